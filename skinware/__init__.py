@@ -1,0 +1,35 @@
+"""Skinware: real-time middleware for robot skin.
+
+Read a skin without knowing its hardware::
+
+    import skinware
+
+    with skinware.Skin() as skin:
+        for snapshot in skin:
+            pressure = snapshot.physical("pressure")  # (n,) float32
+"""
+
+from skinware.driver_service import DriverFrame, DriverReader, DriverWriter
+from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
+from skinware.service import ServiceReader, ServiceWriter
+from skinware.skin import Skin, SkinLayout, Snapshot
+from skinware.status import BusState, PatchState, Status
+from skinware.structure import Structure
+
+__all__ = [
+    "BusState",
+    "DriverFrame",
+    "DriverReader",
+    "DriverWriter",
+    "Frame",
+    "Namespace",
+    "PatchState",
+    "ServiceReader",
+    "ServiceWriter",
+    "Skin",
+    "SkinLayout",
+    "Snapshot",
+    "Status",
+    "Structure",
+]

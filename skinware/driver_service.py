@@ -1,0 +1,234 @@
+"""A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
+
+Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_counters``,
+``patch_counters``. Static columns: the structure's tables, ``driver_type`` and the names of the counters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadServiceFile, StructureError
+from skinware.memory import _segment
+from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
+from skinware.service import DEFAULT_SLOTS, ServiceReader, ServiceWriter
+from skinware.structure import Structure
+
+KIND = "driver"
+
+
+class DriverFrame(Frame):
+    """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
+
+    Every array is coherent with every other: they were published in one piece.
+    """
+
+    __slots__ = ()
+
+    @property
+    def structure(self) -> Structure:
+        """The structure that this frame belongs to."""
+        return cast(Structure, self.context)
+
+    @property
+    def values(self) -> npt.NDArray[Any]:
+        """(n_sensors,) of the structure's dtype, raw counts as the hardware sent them."""
+        return self.column("values")
+
+    @property
+    def status(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8, bits of :class:`skinware.status.Status`; 0 = fresh and good."""
+        return self.column("status")
+
+    @property
+    def module_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_modules,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each module; 0 = never seen."""
+        return self.column("module_time_ns")
+
+    @property
+    def patch_state(self) -> npt.NDArray[np.uint8]:
+        """(n_patches,) uint8, :class:`skinware.status.PatchState`."""
+        return self.column("patch_state")
+
+    @property
+    def bus_state(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.BusState`."""
+        return self.column("bus_state")
+
+    def physical(self, type_name: str) -> npt.NDArray[np.float32]:
+        """(n,) float32: values of all sensors of a type, in the type's unit, in the order of ``structure.index``."""
+        return self.structure.physical(self.values, type_name)
+
+    def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
+        """(n,) uint8: status of all sensors of a type, in the order of ``structure.index``."""
+        return self.status[self.structure.index(type_name)]
+
+
+class DriverWriter:
+    """A driver's end: a structure, and the frames that go with it.
+
+    Args:
+        name: name of the driver in the namespace.
+        structure: what the skin is made of.
+        driver_type: name of the driver's class (``roboskin``), for people.
+        bus_counters: names of the counters that every bus has.
+        patch_counters: names of the counters that every patch has.
+        namespace, slots, rate_hz, group: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        structure: Structure,
+        *,
+        driver_type: str = "",
+        bus_counters: Sequence[str] = (),
+        patch_counters: Sequence[str] = (),
+        namespace: Namespace | None = None,
+        slots: int = DEFAULT_SLOTS,
+        rate_hz: float | None = None,
+        group: str | None = None,
+    ) -> None:
+        self.structure = structure
+        self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
+        self._service = ServiceWriter(
+            name,
+            self._columns(),
+            self._static(),
+            namespace=namespace,
+            kind=KIND,
+            slots=slots,
+            rate_hz=rate_hz,
+            group=group,
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the driver."""
+        return self._service.name
+
+    @property
+    def namespace(self) -> Namespace:
+        """Where it publishes."""
+        return self._service.namespace
+
+    @property
+    def sequence(self) -> int:
+        """Sequence of the newest frame, 0 before the first."""
+        return self._service.sequence
+
+    @property
+    def closed(self) -> bool:
+        """Whether ``close`` was called, or this is the child of a fork."""
+        return self._service.closed
+
+    def begin(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays of the next frame by column name, to be filled whole; then ``commit``."""
+        return self._service.begin()
+
+    def commit(self, acquired_ns: int) -> int:
+        """Publish; ``acquired_ns`` is the newest time stamp in the frame. Returns its sequence."""
+        return self._service.commit(acquired_ns)
+
+    def restructure(self, structure: Structure) -> None:
+        """Go on with other sensors or another dtype, as a new generation; users are told.
+
+        Raises:
+            NamespaceError: shared memory is full; the old generation then goes on.
+        """
+        before, self.structure = self.structure, structure
+        try:
+            self._service.restructure(self._columns(), self._static())
+        except BaseException:
+            self.structure = before
+            raise
+
+    def close(self) -> None:
+        """Withdraw the driver. Idempotent."""
+        self._service.close()
+
+    def _columns(self) -> dict[str, tuple[npt.DTypeLike, int]]:
+        structure = self.structure
+        _, bus_counters, patch_counters = self._names
+        return {
+            "values": (structure.dtype, structure.n_sensors),
+            "status": ("u1", structure.n_sensors),
+            "module_time_ns": ("<i8", structure.n_modules),
+            "patch_state": ("u1", structure.n_patches),
+            "bus_state": ("u1", len(structure.buses)),
+            "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
+            "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
+        }
+
+    def _static(self) -> dict[str, npt.NDArray[Any]]:
+        driver_type, bus_counters, patch_counters = self._names
+        return {
+            **self.structure.to_columns(),
+            "driver_type": np.array([driver_type.encode()], "S32"),
+            "bus_counter_name": np.array([name.encode() for name in bus_counters], "S24"),
+            "patch_counter_name": np.array([name.encode() for name in patch_counters], "S24"),
+        }
+
+    def __enter__(self) -> DriverWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class DriverReader(ServiceReader[DriverFrame]):
+    """A user's end of one driver. Everything of :class:`skinware.service.ServiceReader`, and the structure.
+
+    Raises:
+        BadServiceFile: the service is not a driver, or its tables contradict each other.
+    """
+
+    frame_class = DriverFrame
+
+    @property
+    def structure(self) -> Structure:
+        """The structure of the generation that is being read."""
+        return cast(Structure, self._ring.context)
+
+    @property
+    def driver_type(self) -> str:
+        """Name of the driver's class, as it told."""
+        return bytes(self.static()["driver_type"][0]).decode()
+
+    def bus_counters(self, frame: DriverFrame) -> list[dict[str, int]]:
+        """The counters of every bus in a frame, by name."""
+        return self._counters(frame, "bus", len(self.structure.buses))
+
+    def patch_counters(self, frame: DriverFrame) -> list[dict[str, int]]:
+        """The counters of every patch in a frame, by name."""
+        return self._counters(frame, "patch", self.structure.n_patches)
+
+    def _counters(self, frame: DriverFrame, what: str, count: int) -> list[dict[str, int]]:
+        names = [bytes(name).decode() for name in self.static()[f"{what}_counter_name"]]
+        rows = frame.column(f"{what}_counters").reshape(count, len(names)).tolist()
+        return [dict(zip(names, row, strict=True)) for row in rows]
+
+    def _describe(self, attached: _segment.Segment) -> Structure:
+        if bytes(attached.header["kind"]) != KIND.encode():
+            raise BadServiceFile(f"service {self.name!r} is not a driver: it has no sensors")
+        columns = {column.name: column for column in attached.layout.slot}
+        try:
+            structure = Structure.from_columns(attached.static_columns(), columns["values"].dtype)
+            expected = {
+                "values": structure.n_sensors,
+                "status": structure.n_sensors,
+                "module_time_ns": structure.n_modules,
+                "patch_state": structure.n_patches,
+                "bus_state": len(structure.buses),
+            }
+            for name, count in expected.items():
+                if columns[name].count != count:
+                    raise StructureError(f"{columns[name].count} {name} for {count} rows of the structure")
+        except (StructureError, KeyError, UnicodeDecodeError) as error:
+            raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
+        return structure

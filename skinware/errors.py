@@ -1,0 +1,71 @@
+"""The error tree. Every message says what was wrong, where, and what to do about it."""
+
+from __future__ import annotations
+
+
+class SkinwareError(Exception):
+    """Base of every error that Skinware raises on purpose."""
+
+
+class ConfigurationError(SkinwareError, ValueError):
+    """An option, a file or a name that a person wrote is wrong. Commands exit with 2."""
+
+
+class StructureError(SkinwareError, ValueError):
+    """The tables of a skin's structure contradict each other."""
+
+
+class NamespaceError(SkinwareError):
+    """The namespace's folder cannot be used: missing rights, a wrong owner, a symlink."""
+
+
+class PlatformError(SkinwareError):
+    """This machine lacks something the core cannot do without (memory fences, /dev/shm)."""
+
+
+class ServiceError(SkinwareError):
+    """Base of what can happen between the writer and the readers of a service."""
+
+
+class ServiceNotFound(ServiceError):
+    """No service of this name has ever published in the namespace."""
+
+
+class ServiceTimeout(ServiceError, TimeoutError):
+    """No newer frame came before the deadline. The message tells whether the writer lives."""
+
+
+class NameInUse(ServiceError):
+    """A living writer owns this name."""
+
+
+class BadServiceFile(ServiceError):
+    """A file in the namespace is not a service that this version can read; it was not mapped."""
+
+
+class StructureChanged(ServiceError):
+    """The service came back with another structure. Call ``reattach()`` to go over to it."""
+
+
+class Overrun(ServiceError):
+    """The writer overwrote the slot faster than it could be copied, several times in a row."""
+
+
+class Closed(ServiceError):
+    """The writer or reader was closed, or belongs to the process that this one was forked from."""
+
+
+class BusError(SkinwareError):
+    """Base of what can go wrong with a bus."""
+
+
+class BusNotAvailable(BusError):
+    """The bus does not exist, is down, or may not be opened. Commands exit with 3."""
+
+
+class BusSendError(BusError):
+    """A frame could not be handed to the bus (down, full, or opened to listen only)."""
+
+
+class HandshakeTimeout(BusError, TimeoutError):
+    """A device did not answer a request in time."""

@@ -1,0 +1,96 @@
+"""Waiting on a word of shared memory: futex(2). It works on mappings that may only be read."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import struct
+from collections.abc import Sequence
+from errno import EAGAIN, EINTR, ENOSYS, ETIMEDOUT
+
+from skinware.errors import PlatformError
+from skinware.realtime import NS_PER_S
+
+_SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
+_SYS_FUTEX_WAITV = 449  # the same number on every architecture, Linux 5.16
+_FUTEX_WAIT = 0
+_FUTEX_WAKE = 1
+_FUTEX_32 = 2
+_EVERYBODY = 2**31 - 1
+_CLOCK_MONOTONIC = 1
+MAX_WORDS = 128
+"""The most words one ``wait_any`` can take (FUTEX_WAITV_MAX)."""
+
+_syscall = ctypes.CDLL(None, use_errno=True).syscall
+_syscall.restype = ctypes.c_long
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = [("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long)]
+
+
+def _number() -> int:
+    try:
+        return _SYS_FUTEX[platform.machine()]
+    except KeyError:
+        raise PlatformError(f"the futex system call number of {platform.machine()} is not known here") from None
+
+
+_sys_futex = ctypes.c_long(_number())
+_wake = ctypes.c_int(_FUTEX_WAKE)
+_wait = ctypes.c_int(_FUTEX_WAIT)
+_all_waiters = ctypes.c_int(_EVERYBODY)
+
+
+def wake_all(address: int) -> None:
+    """Wake everybody who waits on the word at ``address``: one system call."""
+    if _syscall(_sys_futex, ctypes.c_void_p(address), _wake, _all_waiters, None, None, 0) < 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def wait(address: int, expected: int, timeout_ns: int) -> None:
+    """Sleep until the word is woken, differs from ``expected``, or the time is up; may return early.
+
+    The caller looks at the memory again in any case, so the reason of the return is not told. The GIL is free
+    meanwhile, and a signal ends the wait, so that its Python handler runs.
+    """
+    timeout = _Timespec(timeout_ns // NS_PER_S, timeout_ns % NS_PER_S)
+    result = _syscall(
+        _sys_futex, ctypes.c_void_p(address), _wait, ctypes.c_uint32(expected), ctypes.byref(timeout), None, 0
+    )
+    if result < 0:
+        number = ctypes.get_errno()
+        if number not in (EAGAIN, EINTR, ETIMEDOUT):
+            raise OSError(number, os.strerror(number))
+
+
+def wait_any(words: Sequence[tuple[int, int]], deadline_ns: int) -> bool:
+    """Sleep until one of several words is woken or differs from its expected value, or the deadline is there.
+
+    Args:
+        words: (address, expected) pairs, 1 to :data:`MAX_WORDS`.
+        deadline_ns: CLOCK_MONOTONIC ns.
+
+    Returns:
+        False if the kernel is older than 5.16 and cannot do it; the caller then polls.
+    """
+    entry = struct.Struct("QQII")  # struct futex_waitv: val, uaddr, flags, reserved
+    table = ctypes.create_string_buffer(b"".join(entry.pack(value, at, _FUTEX_32, 0) for at, value in words))
+    deadline = _Timespec(deadline_ns // NS_PER_S, deadline_ns % NS_PER_S)
+    result = _syscall(
+        ctypes.c_long(_SYS_FUTEX_WAITV),
+        table,
+        ctypes.c_uint(len(words)),
+        ctypes.c_uint(0),
+        ctypes.byref(deadline),
+        ctypes.c_int(_CLOCK_MONOTONIC),
+    )
+    if result < 0:
+        number = ctypes.get_errno()
+        if number == ENOSYS:
+            return False
+        if number not in (EAGAIN, EINTR, ETIMEDOUT):
+            raise OSError(number, os.strerror(number))
+    return True

@@ -1,0 +1,245 @@
+"""One generation of a service as a file: created whole, made visible by rename, never truncated."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import secrets
+import stat
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadServiceFile, NameInUse, NamespaceError, ServiceNotFound
+from skinware.memory import _futex, _layout
+from skinware.memory._layout import Layout
+from skinware.memory._locks import Descriptor, is_locked, try_lock
+from skinware.memory.namespace import Namespace
+
+_OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
+_HEAD_BYTES = _layout.COLUMN_OFFSET + _layout.COLUMN.itemsize * _layout.MAX_COLUMNS
+
+
+@dataclass
+class Segment:
+    """A mapped generation. Arrays keep the map alive; it is never unmapped under them.
+
+    Attributes:
+        path: file name, for messages.
+        header: header row (:data:`_layout.HEADER`).
+        layout: where the columns are.
+        data: (file_size,) uint8, the whole map; read-only for readers.
+        descriptor: the open file: the writer's holds the lock, the reader's queries it.
+        inode: (device, inode), which tells generations of one name apart.
+    """
+
+    path: str
+    header: np.void
+    layout: Layout
+    data: npt.NDArray[np.uint8]
+    descriptor: Descriptor
+    inode: tuple[int, int]
+
+    @property
+    def generation(self) -> int:
+        """Unique per creation, growing."""
+        return int(self.header["generation"])
+
+    def address(self, offset: int) -> int:
+        """Memory address of a byte of the file."""
+        return self.data.ctypes.data + offset
+
+    def static_columns(self) -> dict[str, npt.NDArray[Any]]:
+        """Views of the static columns, by name."""
+        return {c.name: self.view(c.offset, c.dtype, c.count) for c in self.layout.static}
+
+    def view(self, offset: int, dtype: np.dtype[Any], count: int) -> npt.NDArray[Any]:
+        """A typed view of a range of the file."""
+        return self.data[offset : offset + dtype.itemsize * count].view(dtype)
+
+    def writer_lives(self) -> bool:
+        """Whether the process that created this generation still holds its lock."""
+        fd = self.descriptor.fd
+        return fd >= 0 and is_locked(fd)
+
+    def mark(self, state: int) -> None:
+        """Set bits of the state word and wake everybody who waits (needs a writable map)."""
+        control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
+        control["state"] |= state
+        control["wake_word"] += np.uint32(1)
+        _futex.wake_all(self.address(_layout.WAKE_WORD_OFFSET))
+
+
+def take_name(namespace: Namespace, name: str) -> Descriptor:
+    """Become the owner of a service's name, for as long as the returned descriptor is open.
+
+    Raises:
+        NameInUse: a living process owns it.
+        NamespaceError: the lock file cannot be used.
+    """
+    path = namespace.lock_path(name)
+    try:
+        fd = os.open(path, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
+    descriptor = Descriptor(fd)
+    if not try_lock(fd):
+        descriptor.close()
+        raise NameInUse(
+            f"a living driver or service is called {name!r} in namespace {namespace.name!r};"
+            " stop it (skin-info shows its pid), or choose another name (--name) or namespace (SKINWARE_NAMESPACE)"
+        )
+    return descriptor
+
+
+def create(
+    namespace: Namespace,
+    name: str,
+    layout: Layout,
+    static: Mapping[str, npt.NDArray[Any]],
+    *,
+    kind: str,
+    period_ns: int,
+) -> Segment:
+    """Make a new generation and put it in the place of the old one. The caller owns the name.
+
+    Raises:
+        NamespaceError: no room in shared memory, or no rights.
+    """
+    _remove_leftovers(namespace, name)
+    final = namespace.ring_path(name)
+    temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
+    header = _header(name, layout, layout.digest(static), kind, period_ns)
+    try:
+        fd = os.open(temporary, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        descriptor = Descriptor(fd)
+        try:
+            if not try_lock(fd):
+                raise NamespaceError(f"somebody locked {temporary} as it was made")
+            os.posix_fallocate(fd, 0, layout.file_size)
+            data = _map(temporary, layout.file_size)
+            table = _layout.column_table(layout)
+            data[: header.nbytes] = header.view(np.uint8)
+            data[_layout.COLUMN_OFFSET : _layout.COLUMN_OFFSET + table.nbytes] = table.view(np.uint8)
+            for column in layout.static:
+                contents = np.ascontiguousarray(static[column.name]).view(np.uint8)
+                data[column.offset : column.offset + contents.nbytes] = contents
+            os.fchmod(fd, 0o640)
+            previous = _previous(namespace, name)
+            os.rename(temporary, final)
+        except BaseException:
+            os.unlink(temporary)
+            descriptor.close()
+            raise
+    except OSError as error:
+        raise NamespaceError(f"cannot make {final} ({layout.file_size} bytes): {error.strerror}") from None
+    if previous is not None:
+        previous.mark(_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
+    info = os.fstat(fd)
+    return Segment(str(final), header[0], layout, data, descriptor, (info.st_dev, info.st_ino))
+
+
+def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
+    """A writable map through an open file of its own.
+
+    ``mmap`` keeps a duplicate of its descriptor; of the locked one, that would hold the lock for as long as any
+    array lives, and in forked children too.
+    """
+    fd = os.open(path, _OPEN_FLAGS | os.O_RDWR)
+    try:
+        return np.frombuffer(mmap.mmap(fd, size), np.uint8)
+    finally:
+        os.close(fd)
+
+
+def _previous(namespace: Namespace, name: str) -> Segment | None:
+    try:
+        return attach(namespace, name, writable=True)
+    except (ServiceNotFound, BadServiceFile):
+        return None  # nobody can be attached to it
+
+
+def _remove_leftovers(namespace: Namespace, name: str) -> None:
+    """Remove the half-made generations of a writer that was killed; the caller owns the name."""
+    pattern = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{8}}\.tmp")
+    for entry in os.listdir(namespace.path):
+        if pattern.fullmatch(entry):
+            os.unlink(namespace.path / entry)
+
+
+def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segment:
+    """Map the present generation of a service after checking everything that is mapped.
+
+    Raises:
+        ServiceNotFound: there is none.
+        BadServiceFile: the file is not one that can be read safely.
+        NamespaceError: the namespace cannot be trusted or read.
+    """
+    if not namespace.exists():
+        raise ServiceNotFound(_not_found(namespace, name))
+    owner = namespace.check()
+    path = namespace.ring_path(name)
+    try:
+        fd = os.open(path, _OPEN_FLAGS | (os.O_RDWR if writable else os.O_RDONLY))
+    except FileNotFoundError:
+        raise ServiceNotFound(_not_found(namespace, name)) from None
+    except OSError as error:
+        raise BadServiceFile(f"{path}: cannot be opened ({error.strerror}); not attached") from None
+    descriptor = Descriptor(fd)
+    try:
+        info = os.fstat(fd)
+        if not stat.S_ISREG(info.st_mode):
+            raise BadServiceFile(f"{path}: not a regular file; not attached")
+        if info.st_uid != owner:
+            raise BadServiceFile(f"{path}: owned by uid {info.st_uid}, its namespace by uid {owner}; not attached")
+        header, layout = _layout.parse(os.pread(fd, _HEAD_BYTES, 0), str(path), info.st_size)
+        protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
+        data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
+    except BaseException:
+        descriptor.close()
+        raise
+    return Segment(str(path), header, layout, data, descriptor, (info.st_dev, info.st_ino))
+
+
+def current_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
+    """(device, inode) of a service's present file, None if there is none."""
+    try:
+        info = os.lstat(namespace.ring_path(name))
+    except OSError:
+        return None
+    return info.st_dev, info.st_ino
+
+
+def _not_found(namespace: Namespace, name: str) -> str:
+    others = namespace.services()
+    there_are = f"it has: {', '.join(others)}" if others else "it has none; start a driver (skin-driver --bus ...)"
+    return f"no service {name!r} in namespace {namespace.name!r}; {there_are}"
+
+
+def _header(name: str, layout: Layout, digest: bytes, kind: str, period_ns: int) -> npt.NDArray[np.void]:
+    header = np.zeros(1, _layout.HEADER)
+    header["magic"] = _layout.MAGIC
+    header["version_major"], header["version_minor"] = _layout.VERSION
+    header["file_size"] = layout.file_size
+    header["generation"] = header["created_ns"] = time.monotonic_ns()
+    header["column_count"] = len(layout.static) + len(layout.slot)
+    header["slot_count"], header["slot_offset"] = layout.slot_count, layout.slot_offset
+    header["slot_stride"] = layout.slot_stride
+    header["writer_pid"], header["writer_start_ticks"] = os.getpid(), _start_ticks()
+    header["pid_namespace"] = os.stat("/proc/self/ns/pid").st_ino
+    header["period_ns"] = period_ns
+    header["kind"], header["name"] = kind.encode(), name.encode()
+    header["digest"] = np.frombuffer(digest, "V32")
+    return header
+
+
+def _start_ticks() -> int:
+    """When this process began, in clock ticks since boot: field 22 of proc(5) stat."""
+    with open("/proc/self/stat", encoding="ascii", errors="replace") as file:
+        return int(file.read().rpartition(")")[2].split()[19])

@@ -1,0 +1,135 @@
+"""Readers make themselves known: a locked file each, which only its reader writes and nobody maps.
+
+A file is the CRC-32 of what follows (8 hex digits), a space, one JSON object, spaces up to 1024 bytes. A file
+that nobody holds the lock of belongs to a dead reader and is swept away.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import time
+import zlib
+from collections.abc import Iterator
+
+import msgspec
+
+from skinware.memory._locks import Descriptor, is_locked, try_lock
+from skinware.memory.namespace import Namespace
+
+_SIZE = 1024
+_HALF_MADE_S = 60.0
+_READ_ATTEMPTS = 5
+
+
+class ReaderRecord(msgspec.Struct):
+    """What a reader tells of itself.
+
+    Attributes:
+        service: which service it reads.
+        pid: its process (as seen in its own pid namespace).
+        program: the process' name.
+        kind: how it reads: ``asap``, ``in order``, ``periodic 30 Hz``, ``on demand``.
+        frames: frames taken so far.
+        lost: frames that were published since its first one and that it did not take.
+        rate_hz: frames per second lately.
+        age_ms: how old the newest data was when the last frame was taken.
+    """
+
+    service: str
+    pid: int
+    program: str
+    kind: str
+    frames: int = 0
+    lost: int = 0
+    rate_hz: float = 0.0
+    age_ms: float = 0.0
+
+
+class Announcement:
+    """This reader's own file. A namespace that cannot be written is no obstacle to reading."""
+
+    def __init__(self, namespace: Namespace, service: str) -> None:
+        name = f"{service}.{os.getpid()}.{secrets.token_hex(4)}"
+        self._path = namespace.readers_path / name
+        self._descriptor: Descriptor | None = None
+        temporary = namespace.readers_path / f".{name}"
+        try:
+            fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o640)
+        except OSError:
+            return
+        self._descriptor = Descriptor(fd)
+        try_lock(fd)
+        os.rename(temporary, self._path)
+
+    def write(self, record: ReaderRecord) -> None:
+        """Tell the present figures."""
+        if self._descriptor is None or self._descriptor.fd < 0:
+            return
+        text = msgspec.json.encode(record)[: _SIZE - 9].ljust(_SIZE - 9)
+        os.pwrite(self._descriptor.fd, b"%08x " % zlib.crc32(text) + text, 0)
+
+    def close(self) -> None:
+        """Take the announcement back. Idempotent."""
+        if self._descriptor is None or self._descriptor.fd < 0:
+            return  # never made, closed, or a fork's: the file is the parent's
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        self._descriptor.close()
+
+
+def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
+    """What the readers that are alive say of themselves, in order of service and pid."""
+    for path in namespace.reader_files():
+        try:
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        except OSError:
+            continue
+        try:
+            record = _read(fd) if is_locked(fd) else None
+        except OSError:
+            continue
+        finally:
+            os.close(fd)
+        if record is not None:
+            yield record
+
+
+def sweep(namespace: Namespace) -> int:
+    """Remove what dead readers left behind, as far as this user may.
+
+    Returns:
+        How many files were removed.
+    """
+    removed = 0
+    try:
+        names = os.listdir(namespace.readers_path)
+    except OSError:
+        return 0
+    for name in names:
+        path = namespace.readers_path / name
+        with contextlib.suppress(OSError):
+            # a name that begins with a dot is being made, unless it has been for a minute
+            if name.startswith(".") and time.time() - path.lstat().st_mtime < _HALF_MADE_S:
+                continue
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                alive = is_locked(fd)
+            finally:
+                os.close(fd)
+            if not alive:
+                path.unlink()
+                removed += 1
+    return removed
+
+
+def _read(fd: int) -> ReaderRecord | None:
+    for _ in range(_READ_ATTEMPTS):  # its owner may be writing this very moment
+        data = os.pread(fd, _SIZE, 0)
+        if data[:8] == b"%08x" % zlib.crc32(data[9:]):
+            try:
+                return msgspec.json.decode(data[9:], type=ReaderRecord)
+            except msgspec.DecodeError:
+                return None
+    return None

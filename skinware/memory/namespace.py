@@ -1,0 +1,173 @@
+"""A namespace: the folder in shared memory where services meet."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from skinware.errors import ConfigurationError, NamespaceError
+
+ROOT = Path("/dev/shm")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
+
+
+def check_name(name: str, what: str) -> str:
+    """``name`` itself, if it can name a service or a namespace.
+
+    Raises:
+        ConfigurationError: it cannot; the message says what can.
+    """
+    if not _NAME.fullmatch(name):
+        raise ConfigurationError(
+            f"{what} name {name!r}: give 1 to 47 letters, digits, '_' or '-', beginning with a letter or digit"
+        )
+    return name
+
+
+class Namespace:
+    """A folder under /dev/shm, owned by the one user who runs its drivers.
+
+    Everybody in the folder's group may read the services and announce readers; nobody else sees anything.
+
+    Args:
+        name: default: environment variable ``SKINWARE_NAMESPACE``, else ``default``.
+        owner: a user (name or id) whose namespace is accepted beside mine and root's; default: environment
+            variable ``SKINWARE_OWNER``.
+
+    Raises:
+        ConfigurationError: a name that cannot be one, or an unknown owner.
+    """
+
+    def __init__(self, name: str | None = None, *, owner: str | int | None = None) -> None:
+        self.name = check_name(name or os.environ.get("SKINWARE_NAMESPACE") or "default", "namespace")
+        self.path = ROOT / f"skinware.{self.name}"
+        self.readers_path = self.path / "readers"
+        self._extra_owner = _user_id(owner if owner is not None else os.environ.get("SKINWARE_OWNER"))
+
+    def create(self, group: str | None = None) -> None:
+        """Make the folder if it is not there, and check that this user may write services into it.
+
+        Args:
+            group: give the folder to this group, whose members may then read.
+
+        Raises:
+            ConfigurationError: unknown group.
+            NamespaceError: the folder belongs to somebody else or cannot be made.
+        """
+        try:
+            for path, mode in ((self.path, 0o2750), (self.readers_path, 0o3770)):
+                if not path.is_symlink() and not path.exists():
+                    _make_folder(path, mode, group)
+        except PermissionError as error:
+            raise NamespaceError(f"cannot make {error.filename or self.path}: {error.strerror}") from None
+        owner = self.check()
+        if owner != os.geteuid():
+            raise NamespaceError(
+                f"namespace {self.name!r} ({self.path}) belongs to {_user_name(owner)}: drivers must run as that"
+                " user, or in another namespace (SKINWARE_NAMESPACE)"
+            )
+
+    def exists(self) -> bool:
+        """Whether any driver or service ever ran here since the machine was started."""
+        return self.path.is_dir()
+
+    def check(self) -> int:
+        """Make sure that the folder is one that this user can trust.
+
+        Returns:
+            The user id of the folder's owner.
+
+        Raises:
+            NamespaceError: not there, a symlink, writable by others, or of an owner that is not accepted.
+        """
+        try:
+            info = self.path.lstat()
+        except FileNotFoundError:
+            raise NamespaceError(
+                f"namespace {self.name!r} is empty: no driver has run in it since the machine was started"
+            ) from None
+        if not stat.S_ISDIR(info.st_mode):
+            raise NamespaceError(f"{self.path} is not a folder (a symlink is never followed); remove it")
+        if info.st_mode & 0o022:
+            mode = f"{info.st_mode & 0o7777:o}"
+            raise NamespaceError(f"{self.path} can be written by others (mode {mode}); chmod 2750 it")
+        accepted = {os.geteuid(), 0}
+        if self._extra_owner is not None:
+            accepted.add(self._extra_owner)
+        if info.st_uid not in accepted:
+            raise NamespaceError(
+                f"namespace {self.name!r} ({self.path}) belongs to {_user_name(info.st_uid)}, who is neither you nor"
+                " root; if that is right, set SKINWARE_OWNER to that user"
+            )
+        return info.st_uid
+
+    def services(self) -> list[str]:
+        """Names of the services that have published here, living or dead, sorted; [] if there is no folder."""
+        try:
+            with os.scandir(self.path) as entries:
+                return sorted(entry.name[:-5] for entry in entries if entry.name.endswith(".ring"))
+        except FileNotFoundError:
+            return []
+        except PermissionError:
+            raise NamespaceError(
+                f"{self.path} may not be read by {_user_name(os.geteuid())}; ask its owner"
+                f" {_user_name(self.path.stat().st_uid)} to add you to its group"
+            ) from None
+
+    def ring_path(self, service: str) -> Path:
+        """The file that readers of a service map."""
+        return self.path / f"{service}.ring"
+
+    def lock_path(self, service: str) -> Path:
+        """The file whose lock is the ownership of a service's name."""
+        return self.path / f"{service}.lock"
+
+    def reader_files(self) -> Iterator[Path]:
+        """The announcements of readers."""
+        try:
+            with os.scandir(self.readers_path) as entries:
+                names = sorted(entry.name for entry in entries if not entry.name.startswith("."))
+        except (FileNotFoundError, PermissionError):
+            return
+        for name in names:
+            yield self.readers_path / name
+
+    def __repr__(self) -> str:
+        return f"<Namespace {self.name} at {self.path}>"
+
+
+def _make_folder(path: Path, mode: int, group: str | None) -> None:
+    try:
+        path.mkdir(mode=0o700)
+    except FileExistsError:
+        return  # another driver was faster
+    if group is not None:
+        try:
+            os.chown(path, -1, grp.getgrnam(group).gr_gid)
+        except KeyError:
+            path.rmdir()
+            raise ConfigurationError(f"there is no group {group!r} on this machine (see: getent group)") from None
+    path.chmod(mode)
+
+
+def _user_id(user: str | int | None) -> int | None:
+    if user is None or user == "":
+        return None
+    if isinstance(user, int) or user.isdigit():
+        return int(user)
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except KeyError:
+        raise ConfigurationError(f"there is no user {user!r} on this machine (SKINWARE_OWNER)") from None
+
+
+def _user_name(user_id: int) -> str:
+    try:
+        return f"user {pwd.getpwuid(user_id).pw_name}"
+    except KeyError:
+        return f"user {user_id}"

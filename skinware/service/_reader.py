@@ -1,0 +1,313 @@
+"""A reader's end of a service."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, Generic, TypeVar
+
+import numpy.typing as npt
+
+from skinware.errors import Closed, Overrun, ServiceNotFound, ServiceTimeout, StructureChanged
+from skinware.memory import _futex, _layout, _segment
+from skinware.memory.announcement import Announcement, ReaderRecord
+from skinware.memory.namespace import Namespace, check_name
+from skinware.memory.ring import Frame, RingReader
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
+
+_ANNOUNCE_EVERY_NS = NS_PER_S // 4
+_MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
+
+Position = tuple[int, int]
+"""(generation, sequence) of a frame."""
+
+F = TypeVar("F", bound=Frame)
+
+
+class ServiceReader(Generic[F]):
+    """A reader of one service: it re-attaches by itself when the writer comes back.
+
+    Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
+    slow loses frames (``lost`` counts them exactly) and never disturbs the writer or other readers.
+
+    Args:
+        name: the service.
+        namespace: default: the one of ``SKINWARE_NAMESPACE``.
+        timeout_s: how long to wait for the service to appear; 0 for not at all, None for ever.
+
+    Raises:
+        ServiceNotFound: it did not appear in time.
+        BadServiceFile: its file cannot be read safely.
+        NamespaceError: the namespace cannot be trusted or read.
+    """
+
+    frame_class: type[Any] = Frame
+
+    def __init__(self, name: str, *, namespace: Namespace | None = None, timeout_s: float | None = 0.0) -> None:
+        self.name = check_name(name, "service")
+        self.namespace = namespace or Namespace()
+        self.frames_taken = 0
+        self.lost = 0
+        self._last: Position | None = None
+        self._closed = False
+        self._moved = False
+        self._ring: RingReader[F] = self._attach_within(timeout_s)
+        self._announcement = Announcement(self.namespace, name)
+        self._record = ReaderRecord(name, os.getpid(), os.path.basename(sys.argv[0] or sys.executable), "on demand")
+        self._announced_ns = self._announced_frames = 0
+        self._announce(None)
+
+    @property
+    def generation(self) -> int:
+        """The generation that is being read."""
+        return self._ring.generation
+
+    @property
+    def alive(self) -> bool:
+        """Whether the writer of the generation that is being read lives (it may still be silent)."""
+        return self._ring.segment.writer_lives()
+
+    @property
+    def paused(self) -> bool:
+        """Whether the writer says that it publishes nothing for now."""
+        return bool(self._ring.state & _layout.STATE_PAUSED)
+
+    @property
+    def structure_changed(self) -> bool:
+        """Whether the service came back with other columns, so that ``reattach`` is due."""
+        return self._moved
+
+    @property
+    def latest(self) -> Position | None:
+        """Position of the newest frame, None before the first; goes over to a new generation if there is one."""
+        if not self._moved and (self._ring.state & _MOVED_ON or not self.alive):
+            self._follow()
+        sequence = self._ring.latest
+        return (self._ring.generation, sequence) if sequence else None
+
+    def wake_word(self) -> tuple[int, int]:
+        """(address, present value) of the futex that every publication wakes; take it before ``latest``."""
+        return self._ring.wake_word()
+
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """The static columns of the generation that is being read, read-only."""
+        return self._ring.segment.static_columns()
+
+    def read(self, *, newer_than: Frame | Position | None = None, timeout_s: float | None = 5.0) -> F:
+        """The newest frame, as a private copy.
+
+        Args:
+            newer_than: wait for a frame that is newer than this one; any frame of another generation is.
+                Default: take what is there, wait only if nothing was published yet.
+            timeout_s: longest wait; None for ever.
+
+        Raises:
+            ServiceTimeout: nothing newer came in time; the message says whether the writer lives.
+            StructureChanged: the service came back with another structure (only when waiting for newer).
+            Overrun: the writer is too fast for this number of slots.
+            Closed: this reader was closed.
+        """
+        known = newer_than.position if isinstance(newer_than, Frame) else newer_than
+        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        if known is None and self.latest is not None:
+            return self._taken(self._ring.copy())
+        self._wait_for_newer(known, deadline_ns)
+        return self._taken(self._ring.copy())
+
+    @contextlib.contextmanager
+    def view(self) -> Iterator[F]:
+        """The newest frame in place, with no copy: ask ``frame.valid`` after using it, and only then trust it.
+
+        Raises:
+            ServiceTimeout: nothing was published yet.
+        """
+        if self.latest is None:
+            raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
+        yield self._taken(self._ring.view())
+
+    def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
+        """Newest frames, for ever.
+
+        Args:
+            rate_hz: None: each time the writer publishes (ASAP). A rate: at the deadlines of that rate, whatever
+                is newest then; the same frame comes again if there is no newer one.
+            timeout_s: longest silence of the writer before ServiceTimeout (ASAP only); None for any.
+
+        Raises:
+            ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
+        """
+        if rate_hz is None:
+            self._record.kind = "asap"
+            while True:
+                yield self.read(newer_than=self._last, timeout_s=timeout_s)
+        self._record.kind = f"periodic {rate_hz:g} Hz"
+        timer = Periodic(rate_hz)
+        while timer.wait(lambda: self._closed):
+            yield self.read(timeout_s=timeout_s)
+
+    def __iter__(self) -> Iterator[F]:
+        return self.frames()
+
+    def in_order(self, *, timeout_s: float | None = None) -> Iterator[F]:
+        """Every frame, one after the other, as long as this program keeps up within the ring's slots.
+
+        For recorders and tests; a control loop wants the newest (``frames``). What was overwritten before its turn
+        is counted in ``lost``.
+
+        Raises:
+            ServiceTimeout, StructureChanged, Closed: as ``read``.
+        """
+        self._record.kind = "in order"
+        while True:
+            deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+            self._wait_for_newer(self._last, deadline_ns)
+            yield self._taken(self._next_in_order())
+
+    def reattach(self) -> None:
+        """Go over to the present generation of the service, whatever its structure.
+
+        Raises:
+            ServiceNotFound: there is none any more.
+            BadServiceFile: its file cannot be read safely.
+        """
+        self._adopt(self._attach(self._ring))
+
+    def close(self) -> None:
+        """Stop reading and take the announcement back. Frames that were handed out stay readable. Idempotent."""
+        self._closed = True
+        self._announcement.close()
+        self._ring.segment.descriptor.close()
+
+    # -- attaching ----------------------------------------------------------------------------------------------
+
+    def _attach(self, known: RingReader[F] | None = None) -> RingReader[F]:
+        segment = _segment.attach(self.namespace, self.name)
+        if known is not None and _digest(segment) == _digest(known.segment):
+            return RingReader(segment, self.frame_class, known.context)
+        return RingReader(segment, self.frame_class, self._describe(segment))
+
+    def _describe(self, _attached: _segment.Segment) -> object:
+        """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
+        return None
+
+    def _attach_within(self, timeout_s: float | None) -> RingReader[F]:
+        timer = Periodic(10)
+        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        while True:
+            try:
+                return self._attach()
+            except ServiceNotFound:
+                if deadline_ns is not None and now_ns() >= deadline_ns:
+                    raise
+            timer.wait()
+
+    def _adopt(self, ring: RingReader[F]) -> None:
+        if self._last is not None and self._last[0] == self._ring.generation:
+            self.lost += self._ring.latest - self._last[1]
+            self._last = (ring.generation, 0)
+        self._ring.segment.descriptor.close()
+        self._ring = ring
+        self._moved = False
+
+    def _follow(self) -> None:
+        """Go over to a newer generation if there is one of the same structure; remember if it has another."""
+        inode = _segment.current_inode(self.namespace, self.name)
+        if inode is None or inode == self._ring.segment.inode:
+            return
+        try:
+            ring = self._attach(self._ring)
+        except ServiceNotFound:
+            return
+        if _digest(ring.segment) == _digest(self._ring.segment):
+            self._adopt(ring)
+        else:
+            ring.segment.descriptor.close()
+            self._moved = True
+
+    # -- waiting ------------------------------------------------------------------------------------------------
+
+    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None) -> None:
+        look_around = False
+        while True:
+            if self._closed:
+                raise Closed(f"the reader of {self.name!r} was closed")
+            address, word = self._ring.wake_word()
+            if (look_around or self._ring.state & _MOVED_ON) and not self._moved:
+                self._follow()
+                address, word = self._ring.wake_word()
+            latest = self._ring.latest
+            if latest and (self._ring.generation, latest) != known:
+                return
+            if self._moved:
+                raise StructureChanged(
+                    f"service {self.name!r} came back with another structure; call reattach() and read it anew"
+                )
+            remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
+            if remaining_ns <= 0:
+                raise ServiceTimeout(self._why_nothing_came())
+            self._announce(None)
+            _futex.wait(address, word, min(remaining_ns, WAIT_SLICE_NS))
+            look_around = self._ring.latest == latest
+
+    def _why_nothing_came(self) -> str:
+        if not self.alive:
+            return f"no newer frame of {self.name!r}: its writer is dead or was stopped; start it again"
+        if self.paused:
+            return f"no newer frame of {self.name!r}: its writer is paused"
+        if not self._ring.latest:
+            return f"no frame of {self.name!r} yet: its writer lives, but has published nothing so far"
+        return f"no newer frame of {self.name!r}: its writer lives, but is silent (hung, stopped or waiting)"
+
+    def _next_in_order(self) -> F | None:
+        last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
+        if last is None:
+            return self._ring.copy()
+        while True:
+            latest = self._ring.latest
+            oldest = max(last + 1, latest - self._ring.slot_count + 2)
+            for sequence in range(oldest, latest + 1):
+                frame = self._ring.copy(sequence)
+                if frame is not None:
+                    return frame
+            if latest == self._ring.latest:
+                raise Overrun(f"no slot of {self.name!r} could be read; its writer may have died while filling one")
+
+    def _taken(self, frame: F | None) -> F:
+        if frame is None:
+            raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
+        if self._last is not None:  # of this generation: _adopt saw to it
+            self.lost += max(0, frame.sequence - self._last[1] - 1)
+        self._last = frame.position
+        self.frames_taken += 1
+        frame.stale = not self.alive
+        self._announce(frame)
+        return frame
+
+    def _announce(self, frame: Frame | None) -> None:
+        time_ns = now_ns()
+        passed_ns = time_ns - self._announced_ns
+        if passed_ns < _ANNOUNCE_EVERY_NS:
+            return
+        record = self._record
+        if self._announced_ns:
+            record.rate_hz = round((self.frames_taken - self._announced_frames) * NS_PER_S / passed_ns, 2)
+        if frame is not None:
+            record.age_ms = round((time_ns - frame.acquired_ns) / 1e6, 3)
+        record.frames, record.lost = self.frames_taken, self.lost
+        self._announcement.write(record)
+        self._announced_ns, self._announced_frames = time_ns, self.frames_taken
+
+    def __enter__(self) -> ServiceReader[F]:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self.name!r} in {self.namespace.name!r}>"
+
+
+def _digest(segment: _segment.Segment) -> bytes:
+    return bytes(segment.header["digest"])

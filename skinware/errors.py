@@ -60,7 +60,15 @@ class BusError(SkinwareError):
 
 
 class BusNotAvailable(BusError):
-    """The bus does not exist, is down, or may not be opened. Commands exit with 3."""
+    """The bus does not exist, is down, or may not be opened. Commands exit with 3.
+
+    Attributes:
+        is_down: the interface is there, but down; otherwise it is not there (or not for us).
+    """
+
+    def __init__(self, message: str, *, is_down: bool = False) -> None:
+        super().__init__(message)
+        self.is_down = is_down
 
 
 class BusSendError(BusError):

@@ -1,0 +1,115 @@
+"""What a driver says of its hardware. Subclass a transport's adapter (``can.adapter.CanAdapter``), declare, done."""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Sequence
+from typing import Any, ClassVar, Generic, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.sensor_types import SensorType
+from skinware_drivers.decoder import SkinState, Updates
+from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.layout import Layout
+from skinware_drivers.link import Link
+
+
+class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a driver that has none."""
+
+
+OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+
+
+class Watch:
+    """Looks at every update of all buses, to mark values that the wire alone does not call doubtful.
+
+    Attributes:
+        module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
+    """
+
+    def __init__(self, tables: SkinTables) -> None:
+        self.tables = tables
+        self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
+
+    def look(self, state: SkinState, updates: Updates) -> None:
+        """Called after updates were applied, with the state that now shows them."""
+
+    def forget(self, patch: int) -> None:
+        """Called when a patch was set up anew: what was held against it no longer counts."""
+        self.module_status[self.tables.structure.module_patch == patch] = 0
+
+
+class Adapter(ABC, Generic[OptionsT]):
+    """One bus of a driver: what hangs on it, what its frames mean, and how to get it going.
+
+    The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
+    ``recover`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines of one event
+    loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went down); the runner
+    then says so and tries again later.
+
+    In listen-only mode only ``describe`` and ``recover`` are called, and every send is refused.
+
+    Attributes:
+        medium: kind of bus: ``can``.
+        Options: struct of the options; becomes command-line options and TOML keys.
+        types: the sensor types, with this hardware's units and scales.
+        dtype: dtype of the values.
+        layout: what frames mean.
+        patches: what hangs on each bus, unless ``describe`` finds out.
+        period_s: nominal time between two updates of a module.
+        by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+    """
+
+    medium: ClassVar[str]
+    Options: ClassVar[type[msgspec.Struct]] = NoOptions
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike = np.uint8
+    layout: Layout
+    patches: Sequence[Patch] = ()
+    by_cycle: bool = True
+
+    def __init__(self, options: OptionsT) -> None:
+        self.options = options
+
+    @property
+    def period_s(self) -> float:
+        """Nominal time between two updates of a module, s."""
+        return 0.02
+
+    async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
+        """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
+        return self.patches
+
+    async def configure(self, link: Link) -> None:
+        """Set the devices up."""
+
+    async def start(self, link: Link) -> None:
+        """Make them send data."""
+
+    async def stop(self, link: Link) -> None:
+        """Make them silent."""
+
+    async def recover(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Try to get a silent patch going again.
+
+        Returns:
+            True if it answered and was set up anew; False: nothing was done, it is asked again later.
+        """
+        return False
+
+    async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
+        """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""
+        del known
+        return await self.describe(link)
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """What marks doubtful values; by default nothing does."""
+        return Watch(tables)
+
+
+AnyAdapter = Adapter[Any]

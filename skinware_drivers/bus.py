@@ -1,0 +1,192 @@
+"""What carries frames: the contract of a bus, and the batch that all buses of a driver fill.
+
+A bus knows nothing of skins. It moves frames between a wire and a :class:`FrameBatch`, stamps them with
+``CLOCK_MONOTONIC`` and counts what it had to drop. Implementations: ``can.socketcan`` (Linux), ``can.pythoncan``
+(every python-can interface), ``virtual.bus`` (emulated hardware in the same process).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+EXTENDED_FLAG = 0x8000_0000
+"""Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h)."""
+REMOTE_FLAG = 0x4000_0000
+"""Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
+ERROR_FLAG = 0x2000_0000
+"""Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
+
+
+def wire_dtype(payload_size: int) -> np.dtype[np.void]:
+    """Row of a batch: the layout of ``struct can_frame`` (payload 8) and ``struct canfd_frame`` (64).
+
+    Args:
+        payload_size: bytes of payload a row can hold, a multiple of 8.
+    """
+    return np.dtype(
+        [
+            ("identifier", np.uint32),
+            ("length", np.uint8),
+            ("flags", np.uint8),
+            ("reserved", np.uint16),
+            ("payload", np.uint8, (payload_size,)),
+        ]
+    )
+
+
+class FrameBatch:
+    """Frames of all buses of a driver, in order of arrival per bus; filled by buses, emptied by the decoder.
+
+    Attributes:
+        wire: (capacity,) :func:`wire_dtype`; rows ``start`` to ``stop`` are valid.
+        time_ns: (capacity,) int64, CLOCK_MONOTONIC ns at which the kernel (or device) saw the frame.
+        bus: (capacity,) uint16, ordinal of the bus in the driver.
+        start: first valid row. The rows before it are headroom, into which the decoder puts frames that
+            it still holds from the batch before.
+        stop: one past the last valid row.
+    """
+
+    def __init__(self, capacity: int, payload_size: int = 8, headroom: int = 0) -> None:
+        self.capacity = capacity + headroom
+        self.payload_size = payload_size
+        self.headroom = headroom
+        self.wire = np.zeros(self.capacity, wire_dtype(payload_size))
+        self.time_ns = np.zeros(self.capacity, np.int64)
+        self.bus = np.zeros(self.capacity, np.uint16)
+        self.start = self.stop = headroom
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def free(self) -> int:
+        """Rows that a bus may still fill."""
+        return self.capacity - self.stop
+
+    def clear(self) -> None:
+        """Forget all rows; the memory stays."""
+        self.start = self.stop = self.headroom
+
+    def append(self, bus: int, time_ns: int, identifier: int, payload: bytes) -> None:
+        """Add one frame: the slow path of buses that hand out frames one by one.
+
+        Raises:
+            ValueError: the payload is longer than a row holds.
+            IndexError: the batch is full.
+        """
+        if len(payload) > self.payload_size:
+            raise ValueError(f"payload of {len(payload)} bytes in a batch of {self.payload_size}-byte rows")
+        row = self.wire[self.stop]
+        row["identifier"] = identifier
+        row["length"] = len(payload)
+        row["payload"][: len(payload)] = np.frombuffer(payload, np.uint8)
+        self.time_ns[self.stop] = time_ns
+        self.bus[self.stop] = bus
+        self.stop += 1
+
+
+@dataclass
+class BusCounters:
+    """What happened on one bus since it was opened, counted by the bus itself."""
+
+    frames: int = 0
+    """Frames received."""
+    lost: int = 0
+    """Frames that the kernel (or the interface's queue) dropped before we could read them."""
+    error_frames: int = 0
+    """CAN error frames and their like."""
+    refused: int = 0
+    """Frames that do not fit this bus' batch (remote frames, FD frames on a classic layout)."""
+    sent: int = 0
+    """Frames handed to the wire."""
+    send_failures: int = 0
+    """Sends that the interface refused."""
+
+
+class Bus(ABC):
+    """One link to hardware.
+
+    Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
+    down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and
+    opened again by its owner, for ever, with growing pauses.
+
+    Args:
+        channel: the part of the bus' name behind ``interface:`` (``vcan0``, ``/dev/ttyUSB0``).
+        options: the ``key=value`` pairs behind ``?``, as strings.
+        payload_size: the longest payload the driver's layout knows, 8 or 64 for CAN.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        skinware.errors.ConfigurationError: an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+    ) -> None:
+        self.channel = channel
+        self.options = dict(options or {})
+        self.payload_size = payload_size
+        self.listen_only = listen_only
+        self.counters = BusCounters()
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect to the wire. Opening again after ``close`` is allowed; counters go on.
+
+        Raises:
+            skinware.errors.BusNotAvailable: no such interface, interface down, or not permitted.
+        """
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """A descriptor that is readable (for epoll) when ``receive`` has something to do."""
+
+    @abstractmethod
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append what has arrived to ``batch``, marked with this bus' ``ordinal``; never blocks.
+
+        Returns:
+            The number of frames appended; at most ``batch.free``.
+
+        Raises:
+            skinware.errors.BusNotAvailable: the interface went down or away.
+        """
+
+    @abstractmethod
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Hand one frame to the wire; never blocks.
+
+        Raises:
+            skinware.errors.BusSendError: down, queue full, or ``listen_only``.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of the wire. Idempotent."""
+
+    @property
+    def note(self) -> str:
+        """What a person should know about this bus (say, a receive buffer smaller than asked for)."""
+        return ""
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.channel}>"
+
+
+__all__ = [
+    "ERROR_FLAG",
+    "EXTENDED_FLAG",
+    "REMOTE_FLAG",
+    "Bus",
+    "BusCounters",
+    "FrameBatch",
+    "wire_dtype",
+]

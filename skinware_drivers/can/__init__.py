@@ -1,0 +1,1 @@
+"""CAN: buses, and the drivers of skins that hang on them."""

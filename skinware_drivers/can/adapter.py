@@ -1,0 +1,13 @@
+"""The adapter that every CAN driver subclasses."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from skinware_drivers.adapter import Adapter, OptionsT
+
+
+class CanAdapter(Adapter[OptionsT]):
+    """One CAN bus of a driver. Frames carry 11-bit identifiers; see :class:`skinware_drivers.adapter.Adapter`."""
+
+    medium: ClassVar[str] = "can"

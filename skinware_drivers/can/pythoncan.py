@@ -1,0 +1,160 @@
+"""Every other CAN interface, through python-can: a thread takes its messages one by one into a queue."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections import deque
+from typing import Any
+
+import can
+
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.realtime import now_ns
+from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
+
+_QUEUE_FRAMES = 1 << 16
+_POLL_S = 0.2
+_NUMBERS = (int, float)
+
+
+class PythonCanBus(Bus):
+    """A bus of one of python-can's interfaces (``slcan``, ``udp_multicast``, ``kvaser``, ``pcan`` ...).
+
+    Frames are stamped when they arrive here, as most interfaces' own stamps are on no clock that we know. The options
+    are those of the interface's class.
+
+    Args:
+        interface: python-can's name of the interface.
+        channel, options, payload_size, listen_only: as for :class:`skinware_drivers.bus.Bus`.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self.interface = interface
+        self._bus: can.BusABC | None = None
+        self._thread: threading.Thread | None = None
+        self._queue: deque[tuple[int, int, bytes]] = deque()
+        self._wake_fd = -1
+        self._stop = threading.Event()
+        self._failure: str | None = None
+
+    def open(self) -> None:
+        """Open the interface and start taking its messages.
+
+        Raises:
+            ConfigurationError: the interface does not take one of the options.
+            BusNotAvailable: the interface's library, adapter or channel is not there.
+        """
+        keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
+        if self.payload_size > 8:
+            keywords.setdefault("fd", True)
+        try:
+            self._bus = can.Bus(interface=self.interface, channel=self.channel or None, **keywords)
+        except (TypeError, can.CanInterfaceNotImplementedError, ValueError) as error:
+            raise ConfigurationError(f"bus {self.interface}:{self.channel}: {error}") from None
+        except (can.CanError, OSError) as error:
+            raise BusNotAvailable(f"bus {self.interface}:{self.channel} cannot be opened: {error}") from None
+        self._failure = None
+        self._stop.clear()
+        self._queue.clear()
+        self._wake_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._thread = threading.Thread(target=self._take_messages, name=f"bus {self.channel}", daemon=True)
+        self._thread.start()
+
+    def fileno(self) -> int:
+        """An eventfd that is readable while messages wait, -1 while closed."""
+        return self._wake_fd
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append the messages that wait; see :class:`skinware_drivers.bus.Bus`."""
+        if self._bus is None:
+            raise BusNotAvailable(f"bus {self.channel} is not open")
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake_fd)
+        count = 0
+        while self._queue and batch.free:
+            time_ns, identifier, payload = self._queue.popleft()
+            if len(payload) > batch.payload_size:
+                self.counters.refused += 1
+                continue
+            batch.append(ordinal, time_ns, identifier, payload)
+            count += 1
+        if self._queue:
+            os.eventfd_write(self._wake_fd, 1)
+        elif self._failure is not None and not count:
+            raise BusNotAvailable(f"bus {self.interface}:{self.channel} failed: {self._failure}")
+        self.counters.frames += count
+        return count
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
+        if self.listen_only:
+            raise BusSendError(f"bus {self.channel} is opened to listen only")
+        if self._bus is None:
+            raise BusSendError(f"bus {self.channel} is not open")
+        message = can.Message(
+            arbitration_id=identifier & ~EXTENDED_FLAG,
+            is_extended_id=bool(identifier & EXTENDED_FLAG),
+            data=payload,
+            is_fd=len(payload) > 8,
+        )
+        try:
+            self._bus.send(message, timeout=0)
+        except (can.CanError, OSError) as error:
+            self.counters.send_failures += 1
+            raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error})") from None
+        self.counters.sent += 1
+
+    def close(self) -> None:
+        """Stop the thread and shut the interface down. Idempotent."""
+        if self._bus is None:
+            return
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._bus.shutdown()
+        self._bus = None
+        os.close(self._wake_fd)
+        self._wake_fd = -1
+
+    def _take_messages(self) -> None:
+        bus = self._bus
+        while bus is not None and not self._stop.is_set():
+            try:
+                message = bus.recv(_POLL_S)
+            except (can.CanError, OSError, ValueError) as error:
+                self._failure = str(error)
+                os.eventfd_write(self._wake_fd, 1)
+                return
+            if message is None:
+                continue
+            if message.is_error_frame:
+                self.counters.error_frames += 1
+            elif message.is_remote_frame:
+                self.counters.refused += 1
+            elif len(self._queue) >= _QUEUE_FRAMES:
+                self.counters.lost += 1
+            else:
+                flag = EXTENDED_FLAG if message.is_extended_id else 0
+                self._queue.append((now_ns(), message.arbitration_id | flag, bytes(message.data)))
+                os.eventfd_write(self._wake_fd, 1)
+
+
+def _typed(text: str) -> int | float | bool | str:
+    """An option as python-can's constructors want it: numbers and truth values are not texts."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for number in _NUMBERS:
+        with contextlib.suppress(ValueError):
+            return number(text)
+    return text

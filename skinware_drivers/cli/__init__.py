@@ -1,0 +1,1 @@
+"""Commands that need a bus, one module each."""

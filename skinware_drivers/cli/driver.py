@@ -1,0 +1,190 @@
+"""``skin-driver``: run a driver until it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import json_option, namespace_option, print_json, run
+from skinware.errors import ConfigurationError
+from skinware_drivers.options import describe_options
+
+if TYPE_CHECKING:
+    from skinware_drivers.adapter import AnyAdapter
+    from skinware_drivers.config import DriverConfig
+    from skinware_drivers.runner import Runner
+
+
+class DriverCommand(click.Command):
+    """A command that also takes the options of the driver it is asked to run."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Add the driver's own options before parsing."""
+        from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
+
+        config = _value_of("--config", args)
+        name = _value_of("--driver", args)
+        if not name and config:
+            name = _read(config).driver
+        own = {parameter.name for parameter in self.params}
+        for option in describe_options(load_driver(name or DEFAULT_DRIVER).Options):
+            if option.name not in own:
+                text = option.description + (f"  [default: {option.default}]" if option.default else "")
+                flag = "--" + option.name.replace("_", "-")
+                self.params.append(click.Option([flag, option.name], metavar=option.kind, help=text))
+        return super().parse_args(ctx, args)
+
+
+@click.command("skin-driver", cls=DriverCommand)
+@click.option(
+    "--bus", "buses", multiple=True, metavar="BUS", help="Bus: vcan0, virtual, slcan:/dev/ttyACM0 ...; several."
+)
+@click.option("--driver", "driver_name", metavar="DRIVER", help="Driver.  [default: roboskin]")
+@click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
+@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of all this.")
+@click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
+@click.option("--slots", type=int, default=8, show_default=True, help="Frames that slow users may lag behind, 2-64.")
+@click.option("--group", metavar="GROUP", help="Group whose members may read, if the namespace is new.")
+@namespace_option
+@json_option
+@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+def command(
+    buses: tuple[str, ...],
+    driver_name: str | None,
+    name: str | None,
+    config: Path | None,
+    listen_only: bool,
+    slots: int,
+    group: str | None,
+    namespace: str | None,
+    as_json: bool,
+    verbose: bool,
+    **driver_options: str | None,
+) -> None:
+    """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
+
+    \b
+    skin-driver --bus vcan0                    ROBOSKIN boards on a CAN interface
+    skin-driver --bus virtual                  emulated ones, no hardware needed
+    skin-driver --bus can0 --boards 7,8,9,10   only these boards
+    skin-driver --bus can0 --listen-only       send nothing
+
+    SIGHUP makes a listener take in what it has heard since it started.
+    """
+    from skinware.memory.namespace import Namespace
+    from skinware_drivers.config import DriverConfig
+    from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
+    from skinware_drivers.runner import Runner
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="skin-driver: %(message)s", stream=sys.stderr
+    )
+    settings = _read(str(config)) if config else DriverConfig()
+    driver_type = driver_name or settings.driver or DEFAULT_DRIVER
+    driver = load_driver(driver_type)
+    listen_only = listen_only or settings.listen_only
+    bus_names = list(buses) or [bus.name for bus in settings.bus]
+    if not bus_names:
+        raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
+    given = {key: text for key, text in driver_options.items() if text is not None}
+    lines = []
+    for bus_name in bus_names:
+        adapter = driver(_options(driver, settings, bus_name, given))
+        bus = make_bus(bus_name, payload_size=adapter.layout.payload_size, listen_only=listen_only)
+        lines.append((bus_name, adapter, bus))
+    runner = Runner(
+        driver_type,
+        lines,
+        name=name or settings.name or driver_type,
+        listen_only=listen_only,
+        namespace=Namespace(namespace),
+        slots=slots,
+        group=group,
+        on_ready=lambda: _tell_ready(runner, as_json),
+    )
+    asyncio.run(_run(runner, as_json))
+
+
+async def _run(runner: Runner, as_json: bool) -> None:
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, runner.stop)
+    loop.add_signal_handler(signal.SIGHUP, runner.join)
+    reporting = asyncio.create_task(_report(runner)) if as_json else None
+    try:
+        await runner.run()
+    finally:
+        if reporting is not None:
+            reporting.cancel()
+            await asyncio.gather(reporting, return_exceptions=True)
+        if as_json:
+            with contextlib.suppress(BrokenPipeError):
+                print_json({"event": "stopped", "name": runner.name, **runner.status()})
+
+
+async def _report(runner: Runner) -> None:
+    while True:
+        await asyncio.sleep(1)
+        if runner.ready:
+            try:
+                print_json({"event": "status", "name": runner.name, **runner.status()})
+            except BrokenPipeError:
+                runner.stop()
+                return
+
+
+def _tell_ready(runner: Runner, as_json: bool) -> None:
+    if runner.decoder is None:
+        return
+    structure = runner.decoder.tables.structure
+    counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
+    buses = [line.name for line in runner.lines]
+    if as_json:
+        types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
+        ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
+        print_json({**ready, "types": types, "buses": buses})
+    else:
+        click.echo(
+            f"{runner.name}: {counts['patches']} patches, {counts['modules']} modules, {counts['sensors']} sensors"
+            f" on {', '.join(buses)}; publishing (skin-top shows them, Ctrl-C ends)"
+        )
+
+
+def _options(driver: type[AnyAdapter], settings: DriverConfig, bus_name: str, given: dict[str, str]) -> Any:
+    """The driver's options for one bus: the command line beats the bus' own, they beat the file's common ones."""
+    from skinware_drivers.config import convert
+    from skinware_drivers.options import options_from_strings
+
+    of_bus = next((bus.options for bus in settings.bus if bus.name == bus_name), {})
+    values = {**settings.options, **of_bus}
+    text_values = options_from_strings(driver.Options, given)
+    values.update({key: getattr(text_values, key) for key in given})
+    return convert(driver.Options, values, f"options of {bus_name}")
+
+
+def _read(path: str) -> DriverConfig:
+    from skinware_drivers.config import read_config
+
+    return read_config(Path(path))
+
+
+def _value_of(flag: str, args: list[str]) -> str | None:
+    """The value of a flag, looked at before the command line is parsed."""
+    for position, argument in enumerate(args):
+        if argument == flag and position + 1 < len(args):
+            return args[position + 1]
+        if argument.startswith(flag + "="):
+            return argument.partition("=")[2]
+    return None
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

@@ -1,0 +1,94 @@
+"""A driver's configuration file: TOML into checked structs; an unknown key is refused with the nearest right one.
+
+::
+
+    driver = "roboskin"
+    name = "torso"
+
+    [options]               # of every bus
+    period_ms = 50
+
+    [[bus]]
+    name = "can0"
+    options = { boards = [7, 8, 9, 10] }
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import msgspec.structs
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.options import nearest_name
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One bus: its name (as ``--bus`` takes it), and driver options that hold for it alone."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole file."""
+
+    driver: str = ""
+    name: str = ""
+    listen_only: bool = False
+    options: dict[str, Any] = {}
+    bus: tuple[BusConfig, ...] = ()
+
+
+def read_config(path: Path) -> DriverConfig:
+    """Read a configuration file.
+
+    Raises:
+        ConfigurationError: not there, not TOML, or a key or value that is wrong; the message says where.
+    """
+    try:
+        with path.open("rb") as file:
+            data = tomllib.load(file)
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(f"{path}: not TOML: {error}") from None
+    check_keys(DriverConfig, data, str(path))
+    for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
+        check_keys(BusConfig, bus, f"{path}: bus {number + 1}")
+    return convert(DriverConfig, data, str(path))
+
+
+def convert(struct: type[T], data: Mapping[str, Any], where: str) -> T:
+    """``data`` as a struct.
+
+    Raises:
+        ConfigurationError: an unknown key or a wrong value; the message begins with ``where``.
+    """
+    check_keys(struct, data, where)
+    try:
+        return msgspec.convert(data, struct)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
+    except msgspec.ValidationError as error:
+        if isinstance(error.__cause__, ConfigurationError):
+            raise ConfigurationError(f"{where}: {error.__cause__}") from None
+        raise ConfigurationError(f"{where}: {str(error).replace('`', '')}") from None
+
+
+def check_keys(struct: type[msgspec.Struct], data: object, where: str) -> None:
+    """Refuse keys that a struct does not have.
+
+    Raises:
+        ConfigurationError: one of them, with the nearest right name.
+    """
+    known = [field.encode_name for field in msgspec.structs.fields(struct)]
+    for key in data if isinstance(data, Mapping) else ():
+        if key not in known:
+            raise ConfigurationError(f"{where}: unknown key {key!r}{nearest_name(key, known)}")

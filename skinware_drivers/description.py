@@ -1,0 +1,142 @@
+"""What hangs on a bus: patches of modules of channels, with the keys by which frames name them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import StructureError
+from skinware.sensor_types import SensorType
+from skinware.structure import Structure
+
+_BUS_SHIFT = 32
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One channel of a module that is a sensor.
+
+    Attributes:
+        type_name: name of one of the driver's types.
+        uid: unique per type on its bus, below 2**32.
+    """
+
+    type_name: str
+    uid: int
+
+
+@dataclass(frozen=True)
+class Module:
+    """A module.
+
+    Attributes:
+        channels: what each channel is; None = not a sensor, its values are dropped.
+        key: how frames name it within its patch.
+        kind: hardware-specific, for people and geometry.
+    """
+
+    channels: Sequence[Sensor | None]
+    key: int = 0
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A patch.
+
+    Attributes:
+        name: for people, unique on the bus.
+        modules: its modules, in the order of the frame.
+        key: how frames name it on its bus.
+    """
+
+    name: str
+    modules: Sequence[Module]
+    key: int = 0
+
+
+def taxels(count: int, *type_names: str, first_uid: int = 0) -> list[Sensor]:
+    """Channels of ``count`` taxels with one or more axes: all axes of a taxel share its uid."""
+    return [Sensor(name, first_uid + i) for i in range(count) for name in type_names or ("pressure",)]
+
+
+@dataclass(frozen=True)
+class SkinTables:
+    """Descriptions of all buses in one piece: the structure, and the way from keys and channels into it.
+
+    Attributes:
+        structure: what users see.
+        patch_key: (bus, key) -> patch.
+        module_key: (patch, key) -> module.
+        channel_to_sensor: (n_modules, n_channels) int64, sensor of each channel; ``n_sensors`` = none.
+    """
+
+    structure: Structure
+    patch_key: dict[tuple[int, int], int] = field(repr=False)
+    module_key: dict[tuple[int, int], int] = field(repr=False)
+    channel_to_sensor: npt.NDArray[np.int64] = field(repr=False)
+
+
+def assemble(
+    buses: Sequence[tuple[str, Sequence[Patch]]], types: Sequence[SensorType], dtype: npt.DTypeLike
+) -> SkinTables:
+    """Put the patches of all buses into one structure; uid = bus index << 32 | the driver's uid.
+
+    Raises:
+        StructureError: no sensor at all, two patches or modules of one key, or an unknown type.
+    """
+    type_ids = {t.name: t.id for t in types}
+    patch_key: dict[tuple[int, int], int] = {}
+    module_key: dict[tuple[int, int], int] = {}
+    patch_name: list[str] = []
+    patch_bus: list[int] = []
+    module_patch: list[int] = []
+    module_kind: list[str] = []
+    uids: list[int] = []
+    sensor_type: list[int] = []
+    sensor_module: list[int] = []
+    channels: list[list[int]] = []
+    for bus, (bus_name, patches) in enumerate(buses):
+        for patch in patches:
+            if (bus, patch.key) in patch_key:
+                raise StructureError(f"bus {bus_name}: two patches answer to key {patch.key:#x}")
+            patch_key[bus, patch.key] = len(patch_name)
+            for module in patch.modules:
+                if (len(patch_name), module.key) in module_key:
+                    raise StructureError(f"{patch.name} on {bus_name}: two modules answer to key {module.key:#x}")
+                module_key[len(patch_name), module.key] = len(module_patch)
+                row = []
+                for channel in module.channels:
+                    row.append(-1 if channel is None else len(uids))
+                    if channel is None:
+                        continue
+                    if channel.type_name not in type_ids:
+                        raise StructureError(f"{patch.name}: the driver declares no type {channel.type_name!r}")
+                    uids.append(bus << _BUS_SHIFT | channel.uid)
+                    sensor_type.append(type_ids[channel.type_name])
+                    sensor_module.append(len(module_patch))
+                channels.append(row)
+                module_patch.append(len(patch_name))
+                module_kind.append(module.kind)
+            patch_name.append(patch.name)
+            patch_bus.append(bus)
+    structure = Structure(
+        types=types,
+        buses=[name for name, _ in buses],
+        patch_name=patch_name,
+        patch_bus=patch_bus,
+        module_patch=module_patch,
+        module_kind=module_kind,
+        sensor_uid=np.array(uids, np.uint64),
+        sensor_type=sensor_type,
+        sensor_module=sensor_module,
+        dtype=dtype,
+    )
+    table = np.full((len(channels), max(map(len, channels))), -1, np.int64)
+    for module_index, row in enumerate(channels):
+        table[module_index, : len(row)] = row
+    table[table < 0] = structure.n_sensors
+    return SkinTables(structure, patch_key, module_key, table)

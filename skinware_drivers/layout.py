@@ -1,0 +1,255 @@
+"""The vocabulary in which a driver says what its frames mean. Nothing here runs per frame: see ``decoder``.
+
+A layout is a list of :class:`Frame`. Each says *when* a frame on the wire is one of its kind, whose module it
+belongs to (*key*), and what its bytes are (*values*, *flags*, *sequence*). A :class:`Cycle` says which frames only
+count together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.status import Status
+
+
+@dataclass(frozen=True)
+class Identifier:
+    """Condition: ``identifier & mask == value``."""
+
+    value: int
+    mask: int = 0x7FF
+
+
+@dataclass(frozen=True)
+class Byte:
+    """Condition: ``payload[offset] & mask == value``; a frame that is too short does not match."""
+
+    offset: int
+    value: int
+    mask: int = 0xFF
+
+
+Condition = Identifier | Byte
+
+
+@dataclass(frozen=True)
+class Bits:
+    """A bit field that names a patch or a module.
+
+    Attributes:
+        shift: position of the lowest bit.
+        width: number of bits, 1 to 16.
+        byte: None: of the identifier; a number: of that payload byte (only as a module's key, at most 8 bits).
+    """
+
+    shift: int
+    width: int
+    byte: int | None = None
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A value of any number of bits, packed without gaps.
+
+    Attributes:
+        bits: bits of a value, 1 to 32.
+        order: ``big``: the first value begins at the highest bit of the first byte; ``little``: at its lowest.
+        signed: two's complement.
+    """
+
+    bits: int
+    order: Literal["big", "little"] = "big"
+    signed: bool = False
+
+
+@dataclass(frozen=True)
+class Values:
+    """Where sensor values lie in a payload.
+
+    Attributes:
+        offset: first byte.
+        dtype: numpy dtype with byte order (``"<u2"``), or :class:`Packed`.
+        count: number of values.
+        to: channel of the module that each value belongs to, None = dropped; default: 0, 1, 2 ...
+    """
+
+    offset: int
+    dtype: str | Packed
+    count: int
+    to: Sequence[int | None] | None = None
+
+    @property
+    def channels(self) -> tuple[int | None, ...]:
+        """Channel of each value."""
+        return tuple(range(self.count)) if self.to is None else tuple(self.to)
+
+    @property
+    def end(self) -> int:
+        """One past the last byte."""
+        if isinstance(self.dtype, Packed):
+            return self.offset + -(-self.count * self.dtype.bits // 8)
+        return self.offset + self.count * np.dtype(self.dtype).itemsize
+
+
+@dataclass(frozen=True)
+class Flag:
+    """Bits of a payload that set a status bit.
+
+    The word of ``dtype`` at ``offset`` is read; a frame that ends before it sets no flag.
+
+    Attributes:
+        status: the bit to set.
+        offset: first byte of the word.
+        dtype: unsigned numpy dtype with byte order (``">u2"``).
+        mask: any of these bits set the status of the whole module. 0: none does.
+        each: (channel, bit of the word) pairs: that bit sets the status of that channel alone.
+    """
+
+    status: Status
+    offset: int
+    dtype: str
+    mask: int = 0
+    each: Sequence[tuple[int, int]] = ()
+
+
+@dataclass(frozen=True)
+class Sentinel:
+    """A value that is none: every value equal to it (or NaN, if it is NaN) sets a status bit of its sensor."""
+
+    status: Status
+    value: float
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """A sequence number in the payload that counts a module's frames; what it skips or repeats is counted.
+
+    Attributes:
+        offset: first byte.
+        dtype: unsigned numpy dtype with byte order.
+        modulo: it wraps to 0 here; default: the dtype's own range.
+    """
+
+    offset: int
+    dtype: str
+    modulo: int | None = None
+
+
+@dataclass(frozen=True)
+class Expand:
+    """The escape for what values cannot say (run lengths, nibble maps, text): a vectorised function.
+
+    ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
+    the row of ``payload``, the channel, and the value.
+    """
+
+    function: Callable[
+        [npt.NDArray[np.uint8], npt.NDArray[np.uint8]],
+        tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]],
+    ]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One kind of frame.
+
+    Attributes:
+        name: for the cycle and for messages.
+        when: all of these hold.
+        length: payload lengths that are right; others are counted as bad and not shown.
+        patch: bit field of the identifier that names the patch; None: the bus has one patch.
+        module: bit field that names the module within the patch; None: the patch has one module.
+        values: where the values are.
+        flags: what sets status bits.
+        stamp: sequence number, if there is one.
+    """
+
+    name: str
+    when: Sequence[Condition]
+    length: Sequence[int]
+    values: Values | Expand
+    patch: Bits | None = None
+    module: Bits | None = None
+    flags: Sequence[Flag | Sentinel] = ()
+    stamp: Stamp | None = None
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Frames that make one coherent update of a module together; without all of them none is shown.
+
+    Attributes:
+        members: names of the frames, in order.
+        within: the members must follow each other without any other frame of the same ``patch`` (or ``module``)
+            in between.
+        order: ``given``: in the order of ``members``; ``any``: each once; ``ends_with``: any order, but the last
+            member last.
+        maximum_age_s: longest time from the first to the last of them.
+    """
+
+    members: Sequence[str]
+    maximum_age_s: float
+    within: Literal["patch", "module"] = "module"
+    order: Literal["given", "any", "ends_with"] = "given"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All frames of a device, and the cycle that some of them form.
+
+    Raises:
+        ConfigurationError: what it says cannot be decoded; the message names the frame.
+    """
+
+    frames: Sequence[Frame]
+    cycle: Cycle | None = None
+
+    def __post_init__(self) -> None:
+        names = [frame.name for frame in self.frames]
+        if len(set(names)) < len(names) or not 1 <= len(names) <= 16:
+            raise ConfigurationError(f"a layout has 1 to 16 frames of different names, not {names}")
+        for frame in self.frames:
+            _check_frame(frame)
+        if self.cycle is not None:
+            members = list(self.cycle.members)
+            if len(set(members)) < len(members) or not set(members) <= set(names) or len(members) < 2:
+                raise ConfigurationError(f"cycle of {members}: name at least two different frames of {names}")
+
+    @property
+    def cycle_length(self) -> int:
+        """Number of frames in a cycle; 1 without one."""
+        return len(self.cycle.members) if self.cycle else 1
+
+    @property
+    def payload_size(self) -> int:
+        """Longest payload, rounded up to what a batch row holds."""
+        longest = max(max(frame.length) for frame in self.frames)
+        return 8 if longest <= 8 else -(-longest // 8) * 8
+
+
+def _check_frame(frame: Frame) -> None:
+    def refuse(why: str) -> ConfigurationError:
+        return ConfigurationError(f"frame {frame.name!r}: {why}")
+
+    if not frame.length:
+        raise refuse("say which payload lengths are right")
+    if isinstance(frame.values, Values):
+        if len(frame.values.channels) != frame.values.count:
+            raise refuse(f"{frame.values.count} values, but `to` names {len(frame.values.channels)} channels")
+        if frame.values.end > min(frame.length):
+            raise refuse(f"values end at byte {frame.values.end}, the shortest right payload has {min(frame.length)}")
+    if frame.patch is not None and frame.patch.byte is not None:
+        raise refuse("a patch is named by bits of the identifier, not of the payload")
+    if frame.module is not None and frame.module.byte is not None and not 1 <= frame.module.width <= 8:
+        raise refuse("a module's key in the payload has 1 to 8 bits")
+    for condition in frame.when:
+        if isinstance(condition, Byte) and condition.offset >= min(frame.length):
+            raise refuse(f"byte {condition.offset} is not in every right payload")
+    if frame.stamp is not None and frame.stamp.offset + np.dtype(frame.stamp.dtype).itemsize > min(frame.length):
+        raise refuse("the sequence number is not in every right payload")

@@ -1,0 +1,152 @@
+"""A driver's conversation with the devices on one bus, in coroutines, while the data keeps flowing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BusSendError, HandshakeTimeout
+from skinware_drivers.bus import Bus, FrameBatch
+
+_SEND_RETRY_S = 0.002
+_SEND_TIMEOUT_S = 0.5
+
+
+class Reply(NamedTuple):
+    """A frame that answered."""
+
+    time_ns: int
+    identifier: int
+    payload: bytes
+
+
+class Match(NamedTuple):
+    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``."""
+
+    value: int
+    mask: int = 0x7FF
+    prefix: bytes = b""
+
+
+class Heard(NamedTuple):
+    """What a listener tells frames apart by."""
+
+    identifier: int
+    first_byte: int
+    length: int
+
+
+class Link:
+    """One bus as a driver's handshakes see it. Everything runs in the runner's one event loop, without a thread.
+
+    Frames that the layout does not claim are offered to whoever waits; nobody waiting costs nothing.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._waiters: list[tuple[Match, asyncio.Queue[Reply]]] = []
+        self._heard: Counter[Heard] | None = None
+
+    @property
+    def bus_name(self) -> str:
+        """Name of the bus, for messages."""
+        return self._bus.channel
+
+    @property
+    def listen_only(self) -> bool:
+        """Whether sending is forbidden."""
+        return self._bus.listen_only
+
+    async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:
+        """Send one frame; waits while the interface's queue is full.
+
+        Raises:
+            BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
+        """
+        deadline = asyncio.get_running_loop().time() + timeout_s
+        while True:
+            try:
+                self._bus.send(identifier, payload)
+                return
+            except BusSendError:
+                if self._bus.listen_only or asyncio.get_running_loop().time() >= deadline:
+                    raise
+            await asyncio.sleep(_SEND_RETRY_S)
+
+    async def request(self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float) -> Reply:
+        """Send one frame and wait for the first answer to it; older frames do not count.
+
+        Raises:
+            HandshakeTimeout: no answer in time.
+            BusSendError: as ``send``.
+        """
+        queue: asyncio.Queue[Reply] = asyncio.Queue()
+        entry = (reply, queue)
+        self._waiters.append(entry)
+        try:
+            await self.send(identifier, payload)
+            return await asyncio.wait_for(queue.get(), timeout_s)
+        except TimeoutError:
+            raise HandshakeTimeout(
+                f"{self.bus_name}: no answer to {identifier:03X} [{payload.hex(' ').upper()}] within {timeout_s:g} s"
+            ) from None
+        finally:
+            self._waiters.remove(entry)
+
+    async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
+        """Send one frame and gather all answers that come within ``duration_s``.
+
+        Raises:
+            BusSendError: as ``send``.
+        """
+        queue: asyncio.Queue[Reply] = asyncio.Queue()
+        entry = (reply, queue)
+        self._waiters.append(entry)
+        try:
+            await self.send(identifier, payload)
+            await asyncio.sleep(duration_s)
+        finally:
+            self._waiters.remove(entry)
+        return [queue.get_nowait() for _ in range(queue.qsize())]
+
+    async def listen(self, duration_s: float) -> Counter[Heard]:
+        """Send nothing and count what is on the bus for a time (frames of declared modules excepted)."""
+        heard: Counter[Heard] = Counter()
+        self._heard = heard
+        try:
+            await asyncio.sleep(duration_s)
+        finally:
+            self._heard = None
+        return heard
+
+    async def sleep(self, duration_s: float) -> None:
+        """Let time pass; the bus keeps being read."""
+        await asyncio.sleep(duration_s)
+
+    def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> None:
+        """Show frames of this bus to those who wait (called by the runner)."""
+        if not len(rows) or (not self._waiters and self._heard is None):
+            return
+        identifier = batch.wire["identifier"][rows]
+        if self._heard is not None:
+            first, length = batch.wire["payload"][rows, 0], batch.wire["length"][rows]
+            self._heard.update(
+                Heard(*row) for row in zip(identifier.tolist(), first.tolist(), length.tolist(), strict=True)
+            )
+        for match, queue in self._waiters:
+            for row in rows[(identifier & match.mask) == match.value].tolist():
+                wire = batch.wire[row]
+                payload = wire["payload"][: min(int(wire["length"]), batch.payload_size)].tobytes()
+                if payload.startswith(match.prefix):
+                    queue.put_nowait(Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload))
+
+
+def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:
+    """``rows`` of a batch, bus by bus."""
+    bus = batch.bus[rows]
+    return [rows[bus == ordinal] for ordinal in range(n_buses)]

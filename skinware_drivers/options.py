@@ -1,0 +1,196 @@
+"""Options that people write as text: bus queries and command lines become typed, checked structs.
+
+An options class is a ``msgspec.Struct`` whose fields carry a description, so that commands can print it::
+
+    class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+        boards: Annotated[tuple[int, ...], msgspec.Meta(description="board addresses")] = (7, 8)
+
+Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import types
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import msgspec.structs
+
+from skinware.errors import ConfigurationError
+
+OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+_LONGEST_RANGE = 1 << 16
+_KINDS = {bool: "yes/no", int: "INTEGER", float: "NUMBER", str: "TEXT"}
+
+
+class Option(NamedTuple):
+    """One option of an options class, as a command shows it."""
+
+    name: str
+    kind: str
+    """What to write: ``INTEGER``, ``NUMBER``, ``TEXT``, ``INTEGER,...``, ``a|b|c`` or ``yes/no``."""
+    required: bool
+    default: str
+    """The default as a person would write it; empty where nothing stands for it."""
+    description: str
+
+
+def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
+    """The options of a class that can be written as text, in the order in which it declares them."""
+    hints = get_type_hints(options_class, include_extras=True)
+    return [
+        Option(
+            field.encode_name,
+            _kind(_plain_type(hints[field.name])),
+            field.required,
+            "" if field.required else option_text(_default(field)),
+            _description(hints[field.name]),
+        )
+        for field in msgspec.structs.fields(options_class)
+        if not _is_table(_plain_type(hints[field.name]))
+    ]
+
+
+def options_from_strings(options_class: type[OptionsT], strings: Mapping[str, str]) -> OptionsT:
+    """Make options from ``key=value`` texts.
+
+    Args:
+        options_class: the struct to make.
+        strings: texts by option name. A yes/no option with an empty text is on.
+
+    Raises:
+        ConfigurationError: an option is unknown (the message gives the nearest right name), missing, or its
+            text is not what the option takes.
+    """
+    fields = {field.encode_name: field for field in msgspec.structs.fields(options_class)}
+    hints = get_type_hints(options_class, include_extras=True)
+    values: dict[str, Any] = {}
+    for name, text in strings.items():
+        if name not in fields:
+            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, fields)}")
+        hint = hints[fields[name].name]
+        try:
+            values[fields[name].name] = msgspec.convert(_split(text, _plain_type(hint)), hint, strict=False)
+        except (msgspec.ValidationError, ValueError) as error:
+            raise ConfigurationError(f"option {name}={text}: {_reason(error)}") from None
+    for name, field in fields.items():
+        if field.required and field.name not in values:
+            raise ConfigurationError(f"option {name!r} must be given")
+    return options_class(**values)
+
+
+def check_options(options: msgspec.Struct) -> None:
+    """Hold every field against its type and limits; for ``__post_init__``, which msgspec's limits do not reach.
+
+    Raises:
+        ConfigurationError: a field has a value that its annotation does not allow.
+    """
+    hints = get_type_hints(type(options), include_extras=True)
+    for field in msgspec.structs.fields(type(options)):
+        value = getattr(options, field.name)
+        try:
+            msgspec.convert(value, hints[field.name])
+        except msgspec.ValidationError as error:
+            message = f"option {field.encode_name}={option_text(value)}: {_reason(error)}"
+            raise ConfigurationError(message) from None
+
+
+def option_text(value: Any) -> str:
+    """A value as a person would write it in a bus query: ``7,8``, ``yes``, ``0.01``."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return ""
+    if isinstance(value, list | tuple):
+        return ",".join(option_text(item) for item in value)
+    return str(value)
+
+
+def nearest_name(wrong: str, right: Iterable[str]) -> str:
+    """The end of an error message about an unknown name: the nearest right one, and all there are."""
+    names = sorted(right)
+    nearest = difflib.get_close_matches(wrong, names, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
+    return f"{hint} Known: {', '.join(names) or 'none'}"
+
+
+def _split(text: str, plain: Any) -> Any:
+    """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
+    if plain is bool:
+        word = text.strip().lower()
+        return {"": True, "yes": True, "on": True, "no": False, "off": False}.get(word, word)
+    if get_origin(plain) not in (list, tuple):
+        return text.strip()
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    if _plain_type(get_args(plain)[0]) is not int:
+        return items
+    numbers: list[str | int] = []
+    for item in items:
+        match = _RANGE.fullmatch(item)
+        if match is None:
+            numbers.append(item)
+            continue
+        first, last = int(match[1]), int(match[2])
+        if not 0 <= last - first < _LONGEST_RANGE:
+            raise ValueError(f"the range {item} does not go upwards, or is too long")
+        numbers.extend(range(first, last + 1))
+    return numbers
+
+
+def _plain_type(hint: Any) -> Any:
+    """The type under ``Annotated`` and beside ``None``."""
+    if get_origin(hint) is Annotated:
+        return _plain_type(get_args(hint)[0])
+    if get_origin(hint) in (Union, types.UnionType):
+        others = [other for other in get_args(hint) if other is not type(None)]
+        return _plain_type(others[0]) if len(others) == 1 else hint
+    return hint
+
+
+def _is_table(plain: Any) -> bool:
+    """Whether a type is a struct or a list of them, which only a configuration file can hold."""
+    if get_origin(plain) in (list, tuple):
+        return _is_table(_plain_type(get_args(plain)[0]))
+    return isinstance(plain, type) and issubclass(plain, msgspec.Struct)
+
+
+def _kind(plain: Any) -> str:
+    if get_origin(plain) in (list, tuple):
+        return f"{_kind(_plain_type(get_args(plain)[0]))},..."
+    if get_origin(plain) is Literal:
+        return "|".join(str(word) for word in get_args(plain))
+    return _KINDS.get(plain, "TEXT")
+
+
+def _description(hint: Any) -> str:
+    if get_origin(hint) is Annotated:
+        for meta in get_args(hint)[1:]:
+            if isinstance(meta, msgspec.Meta) and meta.description:
+                return meta.description
+    return ""
+
+
+def _default(field: msgspec.structs.FieldInfo) -> Any:
+    if field.default_factory is not msgspec.NODEFAULT:
+        return field.default_factory()
+    return field.default
+
+
+def _reason(error: Exception) -> str:
+    """What msgspec says, without its path to a value that the message already names."""
+    return re.sub(r" - at `\$\[(\d+)\]`", r" (item \1, counted from 0)", str(error)).replace("`", "")
+
+
+__all__ = [
+    "Option",
+    "check_options",
+    "describe_options",
+    "nearest_name",
+    "option_text",
+    "options_from_strings",
+]

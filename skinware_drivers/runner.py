@@ -1,0 +1,460 @@
+"""Runs a driver: all its buses in one event loop, into one writer buffer, for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import select
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from skinware.driver_service import DriverWriter
+from skinware.errors import BusError, BusNotAvailable, StructureError
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware.service import DEFAULT_SLOTS
+from skinware.status import BusState, PatchState
+from skinware_drivers.adapter import AnyAdapter, Watch
+from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.decoder import Decoder
+from skinware_drivers.description import Patch, SkinTables, assemble
+from skinware_drivers.link import Link, split_by_bus
+from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+
+log = logging.getLogger("skinware.driver")
+
+_BATCH_FRAMES = 2048
+_TURNS = 8  # batches per wake-up before handshakes and timers get their turn
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
+_STOP_TIMEOUT_S = 2.0
+_DATA_TIMEOUT_S = 1.0
+_DATA_CHECKS_HZ = 100
+
+
+class BusLine:
+    """One bus of a running driver.
+
+    Attributes:
+        name: as the user wrote it.
+        adapter: the driver's object for this bus.
+        bus: the bus itself.
+        link: handshakes on it.
+        patches: what was found on it, None until it was asked.
+        state: what the bus is doing.
+    """
+
+    def __init__(self, name: str, ordinal: int, adapter: AnyAdapter, bus: Bus) -> None:
+        self.name = name
+        self.ordinal = ordinal
+        self.adapter = adapter
+        self.bus = bus
+        self.link = Link(bus)
+        self.patches: Sequence[Patch] | None = None
+        self.state = BusState.CONNECTING
+        self.heard_ns = 0
+        self.started = False
+        self.lost = asyncio.Event()
+
+
+class Runner:
+    """A driver on its buses.
+
+    Args:
+        driver_type: name of the driver, for people.
+        lines: name, adapter and (unopened) bus of every bus, in order.
+        name: the driver's name in the namespace.
+        listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.
+        namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
+        on_ready: called once, when frames are being published.
+    """
+
+    def __init__(
+        self,
+        driver_type: str,
+        lines: Sequence[tuple[str, AnyAdapter, Bus]],
+        *,
+        name: str,
+        listen_only: bool = False,
+        namespace: Namespace | None = None,
+        slots: int = DEFAULT_SLOTS,
+        group: str | None = None,
+        on_ready: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.name = name
+        self.driver_type = driver_type
+        self.lines = [BusLine(bus_name, i, adapter, bus) for i, (bus_name, adapter, bus) in enumerate(lines)]
+        self.writer: DriverWriter | None = None
+        self.publisher: Publisher | None = None
+        self.decoder: Decoder | None = None
+        self.ready = False
+        self._listen_only = listen_only
+        self._namespace = namespace or Namespace()
+        self._slots = slots
+        self._group = group
+        self._on_ready = on_ready
+        self._watch: Watch | None = None
+        self._epoll = select.epoll()
+        self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size)
+        self._stopping = asyncio.Event()
+        self._built = asyncio.Condition()
+        self._timer: asyncio.TimerHandle | None = None
+        self._known_patch_state = np.zeros(0, np.uint8)
+        self._join_requested = asyncio.Event()
+
+    @property
+    def _payload_size(self) -> int:
+        return self.lines[0].adapter.layout.payload_size
+
+    # -- life -----------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Run until ``stop``.
+
+        Raises:
+            BusNotAvailable: a bus could not be opened at the start (later, it is waited for).
+            NameInUse: a living driver has this name.
+            NamespaceError: the namespace cannot be used.
+        """
+        loop = asyncio.get_running_loop()
+        self._namespace.create(self._group)
+        tasks: list[asyncio.Task[None]] = []
+        try:
+            for line in self.lines:
+                line.bus.open()
+                self._opened(line)
+            loop.add_reader(self._epoll.fileno(), self._on_readable)
+            stopping = asyncio.create_task(self._wait_for_stop())
+            tasks = [stopping, *(asyncio.create_task(self._serve(line)) for line in self.lines)]
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            await self._shut_down(loop)
+
+    def stop(self) -> None:
+        """Ask ``run`` to come back; safe in a signal handler of the loop."""
+        self._stopping.set()
+
+    def join(self) -> None:
+        """Take in what has appeared on the buses since the start, as a new generation."""
+        self._join_requested.set()
+
+    async def _wait_for_stop(self) -> None:
+        await self._stopping.wait()
+
+    async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
+        for line in self.lines:
+            if line.started and line.bus.fileno() >= 0:
+                try:
+                    await asyncio.wait_for(line.adapter.stop(line.link), _STOP_TIMEOUT_S)
+                except (TimeoutError, BusError) as error:
+                    log.warning("%s: not stopped in good order: %s", line.name, error or "timed out")
+        loop.remove_reader(self._epoll.fileno())
+        if self._timer is not None:
+            self._timer.cancel()
+        for line in self.lines:
+            line.bus.close()
+        self._epoll.close()
+        if self.writer is not None:
+            self.writer.close()
+
+    async def _serve(self, line: BusLine) -> None:
+        """One bus from discovery to the end: describe, set up, then look after it."""
+        await self._describe(line)
+        joining = asyncio.create_task(self._join_on_request(line))
+        try:
+            if not self._listen_only:
+                await self._set_up(line)
+            await self._check_data(line)
+            while True:
+                if line.lost.is_set():
+                    await self._reopen(line)
+                await self._recover_silent_patches(line)
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(line.lost.wait(), self._silence_s())
+        finally:
+            joining.cancel()
+
+    async def _describe(self, line: BusLine) -> None:
+        pause_s = _FIRST_PAUSE_S
+        told = False
+        while not line.patches:
+            try:
+                line.patches = await line.adapter.describe(line.link)
+                why = "no patch answers"
+            except BusError as error:
+                line.patches = ()
+                why = str(error)
+            await self._build()
+            if line.patches:
+                return
+            if not told:
+                log.warning("%s: %s; waiting for one to appear", line.name, why)
+                told = True
+            if line.lost.is_set():
+                await self._reopen(line)
+            await asyncio.sleep(pause_s)
+            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    async def _set_up(self, line: BusLine) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while not line.started:
+            try:
+                await line.adapter.configure(line.link)
+                await line.adapter.start(line.link)
+                line.started = True
+            except BusError as error:
+                log.warning("%s: set-up failed: %s; trying again", line.name, error)
+                if line.lost.is_set():
+                    await self._reopen(line)
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    async def _check_data(self, line: BusLine) -> None:
+        """Wait for the first data of every patch, and name those that send none."""
+        timer = Periodic(_DATA_CHECKS_HZ)
+        for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * line.adapter.period_s))):
+            if not line.lost.is_set() and not self._patches_in(line, PatchState.EXPECTED):
+                break
+            await asyncio.sleep((timer.deadline_ns - now_ns()) / NS_PER_S)
+            timer.advance(now_ns())
+        for patch in self._patches_in(line, PatchState.EXPECTED):
+            log.warning("%s: %s sends no data", line.name, self._patch_name(patch))
+        if self.publisher is not None and not any(other.patches is None for other in self.lines):
+            if not self.ready:
+                self.ready = True
+                self._on_ready()
+
+    async def _join_on_request(self, line: BusLine) -> None:
+        while True:
+            await self._join_requested.wait()
+            self._join_requested.clear()
+            try:
+                patches = await line.adapter.join(line.link, line.patches or ())
+            except BusError as error:
+                log.warning("%s: nothing joined: %s", line.name, error)
+                continue
+            if patches and patches != line.patches:
+                line.patches = patches
+                await self._build()
+
+    # -- structure ------------------------------------------------------------------------------------------------
+
+    async def _build(self) -> None:
+        """(Re)build tables, decoder and writer once every bus has been asked what hangs on it."""
+        async with self._built:
+            if any(line.patches is None for line in self.lines) or not any(line.patches for line in self.lines):
+                return
+            adapter = self.lines[0].adapter
+            try:
+                tables = assemble(
+                    [(line.name, line.patches or ()) for line in self.lines], adapter.types, adapter.dtype
+                )
+            except StructureError as error:
+                log.error("what was found makes no skin: %s", error)
+                return
+            if self.decoder is not None and tables.structure == self.decoder.tables.structure:
+                return
+            self._go_over_to(tables, adapter)
+
+    def _go_over_to(self, tables: SkinTables, adapter: AnyAdapter) -> None:
+        if self.writer is None:
+            self.writer = DriverWriter(
+                self.name,
+                tables.structure,
+                driver_type=self.driver_type,
+                bus_counters=ALL_BUS_COUNTERS,
+                patch_counters=ALL_PATCH_COUNTERS,
+                namespace=self._namespace,
+                slots=self._slots,
+                rate_hz=1 / adapter.period_s,
+            )
+        else:
+            self.writer.restructure(tables.structure)
+            log.info("new generation: %r", tables.structure)
+        self.decoder = Decoder(adapter.layout, tables)
+        self._watch = adapter.watch(tables)
+        self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size, self.decoder.headroom)
+        self.publisher = Publisher(self.writer, self.decoder, self._watch, adapter.period_s, adapter.by_cycle)
+        self.publisher.bus_counters = [line.bus.counters for line in self.lines]
+        self._known_patch_state = self.publisher.patch_state.copy()
+        self._publish_when_due()
+
+    # -- data -----------------------------------------------------------------------------------------------------
+
+    def _on_readable(self) -> None:
+        for _ in range(_TURNS):
+            events = self._epoll.poll(0)
+            if not events:
+                break
+            if self.decoder is not None:
+                self.decoder.put_back(self._batch)
+            else:
+                self._batch.clear()
+            time_ns = now_ns()
+            for fd, _ in events:
+                line = next((line for line in self.lines if line.bus.fileno() == fd), None)
+                if line is None:
+                    continue
+                try:
+                    if line.bus.receive(self._batch, line.ordinal):
+                        line.heard_ns = time_ns
+                except BusNotAvailable as error:
+                    self._lose(line, error)
+            self._digest()
+
+    def _digest(self) -> None:
+        batch = self._batch
+        if self.decoder is None or self.publisher is None:
+            rows = np.arange(batch.start, batch.stop)
+            for line, own in zip(self.lines, split_by_bus(batch, rows, len(self.lines)), strict=True):
+                line.link.offer(batch, own)
+            return
+        found, foreign = self.decoder.decode(batch)
+        if len(foreign):
+            for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
+                line.link.offer(batch, own)
+        for updates in found:
+            self.publisher.take(batch, updates)
+        self._arm_timer()
+
+    def _publish_when_due(self) -> None:
+        if self.publisher is None:
+            return
+        self._update_bus_states()
+        if now_ns() >= self.publisher.deadline_ns:
+            self.publisher.publish()
+        self._log_patches()
+        self._arm_timer()
+
+    def _arm_timer(self) -> None:
+        if self.publisher is None:
+            return
+        loop = asyncio.get_running_loop()
+        due_s = self.publisher.deadline_ns / NS_PER_S
+        if self._timer is not None:
+            if not self._timer.cancelled() and loop.time() < self._timer.when() <= due_s:
+                return  # it comes early enough and then looks again
+            self._timer.cancel()
+        self._timer = loop.call_at(due_s, self._publish_when_due)
+
+    # -- buses and patches ----------------------------------------------------------------------------------------
+
+    def _opened(self, line: BusLine) -> None:
+        self._epoll.register(line.bus.fileno(), select.EPOLLIN)
+        line.state = BusState.SILENT
+        line.lost.clear()
+        if line.bus.note:
+            log.warning("%s", line.bus.note)
+
+    def _lose(self, line: BusLine, error: BusNotAvailable) -> None:
+        line.state = BusState.DOWN if error.is_down else BusState.GONE
+        log.warning("%s; waiting for it to come back", error)
+        with contextlib.suppress(OSError):
+            self._epoll.unregister(line.bus.fileno())
+        line.bus.close()
+        line.lost.set()
+
+    async def _reopen(self, line: BusLine) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while line.lost.is_set():
+            try:
+                line.bus.open()
+                self._opened(line)
+                log.warning("bus %s is back", line.name)
+            except BusNotAvailable as error:
+                line.state = BusState.DOWN if error.is_down else BusState.GONE
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    def _update_bus_states(self) -> None:
+        silence_ns = max(NS_PER_S // 2, round(self._silence_s() * NS_PER_S))
+        for line in self.lines:
+            if line.bus.fileno() >= 0:
+                silent = now_ns() - line.heard_ns > silence_ns
+                line.state = BusState.SILENT if silent else BusState.LIVE
+            if self.publisher is not None:
+                self.publisher.bus_state[line.ordinal] = line.state
+
+    def _silence_s(self) -> float:
+        return self.publisher.silence_ns / NS_PER_S if self.publisher is not None else 0.5
+
+    async def _recover_silent_patches(self, line: BusLine) -> None:
+        if self.publisher is None or self._watch is None or line.lost.is_set():
+            return
+        silent = [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]
+        for patch in silent:
+            publisher = self.publisher
+            try:
+                recovered = await line.adapter.recover(line.link, self._patch_of(line, patch))
+            except BusError as error:
+                log.debug("%s: %s", line.name, error)
+                continue
+            if recovered and publisher is self.publisher:
+                publisher.patch_state[patch] = PatchState.RESTARTED
+                self._watch.forget(patch)
+                log.warning("%s: %s had restarted and was set up anew", line.name, self._patch_name(patch))
+
+    def _patches_in(self, line: BusLine, state: PatchState) -> list[int]:
+        if self.publisher is None or self.decoder is None:
+            return []
+        of_bus = self.decoder.tables.structure.patch_bus == line.ordinal
+        found: list[int] = np.flatnonzero(of_bus & (self.publisher.patch_state == state)).tolist()
+        return found
+
+    def _patch_of(self, line: BusLine, patch: int) -> Patch:
+        if self.decoder is None or line.patches is None:
+            raise LookupError("no structure yet")
+        first = int(np.argmax(self.decoder.tables.structure.patch_bus == line.ordinal))
+        return line.patches[patch - first]
+
+    def _patch_name(self, patch: int) -> str:
+        return bytes(self.decoder.tables.structure.patch_name[patch]).decode() if self.decoder else str(patch)
+
+    def _log_patches(self) -> None:
+        """Tell each change of a patch's state once."""
+        if self.publisher is None or self.decoder is None:
+            return
+        now, before = self.publisher.patch_state, self._known_patch_state
+        for patch in np.flatnonzero(now != before).tolist():
+            line = self.lines[int(self.decoder.tables.structure.patch_bus[patch])]
+            if now[patch] == PatchState.STALE:
+                log.warning("%s: %s fell silent", line.name, self._patch_name(patch))
+            elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
+                log.warning("%s: %s is live again", line.name, self._patch_name(patch))
+        self._known_patch_state = now.copy()
+
+    # -- for people -----------------------------------------------------------------------------------------------
+
+    def status(self) -> dict[str, Any]:
+        """Figures of every bus and patch, for ``skin-driver --json``."""
+        if self.publisher is None or self.decoder is None or self.writer is None:
+            return {
+                "sequence": 0,
+                "buses": [{"name": line.name, "state": line.state.name.lower()} for line in self.lines],
+            }
+        structure, state, time_ns = self.decoder.tables.structure, self.decoder.state, now_ns()
+        buses = []
+        for line, row in zip(self.lines, self.publisher.count_buses().tolist(), strict=True):
+            counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
+            buses.append({"name": line.name, "state": line.state.name.lower(), **counters})
+        patches = []
+        for patch in range(structure.n_patches):
+            last_ns = int(state.patch_time_ns[patch])
+            counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
+            patches.append(
+                {
+                    "name": self._patch_name(patch),
+                    "bus": self.lines[int(structure.patch_bus[patch])].name,
+                    "state": PatchState(int(self.publisher.patch_state[patch])).name.lower(),
+                    "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
+                    **counters,
+                }
+            )
+        return {"sequence": self.writer.sequence, "buses": buses, "patches": patches}

@@ -1,0 +1,1 @@
+"""Emulated hardware, in this process or on a real bus."""

@@ -1,0 +1,210 @@
+"""The bus ``virtual``: emulated hardware in the driver's own process. Needs no kernel support and no rights."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from typing import Self
+
+import numpy as np
+
+from skinware.errors import BusError, BusNotAvailable, BusSendError
+from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, load_emulator
+from skinware_drivers.virtual.timer import MonotonicTimer
+
+DEFAULT_EMULATOR = "roboskin"
+
+_AT_ONCE = 0
+_SHORTEST_SLEEP_NS = 4_000_000
+"""Between two wake-ups: frames that follow each other on the wire are taken together, as USB interfaces do."""
+_LONGEST_BACKLOG_NS = 1_000_000_000
+"""What nobody fetched for longer is lost, as in a receive buffer that runs over."""
+
+
+class VirtualCanBus(Bus):
+    """Emulated hardware as a bus.
+
+    Frames are stamped with the moment at which they went onto the emulated wire, and arrive in that order. None is
+    lost unless nobody fetches them for a second; ``counters.lost`` then says how many.
+
+    Its name is ``virtual:NAME?key=value``: NAME is that of an emulator (entry points of the group
+    ``skinware.emulators``; ``roboskin`` if empty), the pairs are the emulator's options.
+
+    Args:
+        channel: name of the emulator.
+        options: of the emulator, as texts.
+        payload_size: longest payload of the driver's frames; longer ones are counted as refused.
+        listen_only: refuse every ``send``.
+        hardware: devices that exist already, instead of ``channel`` and ``options``.
+        clock: tells CLOCK_MONOTONIC ns. Another clock moves the hardware; ``fileno`` knows only the real one.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+        hardware: EmulatedHardware | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        if hardware is None:
+            emulator = load_emulator(channel or DEFAULT_EMULATOR)
+            hardware = emulator(options_from_strings(emulator.Options, self.options))
+        self.hardware = hardware
+        self._clock = clock
+        self._row = struct.Struct(f"=IBBH{payload_size}s")
+        self._timer: MonotonicTimer | None = None
+        self._pending: list[WireFrame] = []
+        self._due_ns: int | None = None
+        self._present = True
+        self._next_error: BusError | None = None
+
+    @classmethod
+    def with_hardware(
+        cls,
+        hardware: EmulatedHardware,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> Self:
+        """A bus with devices of the caller's, for tests."""
+        return cls("", payload_size=payload_size, listen_only=listen_only, hardware=hardware, clock=clock)
+
+    # Bus
+
+    def open(self) -> None:
+        """Listen to the devices. They are powered up by the first time; what they sent meanwhile is gone.
+
+        Raises:
+            BusNotAvailable: after :meth:`vanish`, until :meth:`come_back`.
+            PlatformError: this system has no timerfd.
+        """
+        if not self._present:
+            raise BusNotAvailable(f"{self!r}: the emulated interface is away")
+        if self._timer is None:
+            self._timer = MonotonicTimer()
+            self.hardware.skip(self._clock())
+            self._wake_when_due()
+
+    def fileno(self) -> int:
+        """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
+        return -1 if self._timer is None else self._timer.fileno()
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append the frames that are due, at most ``batch.free``; the others stay, and the bus stays readable.
+
+        Raises:
+            BusNotAvailable: the bus is closed, or :meth:`vanish` or :meth:`fail_next_receive` was called.
+        """
+        if self._next_error is not None:
+            error, self._next_error = self._next_error, None
+            raise error
+        if self._timer is None or not self._present:
+            raise BusNotAvailable(f"{self!r} is not open")
+        now_ns = self._clock()
+        if len(self._pending) < batch.free:
+            self._fetch(now_ns)
+        frames, self._pending = self._pending[: batch.free], self._pending[batch.free :]
+        if frames:
+            self._append(batch, ordinal, frames)
+            self.counters.frames += len(frames)
+        self._wake_when_due(now_ns + _SHORTEST_SLEEP_NS if batch.free else _AT_ONCE)
+        return len(frames)
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Let the devices hear one frame.
+
+        Raises:
+            BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
+        """
+        refusal = self._refusal(payload)
+        if refusal:
+            self.counters.send_failures += 1
+            raise BusSendError(f"{self!r}: {refusal}")
+        self.hardware.receive(identifier, payload, self._clock())
+        self.counters.sent += 1
+        self._wake_when_due()
+
+    def close(self) -> None:
+        """Stop to listen; the devices live on. Idempotent."""
+        if self._timer is not None:
+            self._timer.close()
+            self._timer = None
+        self._pending = []
+
+    @property
+    def note(self) -> str:
+        """That this is no real hardware."""
+        return f"emulated {self.channel or DEFAULT_EMULATOR}"
+
+    # Faults of the bus itself, for tests
+
+    def fail_next_receive(self, error: BusError) -> None:
+        """Let the next ``receive`` raise ``error``, and wake whoever waits for it."""
+        self._next_error = error
+        self._wake_at(_AT_ONCE)
+
+    def vanish(self) -> None:
+        """Go away as an unplugged interface does: ``receive`` raises, and ``open`` until :meth:`come_back`."""
+        self._present = False
+        self.fail_next_receive(BusNotAvailable(f"{self!r}: the emulated interface went away"))
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`. Who has not noticed it yet is still told once."""
+        self._present = True
+
+    # Within
+
+    def _fetch(self, now_ns: int) -> None:
+        if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self.counters.lost += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        frames = self.hardware.emit(now_ns)
+        if self.payload_size < 64:
+            fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
+            self.counters.refused += len(frames) - len(fitting)
+            frames = fitting
+        self._pending += frames
+
+    def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
+        """Write all frames as rows of ``struct can_frame`` at once."""
+        pack = self._row.pack
+        rows = b"".join([pack(identifier, len(payload), 0, 0, payload) for _, identifier, payload in frames])
+        stop = batch.stop + len(frames)
+        batch.wire[batch.stop : stop] = np.frombuffer(rows, batch.wire.dtype)
+        batch.time_ns[batch.stop : stop] = [frame.time_ns for frame in frames]
+        batch.bus[batch.stop : stop] = ordinal
+        batch.stop = stop
+
+    def _wake_when_due(self, rest_until_ns: int = _AT_ONCE) -> None:
+        """Become readable when a frame is due, but not before ``rest_until_ns``; at once while some wait."""
+        if self._pending:
+            self._wake_at(_AT_ONCE)
+            return
+        self._due_ns = due_ns = self.hardware.next_due_ns()
+        self._wake_at(None if due_ns is None else max(due_ns, rest_until_ns))
+
+    def _wake_at(self, time_ns: int | None) -> None:
+        if self._timer is not None:
+            self._timer.wake_at(time_ns)
+
+    def _refusal(self, payload: bytes) -> str:
+        if self.listen_only:
+            return "opened to listen only"
+        if self._timer is None or not self._present:
+            return "not open"
+        if len(payload) > self.payload_size:
+            return f"a payload of {len(payload)} bytes on a bus of {self.payload_size}-byte frames"
+        return ""
+
+
+__all__ = ["DEFAULT_EMULATOR", "VirtualCanBus"]

@@ -1,0 +1,130 @@
+"""The capacitance converters of a board and what its firmware makes of them: settings, baseline, acquisitions."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.virtual.faults import BoardFaults
+from skinware_drivers.virtual.firmware import (
+    CHANNELS,
+    FINGERTIP,
+    TRIANGLES,
+    Arithmetic,
+    ArrayI,
+    Sample,
+    triangle_payloads,
+)
+from skinware_drivers.virtual.touch import DEFAULT_CDC_OFFSET, Touch
+
+DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD, DEFAULT_SHIFT = 0, 245, 2
+"""icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp"""
+
+_LARGEST_SHIFT = 31
+_AHEAD = 16
+"""Acquisitions that are computed together: numpy needs hardly longer for them than for one."""
+
+
+class Acquisition(NamedTuple):
+    """What one acquisition gives."""
+
+    time_ns: int
+    payloads: list[bytes]
+    """HEAD, TAIL, HEAD ... of all 16 triangles."""
+    no_ack: npt.NDArray[np.bool_]
+    """(16,) triangles with a channel that did not acknowledge."""
+
+
+class Converters:
+    """The 16 converters of a board, with default settings and no baseline.
+
+    Args:
+        touch: what they feel.
+        faults: what is wrong with them.
+        mtb3: they belong to the older kind of board.
+        short_tail: the second frame has no diagnostics.
+    """
+
+    def __init__(self, touch: Touch, faults: BoardFaults, *, mtb3: bool, short_tail: bool) -> None:
+        self._touch, self._faults = touch, faults
+        self._mtb3, self._short_tail = mtb3, short_tail
+        self._skin_type, self._no_load = DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD
+        self._shift = [DEFAULT_SHIFT] * TRIANGLES
+        self._cdc_offset = np.full((TRIANGLES, 1), DEFAULT_CDC_OFFSET, np.int64)
+        self._baseline: ArrayI = np.zeros((TRIANGLES, CHANNELS), np.int64)
+        self._ahead: deque[Acquisition] = deque()
+        self._ahead_version = faults.version
+        self._settings_changed()
+
+    def set_board(self, skin_type: int, no_load: int) -> None:
+        """Settings of all triangles."""
+        self._skin_type, self._no_load = skin_type, no_load
+        self._settings_changed()
+
+    def set_triangles(self, first: int, last: int, shift: int, cdc_offset: int) -> None:
+        """Settings of the triangles ``first`` to ``last``."""
+        self._shift[first : last + 1] = [min(shift, _LARGEST_SHIFT)] * (last + 1 - first)
+        self._cdc_offset[first : last + 1] = cdc_offset
+        self._settings_changed()
+
+    def set_shift(self, shift: int) -> None:
+        """The same shift for all triangles."""
+        self._shift = [shift] * TRIANGLES
+        self._settings_changed()
+
+    def set_cdc_offset(self, cdc_offset: int) -> None:
+        """The same offset for all triangles."""
+        self._cdc_offset[:] = cdc_offset
+        self._settings_changed()
+
+    def calibrate(self, time_ns: int, cycle: int) -> None:
+        """Take what is read at ``time_ns`` as the new baseline of all triangles.
+
+        A triangle that is not connected then reads its no-load value and is flagged; one that does not
+        acknowledge reads its no-load value and is **not** flagged any more (``fill`` in
+        icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp: 0 is an error only
+        beside a baseline that is not 0).
+        """
+        self._baseline = self._read(np.array([time_ns]), np.array([cycle]))[0]
+        self._ahead.clear()
+
+    def acquire(self, time_ns: int, cycle: int, period_ns: int) -> Acquisition:
+        """What the skin feels at ``time_ns``; the next call is likely to come one period later."""
+        ahead = self._ahead
+        if ahead and ahead[0].time_ns == time_ns and self._ahead_version == self._faults.version:
+            return ahead.popleft()
+        ahead.clear()
+        self._ahead_version = self._faults.version
+        steps = np.arange(_AHEAD)
+        ahead.extend(self._acquisitions(time_ns + steps * period_ns, cycle + steps, {}))
+        return ahead.popleft()
+
+    def acquire_values(self, time_ns: int, cycle: int, values: Mapping[int, Sequence[int]]) -> Acquisition:
+        """An acquisition with true flags, but with ``values`` (by triangle, 12 of 0-255) as they are."""
+        return self._acquisitions(np.array([time_ns]), np.array([cycle]), values)[0]
+
+    def _acquisitions(self, times_ns: ArrayI, cycles: ArrayI, values: Mapping[int, Sequence[int]]) -> list[Acquisition]:
+        raw = self._read(times_ns, cycles)
+        self._faults.break_taxels(raw, self._baseline, self._arithmetic.bottom)
+        sample: Sample = self._arithmetic.sample(raw, self._baseline)
+        for triangle, twelve in values.items():
+            sample.values[:, triangle] = twelve
+        payloads = triangle_payloads(sample, short_tail=self._short_tail)
+        return [Acquisition(*parts) for parts in zip(times_ns.tolist(), payloads, sample.no_ack, strict=True)]
+
+    def _read(self, times_ns: ArrayI, cycles: ArrayI) -> ArrayI:
+        """(n, 16, 12) what the registers hold."""
+        raw = self._touch.capacitances(times_ns, cycles, self._cdc_offset, fingertip=self._skin_type == FINGERTIP)
+        self._faults.distort(raw)
+        return raw
+
+    def _settings_changed(self) -> None:
+        self._arithmetic = Arithmetic(self._skin_type, self._no_load, tuple(self._shift), self._mtb3)
+        self._ahead.clear()
+
+
+__all__ = ["DEFAULT_NO_LOAD", "DEFAULT_SHIFT", "DEFAULT_SKIN_TYPE", "Acquisition", "Converters"]

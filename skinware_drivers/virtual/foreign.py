@@ -1,0 +1,81 @@
+"""Frames of other devices on the bus: a skin driver has to let them pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skinware_drivers.virtual import events
+from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.wire import Transmission, Transmitter
+
+_EXTENDED_FLAG = 0x8000_0000
+
+
+class ForeignTraffic:
+    """Devices that send at random moments, ``rate_hz`` frames a second on average.
+
+    Motor boards (class 1), strain gauges (class 3, which is also the old class of skin data), a skin board that
+    nobody configured (class 4), inertial sensors (class 5), and 29-bit frames that end in the bits of a skin frame
+    (classes: icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h).
+
+    Args:
+        boards: addresses of the emulated boards; no 11-bit frame comes from one of these.
+        rate_hz: more than 0.
+        seed: of the patch.
+        transmitter: place on the wire.
+        log: takes the events.
+        counts: totals, of which ``foreign`` is counted.
+        now_ns: when the devices begin.
+    """
+
+    def __init__(
+        self,
+        boards: Sequence[int],
+        rate_hz: float,
+        seed: int,
+        transmitter: Transmitter,
+        log: EventLog,
+        counts: dict[str, int],
+        now_ns: int,
+    ) -> None:
+        self._random = np.random.default_rng([seed, len(boards), 2])
+        self._pause_ns = 1e9 / rate_hz
+        self._transmitter, self._log, self._counts = transmitter, log, counts
+        others = [address for address in range(1, 15) if address not in boards]
+        self._identifiers = [
+            message_class << 8 | address << 4 | low
+            for message_class, low in ((1, 0), (1, 3), (3, 10), (3, 11), (4, 2), (5, 3))
+            for address in others
+        ] + [_EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in boards]
+        self._next_ns = now_ns
+        self._wait()
+
+    def _wait(self) -> None:
+        self._next_ns += 1 + int(self._random.exponential(self._pause_ns))
+
+    def next_event_ns(self) -> int:
+        """When the next frame is handed to the wire."""
+        return self._next_ns
+
+    def run(self, now_ns: int) -> None:
+        """Queue what is due."""
+        while self._next_ns <= now_ns:
+            identifier = self._identifiers[int(self._random.integers(len(self._identifiers)))]
+            payload = self._random.bytes(int(self._random.integers(0, 8, endpoint=True)))
+            self._transmitter.queue.append(Transmission(self._next_ns, [identifier], [payload]))
+            self._counts["foreign"] += 1
+            self._log.append(events.ForeignFrame(time_ns=self._next_ns, identifier=identifier, length=len(payload)))
+            self._wait()
+
+    def skip_to(self, now_ns: int) -> int:
+        """Leave out what is due before ``now_ns``; returns how many frames that would have been, on average."""
+        missed_ns = now_ns - self._next_ns
+        if missed_ns <= 0:
+            return 0
+        self._next_ns = now_ns
+        return 1 + int(missed_ns / self._pause_ns)
+
+
+__all__ = ["ForeignTraffic"]

@@ -1,0 +1,92 @@
+"""The contract of emulated hardware: frames in, frames out, driven by a clock that the caller owns."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.options import nearest_name
+
+EMULATORS = "skinware.emulators"
+"""The entry point group in which emulators register, under the name of the driver they serve."""
+
+
+class WireFrame(NamedTuple):
+    """One frame that emulated hardware puts on the wire."""
+
+    time_ns: int
+    """When it went onto the wire, CLOCK_MONOTONIC ns."""
+    identifier: int
+    """With ``EXTENDED_FLAG`` for 29-bit identifiers, as in :class:`skinware_drivers.bus.FrameBatch`."""
+    payload: bytes
+
+
+class EventLog(Protocol):
+    """Where emulated hardware writes down what it did: a plain list will do."""
+
+    def append(self, event: msgspec.Struct, /) -> None:
+        """Take one event. Events come in order of time, except those of a burst, which come together."""
+
+
+class EmulatedHardware(Protocol):
+    """Devices on one bus. They never sleep and read no clock: whoever carries their frames tells the time.
+
+    The devices are powered up by the first call that tells a time (so a carrier starts with ``skip``). A time
+    earlier than one told before counts as that one.
+
+    ``Options`` is a ``msgspec.Struct`` whose fields are the emulator's options: ``skin-emulate`` turns them
+    into command-line options, ``--bus virtual?key=value`` into bus options.
+    """
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        """Take one frame from the bus. Frames that mean nothing to the devices are ignored."""
+
+    def next_due_ns(self) -> int | None:
+        """When ``emit`` is worth calling again; None while everything is silent.
+
+        No frame is due earlier. It can turn out that nothing is due (a burst of which every frame got lost).
+        """
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        """Everything due at ``now_ns`` that was not given before, oldest first, stamped with when it was due."""
+
+    def skip(self, now_ns: int) -> int:
+        """Let the devices run on to ``now_ns`` with nobody listening: cheap, however long it was.
+
+        Returns:
+            The number of frames that went unheard.
+        """
+
+    def totals(self) -> dict[str, int]:
+        """Exact counts since power-up; at least ``frames`` (given by ``emit``), ``bursts``, ``commands``."""
+
+
+class HardwareFactory(Protocol):
+    """What the entry points of group ``skinware.emulators`` name: a class with ``Options``."""
+
+    Options: type[msgspec.Struct]
+
+    def __call__(self, options: Any, *, log: EventLog | None = None) -> EmulatedHardware:
+        """Make the devices. ``options`` is an instance of ``Options``; ``log`` takes what they do."""
+
+
+def load_emulator(name: str) -> HardwareFactory:
+    """The emulator that is registered under ``name``.
+
+    Raises:
+        ConfigurationError: there is none of that name, or it cannot be loaded.
+    """
+    known = {entry.name: entry for entry in entry_points(group=EMULATORS)}
+    if name not in known:
+        raise ConfigurationError(f"unknown emulator {name!r}{nearest_name(name, known)}")
+    try:
+        loaded: HardwareFactory = known[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"emulator {name!r} ({known[name].value}) cannot be loaded: {error}") from error
+    return loaded
+
+
+__all__ = ["EMULATORS", "EmulatedHardware", "EventLog", "HardwareFactory", "WireFrame", "load_emulator"]

@@ -1,0 +1,56 @@
+"""Puts the emulated boards of a patch together, as its options say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinware_drivers.virtual.boards import Board, BoardParts
+from skinware_drivers.virtual.faults import BoardFaults
+from skinware_drivers.virtual.foreign import ForeignTraffic
+from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.mtb3 import Mtb3
+from skinware_drivers.virtual.mtb4 import Mtb4
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.touch import Touch, WireSource, cycle_pattern
+from skinware_drivers.virtual.wire import Wire
+
+
+def make_boards(
+    options: RoboskinOptions,
+    wire: Wire,
+    log: EventLog,
+    counts: dict[str, int],
+    source: WireSource | None,
+    now_ns: int,
+) -> list[Board]:
+    """The boards in the order of the option ``boards``, each powered up at ``now_ns`` and with its own phase."""
+    if source is None and options.pattern == "cycle":
+        source = cycle_pattern
+    phases = np.random.default_rng([options.seed, len(options.boards)]).uniform(0.02, 1, len(options.boards))
+    boards: list[Board] = []
+    for ordinal, address in enumerate(options.boards):
+        parts = BoardParts(
+            touch=Touch(options.seed, ordinal, pressed=options.pattern == "touch"),
+            transmitter=wire.attach(),
+            faults=BoardFaults(options, address, ordinal),
+            log=log,
+            counts=counts,
+            phase=float(phases[ordinal]),
+            source=source,
+            short_tail=options.short_tail,
+            tail_class=options.tail_class,
+        )
+        boards.append((Mtb3 if address in options.mtb3 else Mtb4)(address, parts, now_ns))
+    return boards
+
+
+def make_foreign_traffic(
+    options: RoboskinOptions, wire: Wire, log: EventLog, counts: dict[str, int], now_ns: int
+) -> list[ForeignTraffic]:
+    """The other devices on the bus, where the options want any."""
+    if not options.foreign_hz:
+        return []
+    return [ForeignTraffic(options.boards, options.foreign_hz, options.seed, wire.attach(), log, counts, now_ns)]
+
+
+__all__ = ["make_boards", "make_foreign_traffic"]

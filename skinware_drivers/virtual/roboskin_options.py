@@ -1,0 +1,123 @@
+"""The options of the emulated ROBOSKIN patches and what they mean (imports nothing slow: ``--help`` shows them)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.options import check_options
+
+Probability = Annotated[float, Meta(ge=0, le=1)]
+Seconds = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0)]
+
+_PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
+_LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
+
+
+class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which boards there are, what they feel, and what is wrong with them.
+
+    Raises:
+        ConfigurationError: an option is out of its limits, or names a board that is not there.
+    """
+
+    boards: Annotated[tuple[int, ...], Meta(description="CAN addresses of the boards, 1-14")] = (7, 8, 9, 10)
+    mtb3: Annotated[
+        tuple[int, ...], Meta(description="which of the boards are of the older kind MTB3; the others are MTB4")
+    ] = ()
+    pattern: Annotated[
+        Literal["touch", "idle", "cycle"],
+        Meta(description="what is felt: a wandering press, nothing, or each burst's number modulo 256"),
+    ] = "touch"
+    seed: Annotated[Count, Meta(description="another seed, another touch and other random faults")] = 0
+    streaming: Annotated[
+        bool, Meta(description="stream from power-up, as if a host had configured the boards already")
+    ] = False
+    short_tail: Annotated[
+        bool, Meta(description="old firmware: the second frame of a triangle has 6 bytes and no diagnostics")
+    ] = False
+    tail_class: Annotated[
+        int,
+        Meta(ge=0, le=7, description="message class of the second frame; 6 in the firmware variant for TLR"),
+    ] = 4
+
+    lose: Annotated[Probability, Meta(description="probability of each data frame to get lost")] = 0.0
+    wrong_length: Annotated[
+        Probability, Meta(description="probability of each data frame to have a wrong number of bytes")
+    ] = 0.0
+    jitter_us: Annotated[Count, Meta(description="longest random delay of a burst, in microseconds")] = 0
+    foreign_hz: Annotated[float, Meta(ge=0, le=10_000, description="frames a second from other devices on the bus")] = (
+        0.0
+    )
+    dead: Annotated[tuple[int, ...], Meta(description="boards that die, after dead_after_s or dead_after_cycles")] = ()
+    dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 0.0
+    dead_after_cycles: Annotated[
+        Count | None, Meta(description="bursts that they still send, instead of dead_after_s")
+    ] = None
+    restart: Annotated[
+        tuple[int, ...], Meta(description="boards that lose power for a moment, after restart_after_s")
+    ] = ()
+    restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
+    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted board hears nothing")] = 0.5
+    not_connected: Annotated[
+        tuple[str, ...], Meta(description="triangles that were never plugged in, as BOARD/TRIANGLE")
+    ] = ()
+    unplugged: Annotated[tuple[str, ...], Meta(description="triangles that get unplugged, as BOARD/TRIANGLE")] = ()
+    unplugged_after_cycles: Annotated[Count, Meta(description="bursts of the board before that")] = 20
+    no_ack: Annotated[tuple[str, ...], Meta(description="triangles that stop to acknowledge, as BOARD/TRIANGLE")] = ()
+    no_ack_after_cycles: Annotated[Count, Meta(description="bursts of the board before that")] = 20
+    out_of_range: Annotated[
+        tuple[str, ...], Meta(description="broken taxels, far out of range, as BOARD/TRIANGLE/TAXEL")
+    ] = ()
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if not self.boards:
+            raise ConfigurationError("option boards: at least one board is needed")
+        for address in self.boards:
+            if not 1 <= address <= 14:
+                raise ConfigurationError(
+                    f"option boards: address {address} is outside 1-14 (0 is the host, 15 all boards)"
+                )
+        if len(set(self.boards)) < len(self.boards):
+            raise ConfigurationError("option boards: an address is given twice")
+        for name in ("mtb3", "dead", "restart"):
+            self._check_boards(name, getattr(self, name))
+        for name, depth in (("not_connected", 2), ("unplugged", 2), ("no_ack", 2), ("out_of_range", 3)):
+            self._check_boards(name, [place[0] for place in self.places(name, depth)])
+
+    def places(self, name: str, depth: int) -> list[tuple[int, ...]]:
+        """The places that a list option names, as numbers.
+
+        Args:
+            name: of the option.
+            depth: 2 for (board, triangle), 3 for (board, triangle, taxel).
+
+        Raises:
+            ConfigurationError: a text is not of that form, or a number is out of its limits.
+        """
+        found: list[tuple[int, ...]] = []
+        for text in getattr(self, name):
+            parts = text.split("/")
+            if len(parts) != depth or not all(part.isascii() and part.isdigit() for part in parts):
+                raise ConfigurationError(f"option {name}: {text!r} is not of the form {_PLACES[depth - 1]}")
+            numbers = tuple(int(part) for part in parts)
+            for (what, first, last), number in zip(_LIMITS, numbers, strict=False):
+                if not first <= number <= last:
+                    raise ConfigurationError(f"option {name}: {what} {number} in {text!r} is outside {first}-{last}")
+            found.append(numbers)
+        return found
+
+    def _check_boards(self, name: str, addresses: list[int] | tuple[int, ...]) -> None:
+        for address in addresses:
+            if address not in self.boards:
+                raise ConfigurationError(
+                    f"option {name}: there is no board {address}; boards={','.join(map(str, self.boards))}"
+                )
+
+
+__all__ = ["RoboskinOptions"]

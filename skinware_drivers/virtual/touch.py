@@ -1,0 +1,99 @@
+"""What the skin of one board feels: capacitances of a hand that wanders, presses and lets go, and of a warm robot.
+
+Everything is a function of the time and the seed alone, so that runs can be repeated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.virtual.firmware import CHANNELS, TRIANGLES, ArrayI
+
+WireSource = Callable[[int, int, int, int], Sequence[int]]
+"""(board address, triangle, cycle, time in ns) -> the 12 values that go on the wire, 0-255, whatever is felt."""
+
+DEFAULT_CDC_OFFSET = 0x2200
+"""icub-firmware:emBODY/eBcode/arch-arm/board/mtb4/application/src/others/AD7147.c"""
+
+_THERMAL_PADS = (6, 10)
+_WARMTH = np.array([70, 96, 83, 38, 38, 70, 128, 45, 77, 164, 128, 77]) / 128
+"""How strongly each channel follows the warmth of its triangle; 1 for the thermal pads."""
+_PRESS_COUNTS = 480
+"""Capacitance counts of a firm press: 120 of the values on the wire at the usual shift of 2."""
+_PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
+_BLOB_RADIUS = 0.7
+"""Of the pressed spot; triangles are 1 apart."""
+_NOISE_SCALE, _NOISE_LIMIT = 2.5, 7
+"""Of the noise, in counts: at most 2 of the values on the wire at a shift of 2."""
+_NOISE_PERIOD = 61
+
+
+class Touch:
+    """The capacitances of one board.
+
+    Args:
+        seed: of the whole patch; boards with different ``ordinal`` feel different things.
+        ordinal: of the board in the patch.
+        pressed: False for a skin that nobody touches.
+    """
+
+    def __init__(self, seed: int, ordinal: int, *, pressed: bool = True) -> None:
+        random = np.random.default_rng([seed, ordinal])
+        self._pressed = pressed
+        self._rest = random.integers(0x8800, 0x9800, (TRIANGLES, CHANNELS))
+        noise = random.normal(0, _NOISE_SCALE, (_NOISE_PERIOD, TRIANGLES, CHANNELS))
+        self._noise = np.clip(np.rint(noise), -_NOISE_LIMIT, _NOISE_LIMIT).astype(np.int64)
+        self._warmth_phase = random.uniform(0, 2 * math.pi, (TRIANGLES, 1))
+        self._press_phase_s, self._path_phase = random.uniform(0, _PRESS_S + _PAUSE_S), random.uniform(0, 9)
+        triangle, channel = np.divmod(np.arange(TRIANGLES * CHANNELS), CHANNELS)
+        angle = channel * (2 * math.pi / CHANNELS)
+        self._x = (triangle % 4 + 0.35 * np.cos(angle)).reshape(TRIANGLES, CHANNELS)
+        self._y = (triangle // 4 + 0.35 * np.sin(angle)).reshape(TRIANGLES, CHANNELS)
+
+    def capacitances(self, times_ns: ArrayI, cycles: ArrayI, cdc_offset: ArrayI, *, fingertip: bool) -> ArrayI:
+        """(n, 16, 12) what the converters read, 1-65534.
+
+        Args:
+            times_ns: (n,) of the acquisitions, since anything.
+            cycles: (n,) of the board, for the noise.
+            cdc_offset: (16, 1) the converters' offset; what it adds is taken off the reading, count for count
+                (assumed: the real scale is the converter's affair and vanishes with the next calibration).
+            fingertip: all 12 channels feel pressure, and none warmth.
+        """
+        times_s = times_ns[:, np.newaxis, np.newaxis].astype(np.float64) * 1e-9
+        raw: ArrayI = self._rest + self._noise[cycles % _NOISE_PERIOD]
+        if self._pressed:
+            pressure = self._pressure(times_s)
+            if not fingertip:
+                pressure[:, :, _THERMAL_PADS] = 0
+            raw += pressure
+        if not fingertip:
+            phase = self._warmth_phase
+            warmer = 60 * np.sin(times_s * (2 * math.pi / 120) + phase)
+            warmer += 25 * np.sin(times_s * (2 * math.pi / 37) + 2 * phase)
+            raw += (warmer * _WARMTH).astype(np.int64)
+        raw -= cdc_offset - DEFAULT_CDC_OFFSET
+        return np.clip(raw, 1, 0xFFFE, out=raw)
+
+    def _pressure(self, times_s: npt.NDArray[np.float64]) -> ArrayI:
+        """(n, 16, 12) counts that a press adds."""
+        moment_s = (times_s + self._press_phase_s) % (_PRESS_S + _PAUSE_S)
+        ramp = np.clip(np.minimum(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0, 1)
+        strength = _PRESS_COUNTS * (0.5 - 0.5 * np.cos(math.pi * ramp))
+        at = times_s + self._path_phase
+        centre_x, centre_y = 1.5 + 1.5 * np.sin(0.71 * at), 1.5 + 1.5 * np.sin(0.53 * at + 1)
+        distance2 = (self._x - centre_x) ** 2 + (self._y - centre_y) ** 2
+        pressure: ArrayI = (strength * np.exp(distance2 * (-0.5 / _BLOB_RADIUS**2))).astype(np.int64)
+        return pressure
+
+
+def cycle_pattern(board: int, triangle: int, cycle: int, time_ns: int) -> Sequence[int]:  # noqa: ARG001 - a WireSource
+    """A source of which all 12 values of a triangle are the cycle's number modulo 256: torn data shows."""
+    return (cycle & 0xFF,) * CHANNELS
+
+
+__all__ = ["DEFAULT_CDC_OFFSET", "Touch", "WireSource", "cycle_pattern"]

@@ -7,7 +7,7 @@ Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -174,7 +174,7 @@ class DriverWriter:
             "patch_counter_name": np.array([name.encode() for name in patch_counters], "S24"),
         }
 
-    def __enter__(self) -> DriverWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -283,7 +283,7 @@ class Skin:
             return f"no driver runs in namespace {self.namespace.name!r}; start one (skin-driver --bus ...)"
         return f"no driver of namespace {self.namespace.name!r} published anything newer: {', '.join(self._readers)}"
 
-    def __enter__(self) -> Skin:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -47,11 +47,11 @@ class Adapter(ABC, Generic[OptionsT]):
     """One bus of a driver: what hangs on it, what its frames mean, and how to get it going.
 
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
-    ``recover`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines of one event
-    loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went down); the runner
+    ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
+    of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went down); the runner
     then says so and tries again later.
 
-    In listen-only mode only ``describe`` and ``recover`` are called, and every send is refused.
+    In listen-only mode only ``describe`` and ``join`` are called, and every send is refused.
 
     Attributes:
         medium: kind of bus: ``can``.
@@ -93,13 +93,16 @@ class Adapter(ABC, Generic[OptionsT]):
     async def stop(self, link: Link) -> None:
         """Make them silent."""
 
-    async def recover(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Try to get a silent patch going again.
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Ask a patch that sends no data whether it is there; it is asked again as long as it is silent.
 
         Returns:
-            True if it answered and was set up anew; False: nothing was done, it is asked again later.
+            True if it answered: it has restarted, and ``revive`` is called next.
         """
         return False
+
+    async def revive(self, link: Link, patch: Patch) -> None:
+        """Set one patch up anew and start it, without disturbing the others."""
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
         """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""

@@ -82,7 +82,7 @@ class FrameBatch:
         row = self.wire[self.stop]
         row["identifier"] = identifier
         row["length"] = len(payload)
-        row["payload"][: len(payload)] = np.frombuffer(payload, np.uint8)
+        row["payload"] = np.frombuffer(payload.ljust(self.payload_size, b"\0"), np.uint8)
         self.time_ns[self.stop] = time_ns
         self.bus[self.stop] = bus
         self.stop += 1

@@ -106,9 +106,9 @@ class Decoder:
         self._patch_of_entry = np.concatenate(
             [structure.module_patch, np.arange(self._n_patches), [self._n_patches]]
         ).astype(np.uint16)
-        self._length_ok = np.zeros((len(self._frames), 256), bool)
+        self._length_ok = np.zeros((len(self._frames) + 1, 256), bool)  # the last row: right for any frame
         for kind, frame in enumerate(self._frames):
-            self._length_ok[kind, list(frame.length)] = True
+            self._length_ok[[kind, -1], np.array(frame.length)[:, None]] = True
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], npt.NDArray[np.int64], npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
@@ -245,6 +245,7 @@ class Decoder:
         if self._header is not None:
             at, table = self._header
             kind = table[payload[:, at]]
+            kind[length <= at] = _NO_KIND  # what lies behind the end of a payload means nothing
             kind[~ours] = _NO_KIND
         else:
             kind = np.full(len(entry), _NO_KIND, np.uint8)
@@ -254,15 +255,17 @@ class Decoder:
                 for condition in frame.when:
                     if isinstance(condition, Byte):
                         match &= payload[:, condition.offset] & condition.mask == condition.value
+                        match &= length > condition.offset
                 kind[match] = number
         known = kind != _NO_KIND
-        bad_length = known & ~self._length_ok[np.where(known, kind, 0), length]
-        if bad_length.any():
-            kind[bad_length] = _NO_KIND
-            self.state.bus_counters[:, 1] += np.bincount(bus[bad_length], minlength=n_buses)
-        bad_content = ours & ~known
-        if bad_content.any():
-            self.state.bus_counters[:, 2] += np.bincount(bus[bad_content], minlength=n_buses)
+        length_ok = self._length_ok[np.where(known, kind, len(self._frames)), length]
+        kind[~length_ok] = _NO_KIND
+        wrong = ours & ((kind == _NO_KIND) | ~known)
+        if wrong.any():
+            rows = np.flatnonzero(wrong)
+            bad_length = bus[rows[~length_ok[rows]]]
+            self.state.bus_counters[:, 1] += np.bincount(bad_length, minlength=n_buses)
+            self.state.bus_counters[:, 2] += np.bincount(bus[rows[length_ok[rows]]], minlength=n_buses)
         return kind
 
     def _count_foreign(

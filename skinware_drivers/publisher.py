@@ -49,6 +49,7 @@ class Publisher:
         self._module_patch = structure.module_patch
         self._sensor_module = structure.sensor_module
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
+        self._behind = np.zeros(structure.n_modules, bool)
         self._first_touch_ns = 0
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
@@ -135,10 +136,19 @@ class Publisher:
         return bool((state.touched | ~living).all())
 
     def _stale_modules(self, time_ns: int) -> npt.NDArray[np.bool_]:
-        """Modules that missed their patch's last burst, or whose patch has been silent for too long."""
-        state = self._decoder.state
-        lag_ns = state.patch_time_ns[self._module_patch] - state.module_time_ns
-        limit_ns = self._period_ns // 2 if self._by_cycle else self._period_ns * 3 // 2
-        behind = (lag_ns > limit_ns) | (time_ns - state.module_time_ns > self._silence_ns)
-        stale: npt.NDArray[np.bool_] = behind & (state.module_time_ns > 0)
+        """Modules that missed their patch's last update, or that have been silent for too long.
+
+        By cycle, a module is behind if others of its patch were updated since the last publication and it was not,
+        and stays so until its own next update. At a rate, publications fall anywhere in a burst, so only time tells.
+        """
+        state, module_patch = self._decoder.state, self._module_patch
+        if self._by_cycle:
+            patch_updated = np.zeros(len(state.patch_time_ns), bool)
+            patch_updated[module_patch[state.updated]] = True
+            self._behind |= patch_updated[module_patch]
+            self._behind[state.updated] = False
+        else:
+            self._behind = state.patch_time_ns[module_patch] - state.module_time_ns > self._period_ns * 3 // 2
+        silent = time_ns - state.module_time_ns > self._silence_ns
+        stale: npt.NDArray[np.bool_] = (self._behind | silent) & (state.module_time_ns > 0)
         return stale

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import select
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -151,10 +151,8 @@ class Runner:
     async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
         for line in self.lines:
             if line.started and line.bus.fileno() >= 0:
-                try:
+                with _complaining(f"{line.name}: not stopped in good order"):
                     await asyncio.wait_for(line.adapter.stop(line.link), _STOP_TIMEOUT_S)
-                except (TimeoutError, BusError) as error:
-                    log.warning("%s: not stopped in good order: %s", line.name, error or "timed out")
         loop.remove_reader(self._epoll.fileno())
         if self._timer is not None:
             self._timer.cancel()
@@ -226,10 +224,9 @@ class Runner:
             timer.advance(now_ns())
         for patch in self._patches_in(line, PatchState.EXPECTED):
             log.warning("%s: %s sends no data", line.name, self._patch_name(patch))
-        if self.publisher is not None and not any(other.patches is None for other in self.lines):
-            if not self.ready:
-                self.ready = True
-                self._on_ready()
+        if self.publisher is not None and not self.ready:
+            self.ready = True
+            self._on_ready()
 
     async def _join_on_request(self, line: BusLine) -> None:
         while True:
@@ -320,6 +317,7 @@ class Runner:
         if len(foreign):
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
                 line.link.offer(batch, own)
+        self._update_bus_states()
         for updates in found:
             self.publisher.take(batch, updates)
         self._arm_timer()
@@ -355,7 +353,7 @@ class Runner:
 
     def _lose(self, line: BusLine, error: BusNotAvailable) -> None:
         line.state = BusState.DOWN if error.is_down else BusState.GONE
-        log.warning("%s; waiting for it to come back", error)
+        log.warning("%s; waiting for it to come back", str(error))  # a record that kept the error would keep us
         with contextlib.suppress(OSError):
             self._epoll.unregister(line.bus.fileno())
         line.bus.close()
@@ -386,20 +384,22 @@ class Runner:
         return self.publisher.silence_ns / NS_PER_S if self.publisher is not None else 0.5
 
     async def _recover_silent_patches(self, line: BusLine) -> None:
-        if self.publisher is None or self._watch is None or line.lost.is_set():
+        if self._listen_only or line.lost.is_set():
             return
-        silent = [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]
-        for patch in silent:
-            publisher = self.publisher
+        for patch in [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]:
+            publisher, watch = self.publisher, self._watch
+            if publisher is None or watch is None:
+                return
             try:
-                recovered = await line.adapter.recover(line.link, self._patch_of(line, patch))
+                if not await line.adapter.probe(line.link, self._patch_of(line, patch)):
+                    continue
+                log.warning("%s: %s is silent but answers: it has restarted", line.name, self._patch_name(patch))
+                publisher.patch_state[patch] = PatchState.RESTARTED
+                await line.adapter.revive(line.link, self._patch_of(line, patch))
+                watch.forget(patch)
             except BusError as error:
                 log.debug("%s: %s", line.name, error)
-                continue
-            if recovered and publisher is self.publisher:
-                publisher.patch_state[patch] = PatchState.RESTARTED
-                self._watch.forget(patch)
-                log.warning("%s: %s had restarted and was set up anew", line.name, self._patch_name(patch))
+                publisher.patch_state[patch] = PatchState.STALE
 
     def _patches_in(self, line: BusLine, state: PatchState) -> list[int]:
         if self.publisher is None or self.decoder is None:
@@ -458,3 +458,14 @@ class Runner:
                 }
             )
         return {"sequence": self.writer.sequence, "buses": buses, "patches": patches}
+
+
+@contextlib.contextmanager
+def _complaining(what: str) -> Iterator[None]:
+    """Say what went wrong with a bus, and go on."""
+    try:
+        yield
+    except BusError as error:
+        log.warning("%s: %s", what, str(error))
+    except asyncio.TimeoutError:
+        log.warning("%s: it took too long", what)

@@ -174,6 +174,23 @@ class RingReader(Generic[F]):
             f"give the service more slots (it has {self._count}) or publish less often"
         )
 
+    @property
+    def missed_periods(self) -> int:
+        """Periods that the writer missed."""
+        return self._words[_MISSED_PERIODS]
+
+    def publication_times_ns(self) -> list[int]:
+        """When the frames that the ring still holds were published, oldest first."""
+        times = []
+        latest = self.latest
+        for sequence in range(max(1, latest - self._count + 2), latest + 1):
+            word = (self._first + sequence % self._count * self._stride) // 8
+            time_ns = self._words[word + _PUBLISHED]
+            fence()
+            if self._words[word] == sequence:
+                times.append(time_ns)
+        return times
+
     def view(self) -> F | None:
         """The newest frame in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(_COPY_ATTEMPTS):

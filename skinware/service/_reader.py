@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy.typing as npt
 
@@ -36,6 +36,7 @@ class ServiceReader(Generic[F]):
         name: the service.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         timeout_s: how long to wait for the service to appear; 0 for not at all, None for ever.
+        announce: let others see this reader (``skin-info``).
 
     Raises:
         ServiceNotFound: it did not appear in time.
@@ -45,7 +46,14 @@ class ServiceReader(Generic[F]):
 
     frame_class: type[Any] = Frame
 
-    def __init__(self, name: str, *, namespace: Namespace | None = None, timeout_s: float | None = 0.0) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: Namespace | None = None,
+        timeout_s: float | None = 0.0,
+        announce: bool = True,
+    ) -> None:
         self.name = check_name(name, "service")
         self.namespace = namespace or Namespace()
         self.frames_taken = 0
@@ -54,7 +62,7 @@ class ServiceReader(Generic[F]):
         self._closed = False
         self._moved = False
         self._ring: RingReader[F] = self._attach_within(timeout_s)
-        self._announcement = Announcement(self.namespace, name)
+        self._announcement = Announcement(self.namespace, name) if announce else None
         self._record = ReaderRecord(name, os.getpid(), os.path.basename(sys.argv[0] or sys.executable), "on demand")
         self._announced_ns = self._announced_frames = 0
         self._announce(None)
@@ -78,6 +86,28 @@ class ServiceReader(Generic[F]):
     def structure_changed(self) -> bool:
         """Whether the service came back with other columns, so that ``reattach`` is due."""
         return self._moved
+
+    @property
+    def kind(self) -> str:
+        """What the service's columns mean: ``driver``, ``data``."""
+        return bytes(self._ring.segment.header["kind"]).decode()
+
+    @property
+    def writer_pid(self) -> int:
+        """Process id of the writer, in the writer's own pid namespace."""
+        return int(self._ring.segment.header["writer_pid"])
+
+    @property
+    def missed_periods(self) -> int:
+        """Periods that the writer missed."""
+        return self._ring.missed_periods
+
+    def rate_hz(self) -> float | None:
+        """How often the writer publishes, from the times of the frames that the ring holds; None for fewer than two."""
+        times = self._ring.publication_times_ns()
+        if len(times) < 2 or times[-1] == times[0]:
+            return None
+        return round((len(times) - 1) * NS_PER_S / (times[-1] - times[0]), 3)
 
     @property
     def latest(self) -> Position | None:
@@ -177,7 +207,8 @@ class ServiceReader(Generic[F]):
     def close(self) -> None:
         """Stop reading and take the announcement back. Frames that were handed out stay readable. Idempotent."""
         self._closed = True
-        self._announcement.close()
+        if self._announcement is not None:
+            self._announcement.close()
         self._ring.segment.descriptor.close()
 
     # -- attaching ----------------------------------------------------------------------------------------------
@@ -288,7 +319,7 @@ class ServiceReader(Generic[F]):
     def _announce(self, frame: Frame | None) -> None:
         time_ns = now_ns()
         passed_ns = time_ns - self._announced_ns
-        if passed_ns < _ANNOUNCE_EVERY_NS:
+        if passed_ns < _ANNOUNCE_EVERY_NS or self._announcement is None:
             return
         record = self._record
         if self._announced_ns:
@@ -299,7 +330,7 @@ class ServiceReader(Generic[F]):
         self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, self.frames_taken
 
-    def __enter__(self) -> ServiceReader[F]:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 import numpy.typing as npt
 
@@ -166,7 +166,7 @@ class ServiceWriter:
             self._ring.segment.descriptor.close()
             self._ring = ring
 
-    def __enter__(self) -> ServiceWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -150,7 +150,7 @@ class BaselineWatch(Watch):
         moved = self._cycles >= _RECALIBRATION_CYCLES
         if moved.any():
             module_patch = self.tables.structure.module_patch
-            self.module_status[np.isin(module_patch, module_patch[moved])] |= Status.SUSPECT
+            self.module_status[np.isin(module_patch, module_patch[moved])] |= np.uint8(Status.SUSPECT)
 
     def forget(self, patch: int) -> None:
         """The board was set up anew, so its baseline is known again."""
@@ -219,17 +219,18 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         for board in self._boards:
             await link.send(0x200 | board, b"\x07\x01")
 
-    async def recover(self, link: Link, patch: Patch) -> bool:
-        """A board that is silent but answers a request for its version has restarted: set it up, and it alone."""
-        if link.listen_only:
-            return False
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Ask for the version by unicast: a silent board that answers has restarted."""
         try:
             await self._version(link, patch.key)
         except HandshakeTimeout:
             return False
+        return True
+
+    async def revive(self, link: Link, patch: Patch) -> None:
+        """Set up and start one board (command 50 re-baselines every triangle that it reaches)."""
         await self._configure(link, (patch.key,))
         await link.send(0x200 | patch.key, b"\x07\x00")
-        return True
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:

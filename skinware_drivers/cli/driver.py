@@ -68,7 +68,7 @@ def command(
     verbose: bool,
     **driver_options: str | None,
 ) -> None:
-    """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
+    r"""Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
     \b
     skin-driver --bus vcan0                    ROBOSKIN boards on a CAN interface

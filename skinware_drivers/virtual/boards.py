@@ -86,6 +86,7 @@ class Board:
 
     def _power_up(self, ready_ns: int) -> None:
         self._ready_ns = ready_ns
+        self.parts.touch.stream_from(None)
         self.next_burst_ns: int | None = None
         self.next_inertial_ns: int | None = None
         self._inertial_mask = self._inertial_period_ns = 0
@@ -318,6 +319,8 @@ class Board:
         """Stream from here on. A period of 0 is none."""
         phase_ns = max(1, round(self.parts.phase * self._period_ns))
         self.next_burst_ns = now_ns + phase_ns if self._period_ns else None
+        if not self.parts.touch.streams:
+            self.parts.touch.stream_from(self.next_burst_ns)
 
     def _send_version(self, host: int, payload: bytes, now_ns: int) -> None:
         """GET_FW_VERSION (0x1C): compatible means the same major protocol and no older minor one.

@@ -1,6 +1,7 @@
 """What the skin of one board feels: capacitances of a hand that wanders, presses and lets go, and of a warm robot.
 
-Everything is a function of the time and the seed alone, so that runs can be repeated.
+Everything is a function of time and seed, so that runs can be repeated. Nobody presses before a board streams, nor
+for a second after that: otherwise a press would be taken for the idle state whenever a host starts the board.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ _PRESS_COUNTS = 480
 _PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
 _BLOB_RADIUS = 0.7
 """Of the pressed spot; triangles are 1 apart."""
-_NOISE_SCALE, _NOISE_LIMIT = 2.5, 7
-"""Of the noise, in counts: at most 2 of the values on the wire at a shift of 2."""
+_CALM_S = 1.0
+_NOISE_SCALE, _NOISE_LIMIT = 1.8, 4
+"""Of the noise, in counts: at most 2 of the values on the wire at a shift of 2, baseline and reading together."""
 _NOISE_PERIOD = 61
 
 
@@ -47,12 +49,23 @@ class Touch:
         self._rest = random.integers(0x8800, 0x9800, (TRIANGLES, CHANNELS))
         noise = random.normal(0, _NOISE_SCALE, (_NOISE_PERIOD, TRIANGLES, CHANNELS))
         self._noise = np.clip(np.rint(noise), -_NOISE_LIMIT, _NOISE_LIMIT).astype(np.int64)
+        self._noise[:, :, _THERMAL_PADS] //= 4
         self._warmth_phase = random.uniform(0, 2 * math.pi, (TRIANGLES, 1))
-        self._press_phase_s, self._path_phase = random.uniform(0, _PRESS_S + _PAUSE_S), random.uniform(0, 9)
+        self._first_press_s, self._path_phase = _CALM_S + random.uniform(0, _PAUSE_S), random.uniform(0, 9)
+        self._streams_from_ns: int | None = None
         triangle, channel = np.divmod(np.arange(TRIANGLES * CHANNELS), CHANNELS)
         angle = channel * (2 * math.pi / CHANNELS)
         self._x = (triangle % 4 + 0.35 * np.cos(angle)).reshape(TRIANGLES, CHANNELS)
         self._y = (triangle // 4 + 0.35 * np.sin(angle)).reshape(TRIANGLES, CHANNELS)
+
+    def stream_from(self, time_ns: int | None) -> None:
+        """Say when the board began to stream, or (None) that it does not: it lost its power."""
+        self._streams_from_ns = time_ns
+
+    @property
+    def streams(self) -> bool:
+        """Whether the board has begun to stream."""
+        return self._streams_from_ns is not None
 
     def capacitances(self, times_ns: ArrayI, cycles: ArrayI, cdc_offset: ArrayI, *, fingertip: bool) -> ArrayI:
         """(n, 16, 12) what the converters read, 1-65534.
@@ -66,8 +79,8 @@ class Touch:
         """
         times_s = times_ns[:, np.newaxis, np.newaxis].astype(np.float64) * 1e-9
         raw: ArrayI = self._rest + self._noise[cycles % _NOISE_PERIOD]
-        if self._pressed:
-            pressure = self._pressure(times_s)
+        if self._pressed and self._streams_from_ns is not None:
+            pressure = self._pressure(times_s - self._streams_from_ns * 1e-9)
             if not fingertip:
                 pressure[:, :, _THERMAL_PADS] = 0
             raw += pressure
@@ -80,9 +93,10 @@ class Touch:
         return np.clip(raw, 1, 0xFFFE, out=raw)
 
     def _pressure(self, times_s: npt.NDArray[np.float64]) -> ArrayI:
-        """(n, 16, 12) counts that a press adds."""
-        moment_s = (times_s + self._press_phase_s) % (_PRESS_S + _PAUSE_S)
-        ramp = np.clip(np.minimum(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0, 1)
+        """(n, 16, 12) counts that a press adds, at times since the board streams."""
+        since_s = times_s - self._first_press_s
+        moment_s = since_s % (_PRESS_S + _PAUSE_S)
+        ramp = np.clip(np.minimum(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0, 1) * (since_s > 0)
         strength = _PRESS_COUNTS * (0.5 - 0.5 * np.cos(math.pi * ramp))
         at = times_s + self._path_phase
         centre_x, centre_y = 1.5 + 1.5 * np.sin(0.71 * at), 1.5 + 1.5 * np.sin(0.53 * at + 1)

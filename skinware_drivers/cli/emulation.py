@@ -1,0 +1,249 @@
+"""Carries the frames of emulated hardware over a bus in real time, until told to stop."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import select
+import signal
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from types import FrameType
+from typing import Any, Protocol, Self, TextIO
+
+import msgspec
+
+from skinware.errors import BusNotAvailable, BusSendError
+from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+
+_STATUS_NS = 1_000_000_000
+_RETRY_NS = 2_000_000
+"""Pause before a frame that a full queue refused is tried again."""
+_GIVE_UP_NS = 500_000_000
+"""A frame that is still refused so long after it was due is given up: newer ones are worth more."""
+_LONGEST_BACKLOG_NS = 1_000_000_000
+"""Frames that are due for longer (the process was stopped) go unheard, as if nobody had listened."""
+_FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
+"""Pauses between attempts to open a bus that went down."""
+
+
+class Report(Protocol):
+    """Where the emulation says what it does."""
+
+    def event(self, name: str, **facts: Any) -> None:
+        """Say that something happened: ready, status, bus_down, bus_up, stopped."""
+
+
+class JsonReport:
+    """One JSON object a line."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def event(self, name: str, **facts: Any) -> None:
+        """Write one line at once."""
+        self._stream.write(json.dumps({"event": name, **facts}) + "\n")
+        self._stream.flush()
+
+
+class HumanReport:
+    """Lines for a person; no status every second."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def event(self, name: str, **facts: Any) -> None:
+        """Write one line, or nothing for the status."""
+        if name == "status":
+            return
+        if name == "ready":
+            text = f"emulating {facts['driver']} on {facts['bus']}; Ctrl-C stops"
+        elif name == "stopped":
+            text = "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
+        else:
+            text = f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
+        self._stream.write(text + "\n")
+        self._stream.flush()
+
+
+class SignalWatch:
+    """Turns SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._reader, self._writer = socket.socketpair()
+        self._reader.setblocking(False)
+        self._writer.setblocking(False)
+        self._before: list[tuple[signal.Signals, Any]] = []
+        self._wakeup_before = -1
+
+    def __enter__(self) -> Self:
+        self._wakeup_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        self._before = [(number, signal.signal(number, self._stop)) for number in (signal.SIGINT, signal.SIGTERM)]
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        for number, handler in self._before:
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._wakeup_before)
+        self._reader.close()
+        self._writer.close()
+
+    def fileno(self) -> int:
+        """Readable once a signal came."""
+        return self._reader.fileno()
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - a signal handler's arguments
+        self.stopped = True
+
+
+class Stop(Protocol):
+    """What ends a run."""
+
+    stopped: bool
+
+    def fileno(self) -> int:
+        """Readable when ``stopped`` may have changed."""
+
+
+class Emulation:
+    """Emulated hardware on a bus.
+
+    Frames go out at the time they are due, rounded up to the millisecond of ``epoll``; those due together go
+    out together. No frame is dropped silently: what a full queue refuses is tried again until half a second after
+    it was due, and then counted as a send failure; what the hardware sent while the bus was down or this process
+    stopped is counted as ``unheard``.
+
+    Args:
+        bus: not opened yet.
+        hardware: not powered up yet.
+        report: told what happens.
+        clock: CLOCK_MONOTONIC ns.
+        poll: waits for one of the readable descriptors for so many seconds: ``(descriptors, timeout_s)``.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        hardware: EmulatedHardware,
+        report: Report,
+        *,
+        clock: Callable[[], int] = time.monotonic_ns,
+        poll: Callable[[list[int], float | None], None] | None = None,
+    ) -> None:
+        self._bus, self._hardware, self._report = bus, hardware, report
+        self._clock, self._poll = clock, poll or wait_readable
+        self._outbox: deque[WireFrame] = deque()
+        self._batch = FrameBatch(256, bus.payload_size)
+        self._open = False
+        self._backoff_ns = _FIRST_BACKOFF_NS
+        self.send_failures = 0
+        """Frames given up."""
+
+    def run(
+        self,
+        stop: Stop,
+        *,
+        bus_name: str,
+        driver: str,
+        options: msgspec.Struct,
+        duration_s: float | None = None,
+    ) -> None:
+        """Emulate until ``stop``, or for ``duration_s``.
+
+        Raises:
+            BusNotAvailable: the bus could not be opened at the start. Later on it is opened again for ever.
+        """
+        self._bus.open()
+        self._open = True
+        start_ns = self._clock()
+        self._hardware.skip(start_ns)
+        self._report.event("ready", driver=driver, bus=bus_name, options=msgspec.to_builtins(options))
+        end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
+        status_ns = start_ns + _STATUS_NS
+        try:
+            while not stop.stopped:
+                now_ns = self._clock()
+                if end_ns is not None and now_ns >= end_ns:
+                    break
+                if now_ns >= status_ns:
+                    self._report.event("status", **self._totals())
+                    status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
+                next_ns = self._step(now_ns)
+                moments = [moment for moment in (next_ns, end_ns, status_ns) if moment is not None]
+                self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
+        finally:
+            self._bus.close()
+        self._report.event("stopped", **self._totals())
+
+    def _step(self, now_ns: int) -> int | None:
+        """Do what is due now; returns when something will be due by itself."""
+        if not self._open:
+            return self._reopen(now_ns)
+        try:
+            self._receive(now_ns)
+            return self._send(now_ns)
+        except BusNotAvailable as error:
+            self._open = False
+            self._bus.close()
+            self.send_failures += len(self._outbox)
+            self._outbox.clear()
+            self._backoff_ns = _FIRST_BACKOFF_NS
+            self._report.event("bus_down", reason=str(error))
+            return now_ns + self._backoff_ns
+
+    def _reopen(self, now_ns: int) -> int | None:
+        try:
+            self._bus.open()
+        except BusNotAvailable:
+            self._backoff_ns = min(2 * self._backoff_ns, _LONGEST_BACKOFF_NS)
+            return now_ns + self._backoff_ns
+        self._open = True
+        self._hardware.skip(now_ns)
+        self._report.event("bus_up")
+        return now_ns
+
+    def _receive(self, now_ns: int) -> None:
+        while self._bus.receive(self._batch, 0):
+            rows = self._batch.wire[self._batch.start : self._batch.stop]
+            for identifier, length, _, _, payload in rows.tolist():
+                self._hardware.receive(identifier, bytes(payload[:length]), now_ns)
+            self._batch.clear()
+
+    def _send(self, now_ns: int) -> int | None:
+        due_ns = self._hardware.next_due_ns()
+        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        self._outbox += self._hardware.emit(now_ns)
+        while self._outbox:
+            try:
+                self._bus.send(self._outbox[0].identifier, self._outbox[0].payload)
+            except BusSendError:
+                while self._outbox and now_ns - self._outbox[0].time_ns >= _GIVE_UP_NS:
+                    self._outbox.popleft()
+                    self.send_failures += 1
+                return now_ns + _RETRY_NS
+            self._outbox.popleft()
+        return self._hardware.next_due_ns()
+
+    def _wait(self, stop: Stop, timeout_s: float) -> None:
+        descriptors = [stop.fileno(), self._bus.fileno()] if self._open else [stop.fileno()]
+        self._poll(descriptors, timeout_s)
+
+    def _totals(self) -> dict[str, int]:
+        return {**self._hardware.totals(), "send_failures": self.send_failures}
+
+
+def wait_readable(descriptors: list[int], timeout_s: float | None) -> None:
+    """Wait until one of the descriptors is readable, at most ``timeout_s``, rounded up to a millisecond."""
+    poll = select.poll()
+    for descriptor in descriptors:
+        poll.register(descriptor, select.POLLIN)
+    with contextlib.suppress(InterruptedError):
+        poll.poll(None if timeout_s is None else timeout_s * 1000)
+
+
+__all__ = ["Emulation", "HumanReport", "JsonReport", "Report", "SignalWatch", "Stop", "wait_readable"]

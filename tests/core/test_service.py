@@ -1,0 +1,493 @@
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.errors import (
+    BadServiceFile,
+    Closed,
+    NameInUse,
+    NamespaceError,
+    PlatformError,
+    ServiceNotFound,
+    ServiceTimeout,
+    StructureChanged,
+)
+from skinware.memory import _fences, _layout, _segment
+from skinware.memory import ring as ring_module
+from skinware.memory.announcement import living_readers
+from skinware.memory.ring import RingReader, RingWriter
+from tests.conftest import wait_until
+
+SPAWN = multiprocessing.get_context("spawn")
+Columns = dict[str, tuple[str, int]]
+SMALL: Columns = {"values": ("<u8", 512)}
+
+
+def publish(writer: ServiceWriter, value: int) -> None:
+    writer.begin()["values"][:] = value
+    writer.commit(time.monotonic_ns())
+
+
+def write_flat_out(slots: int, stop: Any) -> None:
+    with ServiceWriter("flood", SMALL, slots=slots) as writer:
+        value = 0
+        while not stop.is_set():
+            value += 1
+            publish(writer, value)
+
+
+def write_until_killed(name: str, columns: Columns, published: Any, fill_only: bool) -> None:
+    writer = ServiceWriter(name, columns)
+    for value in range(1, 11):
+        publish(writer, value)
+    if fill_only:
+        writer.begin()["values"][:] = 99  # killed in the middle of filling
+    published.set()
+    while True:
+        time.sleep(1)
+
+
+def killed_writer(name: str = "x", columns: Columns = SMALL, fill_only: bool = False) -> Any:
+    published = SPAWN.Event()
+    process = SPAWN.Process(target=write_until_killed, args=(name, columns, published, fill_only))
+    process.start()
+    assert published.wait(30)
+    return process
+
+
+def kill(process: Any) -> None:
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    process.close()
+
+
+# -- coherency ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slots", [2, 3, 8])
+@pytest.mark.parametrize("way", ["copy", "view", "in order"])
+def test_no_torn_frame_from_a_writer_flat_out(slots: int, way: str) -> None:
+    stop = SPAWN.Event()
+    process = SPAWN.Process(target=write_flat_out, args=(slots, stop))
+    process.start()
+    checked = 0
+    try:
+        with ServiceReader[Frame]("flood", timeout_s=30) as reader:
+            in_order = reader.in_order(timeout_s=30)
+            while checked < 4000:
+                if way == "view":
+                    with reader.view() as frame:
+                        values = frame.column("values")
+                        lowest, highest = int(values.min()), int(values.max())
+                        if not frame.valid:
+                            continue
+                else:
+                    frame = next(in_order) if way == "in order" else reader.read(timeout_s=30)
+                    lowest, highest = int(frame.column("values").min()), int(frame.column("values").max())
+                assert lowest == highest == frame.sequence
+                checked += 1
+    finally:
+        stop.set()
+        process.join(30)
+        process.close()
+    assert not Namespace().services()
+
+
+def test_a_slot_that_is_being_filled_is_never_handed_out() -> None:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        publish(writer, 2)
+        writer.begin()["values"][:256] = 3
+        assert set(reader.read().column("values").tolist()) == {2}
+        assert reader._ring.copy(1) is None
+        writer.commit(1)
+
+
+def test_a_view_says_when_it_was_overwritten() -> None:
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        with reader.view() as frame:
+            assert frame.valid
+            assert not frame.column("values").flags.writeable
+            publish(writer, 2)
+            assert frame.valid
+            writer.begin()
+            assert not frame.valid
+
+
+def test_other_processors_get_fences_from_libatomic(monkeypatch: pytest.MonkeyPatch) -> None:
+    fence = _fences.fence_for("aarch64")
+    monkeypatch.setattr(ring_module, "fence", fence)
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 7)
+        assert reader.read().column("values")[0] == 7
+    with pytest.raises(PlatformError, match="libatomic1"):
+        _fences.fence_for("aarch64", "libmissing.so.9")
+
+
+# -- losses -------------------------------------------------------------------------------------------------------
+
+
+def test_losses_are_counted_exactly() -> None:
+    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        assert reader.read().sequence == 1
+        for value in range(2, 12):
+            publish(writer, value)
+        frame = reader.read()
+        assert (frame.sequence, reader.frames_taken, reader.lost) == (11, 2, 9)
+        assert reader.read().sequence == 11
+        assert reader.lost == 9
+
+
+def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> None:
+    with ServiceWriter("x", SMALL, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+        frames = reader.in_order(timeout_s=5)
+        publish(writer, 1)
+        assert next(frames).sequence == 1
+        for value in (2, 3, 4):
+            publish(writer, value)
+        assert [next(frames).sequence for _ in range(3)] == [2, 3, 4]
+        assert reader.lost == 0
+        for value in range(5, 21):
+            publish(writer, value)
+        assert next(frames).sequence == 18  # the oldest that cannot be overwritten next
+        assert reader.lost == 13
+
+
+def test_losses_over_a_restart_are_counted() -> None:
+    writer = ServiceWriter("x", SMALL)
+    publish(writer, 1)
+    with ServiceReader[Frame]("x") as reader:
+        frame = reader.read()
+        publish(writer, 2)
+        writer.close()
+        with ServiceWriter("x", SMALL) as again:
+            publish(again, 3)
+            publish(again, 4)
+            newer = reader.read(newer_than=frame)
+            assert newer.generation != frame.generation
+            assert reader.lost == 2
+
+
+# -- life and death -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fill_only", [False, True])
+def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) -> None:
+    process = killed_writer(fill_only=fill_only)
+    with ServiceReader[Frame]("x") as reader:
+        frame = reader.read()
+        assert reader.alive
+        assert not frame.stale
+        kill(process)
+        assert not reader.alive
+        with pytest.raises(ServiceTimeout, match="dead or was stopped"):
+            reader.read(newer_than=frame, timeout_s=0.2)
+        last = reader.read()
+        assert last.stale
+        assert set(last.column("values").tolist()) == {10}
+        with ServiceReader[Frame]("x") as late:
+            assert late.read().sequence == 10
+        with ServiceWriter("x", SMALL) as writer:
+            publish(writer, 1)
+            assert reader.read(newer_than=last).column("values")[0] == 1
+            assert reader.alive
+
+
+def test_another_structure_is_told_and_old_data_stays_readable() -> None:
+    process = killed_writer()
+    with ServiceReader[Frame]("x") as reader:
+        last = reader.read()
+        kill(process)
+        with ServiceWriter("x", {"values": ("<u8", 3)}) as writer:
+            publish(writer, 5)
+            with pytest.raises(StructureChanged, match="reattach"):
+                reader.read(newer_than=last)
+            assert reader.structure_changed
+            assert len(reader.read().column("values")) == 512
+            reader.reattach()
+            assert reader.read(newer_than=last).column("values").tolist() == [5, 5, 5]
+
+
+def test_a_stopped_process_is_alive_but_silent() -> None:
+    process = killed_writer()
+    with ServiceReader[Frame]("x") as reader:
+        os.kill(process.pid, signal.SIGSTOP)
+        frame = reader.read()
+        with pytest.raises(ServiceTimeout, match="lives, but is silent"):
+            reader.read(newer_than=frame, timeout_s=0.1)
+        kill(process)
+    ServiceWriter("x", SMALL).close()
+
+
+def test_a_forked_child_neither_writes_nor_keeps_the_writer_alive() -> None:
+    writer = ServiceWriter("x", SMALL)
+    publish(writer, 1)
+    ready, go = os.pipe(), os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            writer.begin()
+            verdict = b"wrote"
+        except Closed:
+            verdict = b"refus"
+        os.write(ready[1], verdict)
+        os.read(go[0], 1)
+        os._exit(0)
+    try:
+        assert os.read(ready[0], 5) == b"refus"
+        with ServiceReader[Frame]("x") as reader:
+            assert reader.alive
+            writer.close()
+            assert not reader.alive
+        ServiceWriter("x", SMALL).close()
+    finally:
+        os.write(go[1], b"x")
+        os.waitpid(child, 0)
+        for fd in (*ready, *go):
+            os.close(fd)
+
+
+def race(name: str, start: Any, results: Any) -> None:
+    start.wait()
+    try:
+        with ServiceWriter(name, SMALL):
+            results.put("won")
+            time.sleep(1.0)  # hold the name while the others try
+    except NameInUse:
+        results.put("lost")
+
+
+def test_of_two_writers_of_one_name_one_wins() -> None:
+    start, results = SPAWN.Event(), SPAWN.Queue()
+    processes = [SPAWN.Process(target=race, args=("x", start, results)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    start.set()
+    assert sorted(results.get(timeout=30) for _ in processes) == ["lost", "won"]
+    for process in processes:
+        process.join(30)
+        process.close()
+    results.close()
+    results.join_thread()
+
+
+def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        frame = reader.read()
+        writer.namespace.ring_path("x").unlink()
+
+        def newer() -> bool:
+            publish(writer, 2)
+            return reader.read().generation != frame.generation
+
+        wait_until(newer)
+
+
+def test_what_a_killed_creator_left_is_removed(namespace: Namespace) -> None:
+    namespace.create()
+    (namespace.path / ".x.0123abcd.tmp").write_bytes(b"half")
+    (namespace.path / ".xy.0123abcd.tmp").write_bytes(b"not ours")
+    with ServiceWriter("x", SMALL):
+        assert not (namespace.path / ".x.0123abcd.tmp").exists()
+    (namespace.path / ".xy.0123abcd.tmp").unlink()
+
+
+# -- waiting ------------------------------------------------------------------------------------------------------
+
+
+def test_readers_wake_on_publication_from_any_thread() -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        publish(writer, 1)
+        seen: list[int] = []
+
+        def follow() -> None:
+            with ServiceReader[Frame]("x") as reader:
+                for frame in reader.frames(timeout_s=30):
+                    seen.append(frame.sequence)
+                    if frame.sequence >= 3:
+                        return
+
+        threads = [threading.Thread(target=follow) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        wait_until(lambda: len(seen) >= 3)
+        publish(writer, 2)
+        publish(writer, 3)
+        for thread in threads:
+            thread.join(30)
+        assert seen.count(3) == 3
+
+
+def test_a_signal_ends_a_wait() -> None:
+    class Alarm(Exception):
+        pass
+
+    def ring(_number: int, _frame: object) -> None:
+        raise Alarm
+
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+            publish(writer, 1)
+            signal.setitimer(signal.ITIMER_REAL, 0.1)
+            with pytest.raises(Alarm):
+                reader.read(newer_than=reader.read(), timeout_s=60)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_a_timeout_is_not_early() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        with pytest.raises(ServiceTimeout, match="published nothing so far"):
+            reader.read(timeout_s=0.05)
+        publish(writer, 1)
+        begin = time.monotonic()
+        with pytest.raises(ServiceTimeout):
+            reader.read(newer_than=reader.read(), timeout_s=0.15)
+        assert time.monotonic() - begin >= 0.15
+
+
+def test_a_periodic_writer_publishes_until_closed() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        for count, columns in enumerate(writer.periodic(200)):
+            columns["values"][:] = count
+            if count == 5:
+                writer.close()
+                break
+        assert reader.read().sequence == 5  # the sixth was not committed: the loop was left first
+
+
+# -- who is there -------------------------------------------------------------------------------------------------
+
+
+def test_readers_are_seen_while_they_live(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        publish(writer, 1)
+        reader = ServiceReader[Frame]("x")
+        reader.read()
+        (record,) = living_readers(namespace)
+        assert (record.service, record.pid) == ("x", os.getpid())
+        reader.close()
+        assert list(living_readers(namespace)) == []
+
+
+def test_a_dead_readers_announcement_is_swept(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL):
+        dead = namespace.readers_path / "x.1.deadbeef"
+        dead.write_bytes(b"left by a killed reader")
+        assert list(living_readers(namespace)) == []
+    with ServiceWriter("x", SMALL):
+        assert not dead.exists()
+
+
+# -- files that are wrong -----------------------------------------------------------------------------------------
+
+
+def ring_file(namespace: Namespace) -> bytes:
+    with ServiceWriter("x", SMALL, {"table": np.arange(5, dtype="<u4")}):
+        return namespace.ring_path("x").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda d: d[:100], "shorter than a header"),
+        (lambda d: d[:-4096], "truncated"),
+        (lambda d: b"NOTARING" + d[8:], "wrong magic"),
+        (lambda d: d[:8] + b"\x09\0\0\0" + d[12:], "layout version 9"),
+        (lambda d: d[:44] + b"\xff\xff\0\0" + d[48:], "make no ring"),
+        (lambda d: d[:40] + b"\xff\xff\0\0" + d[44:], "columns do not fit"),
+        (lambda d: d[: 576 + 32] + b"\xff" * 8 + d[576 + 40 :], "column"),
+    ],
+)
+def test_damaged_files_are_refused(namespace: Namespace, damage: Callable[[bytes], bytes], words: str) -> None:
+    data = damage(ring_file(namespace))
+    namespace.ring_path("x").write_bytes(data)
+    with pytest.raises(BadServiceFile, match=words):
+        ServiceReader[Frame]("x")
+    namespace.ring_path("x").unlink()
+
+
+def test_flipped_bits_in_a_header_never_do_harm(namespace: Namespace) -> None:
+    data = ring_file(namespace)
+    size = len(data)
+    for bit in range(0, 8 * (_layout.COLUMN_OFFSET + 2 * _layout.COLUMN.itemsize), 3):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        try:
+            _, layout = _layout.parse(bytes(damaged), "x", size)
+        except BadServiceFile:
+            continue
+        for column in layout.static:
+            assert column.offset + column.count * column.dtype.itemsize <= layout.slot_offset
+        for column in layout.slot:
+            assert column.offset + column.count * column.dtype.itemsize <= layout.slot_stride
+        assert layout.slot_offset + layout.slot_count * layout.slot_stride <= size
+
+
+def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> None:
+    data = ring_file(namespace)
+    path = namespace.ring_path("x")
+    path.symlink_to("/etc/passwd")
+    with pytest.raises(BadServiceFile, match="cannot be opened"):
+        ServiceReader[Frame]("x")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(BadServiceFile, match="not a regular file"):
+        ServiceReader[Frame]("x")
+    path.unlink()
+    if os.geteuid() == 0:
+        path.write_bytes(data)
+        os.chown(path, 12345, -1)
+        with pytest.raises(BadServiceFile, match="owned by uid 12345"):
+            ServiceReader[Frame]("x")
+        path.unlink()
+
+
+def test_a_folder_that_cannot_be_trusted_is_refused(namespace: Namespace) -> None:
+    with pytest.raises(ServiceNotFound, match="it has none"):
+        ServiceReader[Frame]("x")
+    namespace.create()
+    namespace.path.chmod(0o2777)
+    with pytest.raises(NamespaceError, match="written by others"):
+        ServiceReader[Frame]("x")
+    if os.geteuid() == 0:
+        namespace.path.chmod(0o2750)
+        os.chown(namespace.path, 12345, -1)
+        with pytest.raises(NamespaceError, match="SKINWARE_OWNER"):
+            ServiceReader[Frame]("x")
+        with pytest.raises(ServiceNotFound):
+            ServiceReader[Frame]("x", namespace=Namespace(owner=12345))
+
+
+def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
+    namespace.create()
+    lock = _segment.take_name(namespace, "x")
+    layout = _layout.plan({}, SMALL, 2)
+    segment = _segment.create(namespace, "x", layout, {}, kind="data", period_ns=0)
+    writer = RingWriter(segment)
+    reader = RingReader(_segment.attach(namespace, "x"), Frame)
+    writer._half_words[_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
+    writer.begin()["values"][:] = 1
+    assert writer.commit(5) == 1
+    assert reader.wake_word()[1] == 0
+    frame = reader.copy()
+    assert frame is not None
+    assert (frame.sequence, frame.acquired_ns) == (1, 5)
+    namespace.ring_path("x").unlink()
+    for descriptor in (lock, segment.descriptor, reader.segment.descriptor):
+        descriptor.close()

@@ -1,0 +1,201 @@
+"""The layout vocabulary beyond what one driver uses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from skinware import Status
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoder import PATCH_COUNTERS, Decoder
+from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.layout import (
+    Bits,
+    Byte,
+    Cycle,
+    Expand,
+    Flag,
+    Frame,
+    Identifier,
+    Layout,
+    Packed,
+    Sentinel,
+    Stamp,
+    Values,
+)
+
+TYPES = [PRESSURE.measured(unit="counts")]
+ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
+
+
+def decode(
+    layout: Layout, modules: Sequence[Module], dtype: str, frames: Sequence[tuple[int, bytes]], gap_ns: int = 1000
+) -> Decoder:
+    decoder = Decoder(layout, assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
+    batch = FrameBatch(256, layout.payload_size, decoder.headroom)
+    decoder.put_back(batch)
+    for number, (identifier, payload) in enumerate(frames):
+        batch.append(0, 1 + number * gap_ns, identifier, payload)
+    for updates in decoder.decode(batch)[0]:
+        decoder.apply(batch, updates)
+    return decoder
+
+
+def one(values: Values | Expand, length: int = 8, **more: Any) -> Layout:
+    return Layout([Frame("data", [Identifier(0x100)], (length,), values, **more)])
+
+
+def fingertip(order: Literal["given", "any", "ends_with"] = "given") -> Layout:
+    """Sixteen taxels in four frames, permuted, as the CPM finger sends them."""
+    frames = [
+        Frame(f"q{i}", [Identifier(0x405 + 2 * i)], (8,), Values(0, "<u2", 4, ORDER[4 * i : 4 * i + 4]))
+        for i in range(4)
+    ]
+    return Layout(frames, Cycle([f.name for f in frames], maximum_age_s=0.02, order=order))
+
+
+def quarters(base: int) -> list[tuple[int, bytes]]:
+    raw = [base + channel for channel in ORDER]
+    return [(0x405 + 2 * i, np.array(raw[4 * i : 4 * i + 4], "<u2").tobytes()) for i in range(4)]
+
+
+def test_a_permuted_fingertip_of_four_frames() -> None:
+    decoder = decode(fingertip(), [Module(taxels(16))], "<u2", quarters(1000))
+    assert decoder.state.values[:-1].tolist() == list(range(1000, 1016))
+    assert not decoder.state.status[:-1].any()
+
+
+@pytest.mark.parametrize(
+    ("order", "sent", "shown"),
+    [
+        ("given", (0, 1, 2, 3), True),
+        ("given", (0, 2, 1, 3), False),
+        ("any", (3, 1, 0, 2), True),
+        ("any", (3, 1, 1, 2), False),
+        ("ends_with", (2, 0, 1, 3), True),
+        ("ends_with", (3, 0, 1, 2), False),
+    ],
+)
+def test_orders_of_a_cycle(order: Literal["given", "any", "ends_with"], sent: tuple[int, ...], shown: bool) -> None:
+    frames = quarters(0)
+    decoder = decode(fingertip(order), [Module(taxels(16))], "<u2", [frames[i] for i in sent])
+    assert bool(decoder.state.updated[0]) is shown
+    assert (decoder.state.status[0] == Status.NEVER_SEEN) is not shown
+
+
+def test_any_order_takes_each_frame_once() -> None:
+    frames = quarters(0)
+    decoder = decode(fingertip("any"), [Module(taxels(16))], "<u2", [*frames, *frames, *frames[:2]])
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("updates")] == 2
+
+
+def test_a_cycle_that_takes_too_long_is_not_shown() -> None:
+    decoder = decode(fingertip(), [Module(taxels(16))], "<u2", quarters(0), gap_ns=10_000_000)
+    assert not decoder.state.updated.any()
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("late")] == 1
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 4
+
+
+@pytest.mark.parametrize(
+    ("dtype", "payload", "expected"),
+    [
+        ("<i2", "ff7f0080ffff0000", [32767, -32768, -1, 0]),
+        (">i2", "7fff8000ffff0000", [32767, -32768, -1, 0]),
+        (Packed(12), "abc123fff0000000", [0xABC, 0x123, 0xFFF, 0x000]),
+        (Packed(12, order="little"), "bc3a12ff0f000000", [0xABC, 0x123, 0xFFF, 0x000]),
+        (Packed(12, signed=True), "8007ffffF0000000", [-2048, 2047, -1, 0]),
+        (Packed(1), "a000000000000000", [1, 0, 1, 0]),
+    ],
+)
+def test_values_at_their_extremes(dtype: str | Packed, payload: str, expected: list[int]) -> None:
+    decoder = decode(one(Values(0, dtype, 4)), [Module(taxels(4))], "<i4", [(0x100, bytes.fromhex(payload))])
+    assert decoder.state.values[:-1].tolist() == expected
+
+
+def test_dropped_values_go_nowhere() -> None:
+    layout = one(Values(0, "u1", 8, to=(0, None, 1, None, 2, None, 3, None)))
+    decoder = decode(layout, [Module(taxels(4))], "u1", [(0x100, bytes(range(1, 9)))])
+    assert decoder.state.values[:-1].tolist() == [1, 3, 5, 7]
+
+
+def test_a_module_named_in_the_payload() -> None:
+    layout = one(Values(1, "u1", 4), module=Bits(shift=4, width=4, byte=0))
+    modules = [Module(taxels(4, first_uid=10 * key), key=key) for key in (1, 2)]
+    frames = [(0x100, bytes((0x20, 5, 6, 7, 8, 0, 0, 0))), (0x100, bytes((0x30, 9, 9, 9, 9, 0, 0, 0)))]
+    decoder = decode(layout, modules, "u1", frames)
+    assert decoder.state.values[:-1].tolist() == [0, 0, 0, 0, 5, 6, 7, 8]
+    assert decoder.state.bus_counters[0, 0] == 1
+
+
+def test_sentinels_and_flags() -> None:
+    flags = [
+        Sentinel(Status.NOT_CONNECTED, 0xFFFF),
+        Flag(Status.NO_ACK, 6, "u1", each=[(0, 0), (2, 7)]),
+        Flag(Status.OUT_OF_RANGE, 7, "u1", mask=0x10),
+    ]
+    layout = one(Values(0, "<u2", 3), flags=flags)
+    decoder = decode(layout, [Module(taxels(3))], "<u2", [(0x100, bytes.fromhex("0100ffff02008000"))])
+    assert decoder.state.status[:-1].tolist() == [0, int(Status.NOT_CONNECTED), int(Status.NO_ACK)]
+    decoder = decode(layout, [Module(taxels(3))], "<u2", [(0x100, bytes.fromhex("0100010002000010"))])
+    assert decoder.state.status[:-1].tolist() == [int(Status.OUT_OF_RANGE)] * 3
+    nan = one(Values(0, "<f4", 2), flags=[Sentinel(Status.NOT_CONNECTED, float("nan"))])
+    payload = np.array([np.nan, 0.5], "<f4").tobytes()
+    decoder = decode(nan, [Module(taxels(2))], "<f4", [(0x100, payload)])
+    assert decoder.state.status[:-1].tolist() == [int(Status.NOT_CONNECTED), 0]
+
+
+def test_sequence_numbers_tell_losses_and_repeats() -> None:
+    layout = one(Values(1, "u1", 1), stamp=Stamp(0, "u1"))
+    numbers = [254, 255, 0, 3, 3]
+    frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
+    decoder = Decoder(layout, assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
+    batch = FrameBatch(16, 8, decoder.headroom)
+    for identifier, payload in frames:
+        decoder.put_back(batch)
+        batch.append(0, 1, identifier, payload)
+        for updates in decoder.decode(batch)[0]:
+            decoder.apply(batch, updates)
+    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
+    assert (counters["sequence_lost"], counters["sequence_repeated"]) == (2, 1)
+
+
+def test_expand_is_the_escape() -> None:
+    def run_lengths(
+        payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]:
+        rows: list[int] = []
+        channels: list[int] = []
+        values: list[int] = []
+        for row, (data, size) in enumerate(zip(payload, length, strict=True)):
+            expanded = np.repeat(data[1:size:2], data[0:size:2])
+            rows += [row] * len(expanded)
+            channels += range(len(expanded))
+            values += expanded.tolist()
+        return np.array(rows, np.int64), np.array(channels, np.int64), np.array(values)
+
+    frame = (0x100, bytes((3, 7, 2, 9, 1, 4, 1, 5)))
+    decoder = decode(one(Expand(run_lengths)), [Module(taxels(5))], "u1", [frame])
+    assert decoder.state.values[:-1].tolist() == [7, 7, 7, 9, 9]  # two more than there are channels are dropped
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: one(Values(6, "<u2", 2)), "values end at byte 10"),
+        (lambda: one(Values(0, "u1", 2, to=(0,))), "`to` names 1 channels"),
+        (lambda: Layout([]), "1 to 16 frames"),
+        (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
+        (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
+        (lambda: one(Values(0, "u1", 1), stamp=Stamp(7, "<u2")), "sequence number is not in every"),
+        (lambda: Layout([Frame("f", [Byte(9, 1)], (8,), Values(0, "u1", 1))]), "byte 9 is not in every"),
+    ],
+)
+def test_layouts_that_cannot_be_decoded_are_refused(make: Any, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        make()

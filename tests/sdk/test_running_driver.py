@@ -1,0 +1,298 @@
+"""The ROBOSKIN driver on emulated boards, end to end: frames on a (virtual) wire to a user's arrays."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+
+import msgspec
+import numpy as np
+import pytest
+
+from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
+from skinware.errors import NameInUse
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import CommandReceived, LostHalf, damaged_cycles
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+from tests.conftest import wait_until
+from tests.sdk.driving import driving, emulated, read_until
+
+
+def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
+    assert isinstance(bus.hardware, EmulatedRoboskin)
+    return bus.hardware
+
+
+def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
+    return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+
+
+def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8))
+    with driving(bus):
+        pass
+    sent = [(identifier, payload.replace(" ", "").lower()) for _, identifier, payload in commands(log)]
+    unique = list(dict.fromkeys(sent))  # the emulator logs a broadcast once per board
+    assert unique == [
+        (0x70F, "ff"),
+        (0x207, "4d0032f0"),
+        (0x208, "4d0032f0"),
+        (0x207, "50000f02010022"),
+        (0x208, "50000f02010022"),
+        (0x207, "0700"),
+        (0x208, "0700"),
+        (0x207, "0701"),
+        (0x208, "0701"),
+    ]
+    times = {key: time_ns for (time_ns, *_), key in zip(commands(log), sent, strict=True)}
+    assert times[0x207, "0700"] - times[0x208, "50000f02010022"] >= 510_000_000
+
+
+def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
+    def source(board: int, triangle: int, cycle: int, time_ns: int) -> list[int]:
+        return [(board + triangle + channel) % 256 for channel in range(12)]
+
+    hardware = EmulatedRoboskin(EmulatorOptions(boards=(7, 9)), source=source)
+    with driving(VirtualCanBus.with_hardware(hardware)), DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: not f.status.any())
+        uid = frame.structure.sensor_uid.astype(np.int64)
+        assert frame.values.tolist() == ((uid >> 16) + (uid >> 8 & 0xFF) + (uid & 0xFF)).tolist()
+        assert frame.patch_state.tolist() == [PatchState.LIVE] * 2
+        assert frame.bus_state.tolist() == [BusState.LIVE]
+        with Skin() as skin:
+            assert len(skin.read().physical("pressure")) == 2 * 16 * 10
+
+
+def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> None:
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8, 9, 10), pattern="cycle", lose=0.01)
+    fresh: dict[int, set[int]] = {module: set() for module in range(64)}
+    with driving(bus, period_ms=20) as running, DriverReader("roboskin") as reader:
+        for count, frame in enumerate(reader.in_order(timeout_s=30)):
+            values, status = frame.values.reshape(64, 12), frame.status.reshape(64, 12)
+            for module in np.flatnonzero((status == 0).all(axis=1)).tolist():
+                cycles = set(values[module].tolist())
+                assert len(cycles) == 1, f"module {module} is torn: {values[module]}"
+                fresh[module].add(int(values[module][0]))
+            if count >= 200:
+                break
+        assert reader.lost == 0
+        assert len(damaged_cycles(log)) > 20
+    damaged = damaged_cycles(log)
+    for module, cycles in fresh.items():
+        board, triangle = 7 + module // 16, module % 16
+        between = range(min(cycles), max(cycles) + 1) if max(cycles) - min(cycles) < 250 else range(0)
+        missing = {cycle for cycle in between if cycle not in cycles}
+        assert missing == {c % 256 for b, t, c in damaged if (b, t) == (board, triangle) and c % 256 in between}
+    both = sum(
+        len(list(group)) == 2
+        for _, group in itertools.groupby(
+            sorted((e.board, e.triangle, e.cycle) for e in log if isinstance(e, LostHalf))
+        )
+    )
+    total = sum(patch["orphans"] for patch in running.status()["patches"])
+    lost = sum(isinstance(event, LostHalf) for event in log)
+    assert lost - 2 * both - 4 <= total <= lost - 2 * both  # at most one head per board still waited at the end
+
+
+def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> None:
+    bus = emulated(boards=(7, 8))
+    with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        running.do(lambda: hardware_of(bus).kill(8, bus._clock()))
+        frame = read_until(reader, lambda f: f.patch_state[1] == PatchState.STALE)
+        assert frame.patch_state[0] == PatchState.LIVE
+        assert (frame.status[192:] & Status.STALE).all()
+        later = read_until(reader, lambda f: f.sequence >= frame.sequence + 20)
+        assert not (later.status[:192] & Status.STALE).any()
+        assert (later.published_ns - later.acquired_ns) < 1_000_000_000
+    assert caplog.text.count("board 8 fell silent") == 1
+
+
+def test_a_restarted_board_is_set_up_alone() -> None:
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8), boot_s=0.1)
+    with driving(bus) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        before = len(commands(log))
+        running.do(lambda: hardware_of(bus).restart(8, bus._clock()))
+        read_until(reader, lambda f: f.patch_state[1] == PatchState.STALE)
+        read_until(reader, lambda f: f.patch_state[1] == PatchState.RESTARTED)
+        frame = read_until(reader, lambda f: f.patch_state[1] == PatchState.LIVE)
+        assert frame.patch_state[0] == PatchState.LIVE
+        sent = {(i, p.replace(" ", "").lower()) for _, i, p in commands(log)[before:]}
+    assert {identifier for identifier, payload in sent if not payload.startswith("0701")} == {0x208}
+    assert {"4d0032f0", "50000f02010022", "0700"} <= {payload for _, payload in sent}
+
+
+def test_diagnostics_of_the_hardware_reach_the_user() -> None:
+    bus = emulated(boards=(7,), out_of_range=("7/2/5",), not_connected=("7/3",), pattern="idle")
+    with driving(bus, skin_type=2) as running, DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: not (f.status & Status.NEVER_SEEN).any())
+        assert frame.status[2 * 12 + 5] == Status.OUT_OF_RANGE
+        assert set(frame.status[36:48].tolist()) == {int(Status.NOT_CONNECTED)}
+        running.do(lambda: hardware_of(bus).unplug(7, 4, bus._clock()))
+        frame = read_until(reader, lambda f: bool((f.status[48:60] & Status.NOT_CONNECTED).all()))
+        assert set(frame.values[48:60].tolist()) == {0}  # full pressure, if it were not for the flag
+
+
+def test_a_board_that_recalibrates_itself_is_suspect() -> None:
+    bus = emulated(boards=(7, 8), pattern="idle")
+    with driving(bus) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        running.do(lambda: hardware_of(bus).acknowledge(7, 1, bus._clock(), on=False))
+        frame = read_until(reader, lambda f: bool((f.status[:192] & Status.SUSPECT).all()))
+        assert not (frame.status[192:] & Status.SUSPECT).any()
+
+
+def test_damaged_and_foreign_frames_are_counted() -> None:
+    bus = emulated(boards=(7,), wrong_length=0.05, foreign_hz=200)
+    with driving(bus) as running, DriverReader("roboskin") as reader:
+
+        def both_counted(frame: DriverFrame) -> bool:
+            (counters,) = reader.bus_counters(frame)
+            return counters["bad_length"] > 5 and counters["unknown"] > 5
+
+        read_until(reader, both_counted)
+        assert running.status()["buses"][0]["bad_content"] == 0
+
+
+def test_a_listener_sends_nothing_and_learns_what_it_hears() -> None:
+    bus = emulated(boards=(7, 9), streaming=True, listen_only=True)
+    with driving(bus, listen_only=True, learn_s=0.3), DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: not (f.status & Status.NEVER_SEEN).any())
+        assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]
+    assert bus.counters.sent == bus.counters.send_failures == 0
+
+
+class LateBoards:
+    """Devices that are not there until ``present`` is set."""
+
+    def __init__(self, hardware: EmulatedHardware, present: bool = False) -> None:
+        self._hardware = hardware
+        self.present = present
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        if self.present:
+            self._hardware.receive(identifier, payload, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        return self._hardware.next_due_ns()
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        return [frame for frame in self._hardware.emit(now_ns) if self.present]
+
+    def skip(self, now_ns: int) -> int:
+        return self._hardware.skip(now_ns)
+
+    def totals(self) -> dict[str, int]:
+        return self._hardware.totals()
+
+
+def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.LogCaptureFixture) -> None:
+    late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
+    bus = VirtualCanBus.with_hardware(late)
+    with caplog.at_level(logging.WARNING), driving(bus, wait=False) as running:
+        wait_until(lambda: "no patch answers; waiting" in caplog.text)
+        late.present = True
+        assert running.ready.wait(30)
+        with DriverReader("roboskin") as reader:
+            assert read_until(reader, lambda f: not f.status.any()).structure.n_sensors == 192
+    assert caplog.text.count("no patch answers") == 1
+
+
+def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
+    late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(9,), streaming=True)))
+    both = Together(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)), late)
+    bus = VirtualCanBus.with_hardware(both, listen_only=True)
+    with driving(bus, listen_only=True, learn_s=0.3) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        assert reader.structure.n_patches == 1
+        running.do(lambda: setattr(late, "present", True))
+        read_until(reader, lambda f: reader.bus_counters(f)[0]["unknown"] > 50)
+        assert reader.structure.n_patches == 1
+        assert running.runner is not None
+        running.do(running.runner.join)
+        wait_until(lambda: reader.latest is not None and reader.structure_changed)
+        reader.reattach()
+        frame = read_until(reader, lambda f: not f.status.any())
+        assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]
+
+
+class Together:
+    """Two sets of devices on one bus."""
+
+    def __init__(self, first: EmulatedHardware, second: EmulatedHardware) -> None:
+        self._both = (first, second)
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        for hardware in self._both:
+            hardware.receive(identifier, payload, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        due = [time_ns for hardware in self._both if (time_ns := hardware.next_due_ns()) is not None]
+        return min(due, default=None)
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        return sorted(frame for hardware in self._both for frame in hardware.emit(now_ns))
+
+    def skip(self, now_ns: int) -> int:
+        return sum(hardware.skip(now_ns) for hardware in self._both)
+
+    def totals(self) -> dict[str, int]:
+        return self._both[0].totals()
+
+
+def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:
+    first, second = emulated(boards=(7,)), emulated(boards=(7,))
+    with caplog.at_level(logging.WARNING), driving(first, second) as running, DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: not f.status.any())
+        assert frame.structure.sensor_uid[192] == 1 << 32 | 7 << 16
+        running.do(second.vanish)
+        frame = read_until(reader, lambda f: f.bus_state[1] == BusState.GONE and f.patch_state[1] == PatchState.STALE)
+        later = read_until(reader, lambda f: f.sequence >= frame.sequence + 20)
+        assert later.bus_state[0] == BusState.LIVE
+        assert not (later.status[:192] & Status.STALE).any()
+        running.do(second.come_back)
+        read_until(reader, lambda f: f.bus_state[1] == BusState.LIVE and not f.status.any())
+        assert reader.generation == frame.generation
+    assert caplog.text.count("went away") == 1
+
+
+def test_a_living_drivers_name_is_refused() -> None:
+    with driving(emulated(boards=(7,))):
+        with pytest.raises(NameInUse, match="roboskin"), driving(emulated(boards=(7,))):
+            pass
+
+
+def test_a_burst_that_waited_is_published_cycle_by_cycle() -> None:
+    """After a stall of the driver several cycles are decoded at once; each still becomes a frame of its own."""
+    bus = emulated(boards=(7,), pattern="cycle")
+    with driving(bus) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        import time
+
+        running.do(lambda: time.sleep(0.4))  # the whole loop stands still
+        seen = [int(f.values[0]) for _, f in zip(range(30), reader.in_order(timeout_s=30), strict=False)]
+        steps = np.diff(seen) % 256
+        assert set(steps.tolist()) <= {0, 1}
+
+
+def test_a_full_batch_loses_nothing() -> None:
+    bus = emulated(boards=(7, 8))
+    bus.open()
+    batch = FrameBatch(10, 8)
+    for board in (7, 8):
+        for payload in ("4D0032F0", "50000F02010022", "0700"):
+            bus.send(0x200 | board, bytes.fromhex(payload))
+    total = 0
+    while total < 200:
+        batch.clear()
+        total += bus.receive(batch, 0)
+        assert len(batch) <= 10
+    bus.close()
+    assert bus.counters.lost == 0

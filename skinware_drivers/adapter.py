@@ -48,8 +48,8 @@ class Adapter(ABC, Generic[OptionsT]):
 
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
     ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
-    of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went down); the runner
-    then says so and tries again later.
+    of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went
+    down); the runner then says so and tries again later.
 
     In listen-only mode only ``describe`` and ``join`` are called, and every send is refused.
 

@@ -50,6 +50,7 @@ class Publisher:
         self._sensor_module = structure.sensor_module
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
         self._behind = np.zeros(structure.n_modules, bool)
+        self._first_at = np.zeros(structure.n_modules, np.int64)
         self._first_touch_ns = 0
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
@@ -123,10 +124,12 @@ class Publisher:
 
     def _first_repeat(self, updates: Updates) -> int:
         """How many updates can be shown before one would overwrite another that was not published yet."""
-        _, first = np.unique(updates.module, return_index=True)
-        repeats = self._decoder.state.updated[updates.module]
-        repeats[np.setdiff1d(np.arange(len(updates)), first)] = True
-        return int(np.argmax(repeats)) if repeats.any() else len(updates)
+        n = len(updates)
+        backwards = np.arange(n - 1, -1, -1)
+        self._first_at[updates.module[::-1]] = backwards  # of several for a module, the first one stays
+        repeats = self._first_at[updates.module] != backwards[::-1]
+        repeats |= self._decoder.state.updated[updates.module]
+        return int(np.argmax(repeats)) if repeats.any() else n
 
     def _is_complete(self) -> bool:
         state = self._decoder.state

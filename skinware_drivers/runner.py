@@ -467,5 +467,5 @@ def _complaining(what: str) -> Iterator[None]:
         yield
     except BusError as error:
         log.warning("%s: %s", what, str(error))
-    except asyncio.TimeoutError:
+    except TimeoutError:
         log.warning("%s: it took too long", what)

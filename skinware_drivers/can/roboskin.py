@@ -129,33 +129,31 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class BaselineWatch(Watch):
     """Marks boards that will have moved their baseline without a word.
 
-    After five cycles in a row with a triangle whose channel does not acknowledge though it is connected, the firmware
-    re-calibrates every triangle of the board. What it sends from then on is measured from an unknown baseline, until
-    the board is set up again.
+    After five cycles with a channel that does not acknowledge though it is connected (several such triangles count
+    together), the firmware re-calibrates every triangle of the board, and the flag goes away. What the board sends
+    from then on is measured from an unknown baseline, until it is set up again.
     """
 
     def __init__(self, tables: SkinTables) -> None:
         super().__init__(tables)
-        self._cycles = np.zeros(tables.structure.n_modules, np.int64)
+        self._first_sensor = tables.channel_to_sensor.min(axis=1)
+        self._not_acknowledged = np.zeros(tables.structure.n_patches, np.int64)
 
     def look(self, state: SkinState, updates: Updates) -> None:
-        """Count cycles without acknowledgement; see :class:`skinware_drivers.adapter.Watch`."""
-        first = self.tables.channel_to_sensor[updates.module].min(axis=1)
-        status = state.status[first]
+        """Count what was not acknowledged, per board; see :class:`skinware_drivers.adapter.Watch`."""
+        status = state.status[self._first_sensor[updates.module]]
         silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
-        if not silent.any() and not self._cycles.any():
+        if not silent.any():
             return
-        np.add.at(self._cycles, updates.module[silent], 1)
-        self._cycles[updates.module[~silent]] = 0
-        moved = self._cycles >= _RECALIBRATION_CYCLES
-        if moved.any():
-            module_patch = self.tables.structure.module_patch
-            self.module_status[np.isin(module_patch, module_patch[moved])] |= np.uint8(Status.SUSPECT)
+        module_patch = self.tables.structure.module_patch
+        np.add.at(self._not_acknowledged, module_patch[updates.module[silent]], 1)
+        moved = self._not_acknowledged >= _RECALIBRATION_CYCLES
+        self.module_status[moved[module_patch]] |= np.uint8(Status.SUSPECT)
 
     def forget(self, patch: int) -> None:
         """The board was set up anew, so its baseline is known again."""
         super().forget(patch)
-        self._cycles[self.tables.structure.module_patch == patch] = 0
+        self._not_acknowledged[patch] = 0
 
 
 class RoboskinDriver(CanAdapter[RoboskinOptions]):

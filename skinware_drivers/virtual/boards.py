@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -58,7 +59,7 @@ class BoardParts:
     tail_class: int
 
 
-class Board:
+class Board(ABC):
     """One board, powered up at ``now_ns``.
 
     Defaults: icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp, ``setdefault`` and
@@ -101,13 +102,13 @@ class Board:
 
     # What others do to the board
 
+    @abstractmethod
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
         """Take a frame from the bus.
 
         Returns:
             Whether the board obeyed or answered it. Nothing is ever acknowledged.
         """
-        raise NotImplementedError
 
     def hears(self, now_ns: int) -> bool:
         """Whether the board has power and is not booting."""
@@ -196,9 +197,9 @@ class Board:
         self.cycle += 1
         self.parts.counts["bursts"] += 1
 
+    @abstractmethod
     def _recalibrate_by_itself(self, time_ns: int) -> bool:
         """Take new baselines because converters did not acknowledge; tell whether this burst is sent at all."""
-        raise NotImplementedError
 
     def _calibrate(self, time_ns: int, reason: Literal["power_up", "command", "no_ack"]) -> None:
         """Take what is read at ``time_ns`` as the new baseline of all triangles."""

@@ -33,7 +33,7 @@ class Mtb3(Board):
     is_mtb3: ClassVar[bool] = True
     board_type: ClassVar[int] = 5
     firmware: ClassVar[tuple[int, int, int]] = (2, 10, 14)
-    protocol: ClassVar[tuple[int, int]] = (1, 0)
+    protocol: ClassVar[tuple[int, int]] = (1, 0)  # assumed: no public source tells what its GET_FW_VERSION says
 
     def _power_up(self, ready_ns: int) -> None:
         super()._power_up(ready_ns)

@@ -22,6 +22,7 @@ class Mtb4(Board):
 
     is_mtb3: ClassVar[bool] = False
     board_type: ClassVar[int] = 11
+    # icub-firmware:emBODY/eBcode/arch-arm/board/mtb4/application/src/main-appcan.cpp
     firmware: ClassVar[tuple[int, int, int]] = (1, 25, 0)
     protocol: ClassVar[tuple[int, int]] = (2, 0)
 

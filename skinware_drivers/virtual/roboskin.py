@@ -70,7 +70,7 @@ class EmulatedRoboskin:
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """Take one frame from the bus. Frames that mean nothing to the boards are ignored."""
         now_ns = self._run(now_ns)
-        if identifier > 0x7FF or not payload:
+        if not payload:
             return
         addresses = [board.address for board in self._boards]
         obeyed = [board.receive(identifier, payload, now_ns) for board in self._boards]

@@ -60,6 +60,16 @@ def test_period_zero_never_sends() -> None:
     assert rig.run_ms(1000) == []
 
 
+@pytest.mark.parametrize("mtb3", [(), (7,)])
+def test_period_zero_ends_a_stream(mtb3: tuple[int, ...]) -> None:
+    rig = Rig(mtb3=mtb3)
+    rig.configure()
+    assert rig.streams()
+    rig.send(0x207, "4D 00 00 F0")
+    rig.run_ms(10)
+    assert rig.run_ms(1000) == []
+
+
 def test_set_brd_cfg_disables_all_triangles_even_while_streaming() -> None:
     rig = Rig()
     rig.configure()
@@ -153,7 +163,7 @@ def test_a_larger_shift_makes_presses_smaller() -> None:
 def test_a_far_off_cdc_offset_saturates_the_converters() -> None:
     rig = Rig(seed=3)
     rig.send(0x207, CONFIGURE)
-    rig.send(0x207, "50 00 0F 02 01 FF FF")
+    rig.send(0x207, "50 00 0F 02 01 00 FF")
     rig.send(0x207, "07 00")
     assert {frame.payload[1:6] for frame in rig.run_ms(4000)} == {b"\xf0" * 5}
 
@@ -200,6 +210,19 @@ def test_mtb4_ignores_the_top_bit_of_a_command() -> None:
     rig = Rig()
     rig.send(0x207, "87 00")
     assert rig.streams()
+
+
+def test_what_was_felt_before_a_stop_is_not_sent_after_it() -> None:
+    rig, reference = Rig(), Rig()
+    for each in (rig, reference):
+        each.configure()
+        each.run_ms(3025)
+        each.send(0x207, "07 01")
+        each.run_ms(4000)
+    reference.hardware.acknowledge(7, 0, reference.now_ns, on=True)  # changes nothing, but all is computed anew
+    for each in (rig, reference):
+        each.send(0x207, "07 00")
+    assert rig.run_ms(1000) == reference.run_ms(1000)
 
 
 # Versions and discovery
@@ -312,6 +335,16 @@ def test_mtb3_stays_silent_after_set_triang_cfg_if_it_was_silent() -> None:
     assert not rig.streams()
 
 
+def test_mtb3_stays_stopped_after_a_stop() -> None:
+    rig = Rig(mtb3=(7,))
+    rig.configure()
+    assert rig.streams()
+    rig.send(0x207, "07 01")
+    rig.configure(start=False)
+    rig.run_ms(10)
+    assert not rig.streams()
+
+
 def test_mtb3_set_up_the_old_way_sends_class_3() -> None:
     rig = Rig(mtb3=(7,), source=constant_source(0xF0))
     rig.send(0x207, "4E 02 22 F0 08 03 80 0A")
@@ -330,6 +363,16 @@ def test_mtb3_old_set_up_takes_shift_and_no_load() -> None:
     rig.send(0x207, "4C 01 01 00 00 22 00 00")
     rig.send(0x207, "4E 03 00 EB 08 FF FF 0A")
     assert rig.run_ms(300)[0].payload == bytes.fromhex("40 EB EB EB EB EB EB EB")
+
+
+def test_mtb3_old_set_up_takes_the_shift() -> None:
+    def deepest(shift: int) -> int:
+        rig = Rig(mtb3=(7,), seed=3)
+        rig.send(0x207, "4C 01 01 00 00 22 00 00")
+        rig.send(0x207, f"4E {shift:02X} 00 F0 08 FF FF 0A")
+        return min(min(frame.payload[1:6]) for frame in rig.run_ms(5000))
+
+    assert deepest(2) < deepest(3) < deepest(4)
 
 
 def test_mtb3_old_averaging_modes_are_not_emulated() -> None:

@@ -91,6 +91,7 @@ def test_jitter_delays_single_bursts_and_does_not_add_up() -> None:
     delays = [after - before for before, after in zip(on_time, late, strict=True)]
     assert all(0 <= delay <= 3 * MS for delay in delays)
     assert len(set(delays)) > 90
+    assert not any(delay % 1000 for delay in delays)
     logged = {event.cycle: event.delay_ns for event in shaken.events(events.BurstDelayed)}
     assert logged == {cycle: delay for cycle, delay in enumerate(delays) if delay}
 
@@ -149,6 +150,18 @@ def test_death_in_a_burst_loses_what_was_not_sent_yet() -> None:
     assert len(lost) == 27
     assert (lost[0].triangle, lost[0].half, lost[0].reason) == (2, "tail", "died")
     assert damaged_cycles(rig.log) == {(7, triangle, 0) for triangle in range(2, 16)}
+
+
+def test_a_half_is_lost_only_once() -> None:
+    rig = Rig(streaming=True, pattern="cycle", lose=0.5)
+    begin_ns = rig.hardware.next_due_ns()
+    assert begin_ns is not None
+    rig.hardware.kill(7, begin_ns + 2 * MS)
+    heard = len(rig.run_ms(1000))
+    lost = rig.events(events.LostHalf)
+    assert heard + len(lost) == 32
+    assert len({(event.triangle, event.half) for event in lost}) == len(lost)
+    assert {event.reason for event in lost} == {"random", "died"}
 
 
 def test_dead_after_cycles() -> None:

@@ -63,7 +63,7 @@ def test_halves_of_a_board_stay_in_order_among_other_boards() -> None:
 
 def test_the_lowest_identifier_wins_the_wire() -> None:
     wire = Wire()
-    first, second, third = wire.attach(), wire.attach(), wire.attach()
+    third, second, first = wire.attach(), wire.attach(), wire.attach()
     first.queue.append(Transmission(0, [0x4A0, 0x4A0], [b"12345678", b"abcdefgh"], usual=True))
     second.queue.append(Transmission(10_000, [0x470, 0x600], [b"x", b"y"]))
     third.queue.append(Transmission(20_000, [0x8000_0000 | 0x4A0 << 18], [b""]))
@@ -90,6 +90,22 @@ def test_a_wire_sends_nothing_before_it_is_due() -> None:
     wire.run(130_101)
     assert [frame.time_ns for frame in wire.heard] == [100, 130_100]
     assert len(device) == 1
+
+
+def test_frames_of_odd_lengths_take_their_own_time() -> None:
+    burst = cycles(Rig(streaming=True, wrong_length=0.5).run_ms(60))[0]
+    for before, after in itertools.pairwise(burst):
+        assert after.time_ns == before.time_ns + frame_time_ns(0x470, len(before.payload))
+
+
+def test_frames_that_went_out_before_a_command_came_are_due() -> None:
+    rig = Rig(streaming=True)
+    rig.now_ns += 60 * MS
+    rig.send(0x207, "1C 02 00")
+    due_ns = rig.hardware.next_due_ns()
+    assert due_ns is not None
+    assert due_ns < rig.now_ns
+    assert rig.run_ms(0)[0].time_ns == due_ns
 
 
 def test_nothing_depends_on_how_often_one_asks() -> None:

@@ -1,0 +1,245 @@
+"""The main job on a real (virtual) CAN bus: emulated boards, driver and reader as separate processes."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import BusState, DriverReader, PatchState, Status
+from tests.can.conftest import ip
+from tests.commands import run, running
+from tests.sdk.driving import read_until
+
+pytestmark = [pytest.mark.can, pytest.mark.timeout(400)]
+
+SPAWN = multiprocessing.get_context("spawn")
+TRIALS = Path(__file__).resolve().parents[3] / "shared" / "data" / "icub_grasp" / "trials"
+MINUTE_FRAMES = 1200
+
+
+def check_no_torn_module(frame: Any) -> int:
+    """All values of a fresh module carry one cycle number; returns how many modules were fresh."""
+    values, status = frame.values.reshape(-1, 12), frame.status.reshape(-1, 12)
+    fresh = (status == 0).all(axis=1)
+    assert (values[fresh].min(axis=1) == values[fresh].max(axis=1)).all(), "a torn module was shown as fresh"
+    return int(fresh.sum())
+
+
+def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
+    bus = vcan()
+    with running("skin-emulate", "--bus", bus, "--boards", "7,8,9,10", "--pattern", "cycle") as emulator:
+        emulator.wait_for("ready")
+        with running("skin-driver", "--bus", bus, "--slots", "64") as driver:
+            ready = driver.wait_for("ready")
+            assert (ready["sensors"], ready["modules"], ready["patches"]) == (768, 64, 4)
+            with DriverReader("roboskin") as reader:
+                frames = reader.in_order(timeout_s=60)
+                for _ in range(MINUTE_FRAMES):
+                    check_no_torn_module(next(frames))
+                assert reader.lost == 0
+            stopped = driver.stop()
+        totals = emulator.stop()
+    (shown,) = stopped["buses"]
+    assert shown["lost"] == shown["bad_length"] == shown["unknown"] == shown["bad_content"] == 0
+    assert sum(patch["orphans"] for patch in stopped["patches"]) <= 4  # a pair cut in two when the driver stopped
+    assert shown["frames"] > MINUTE_FRAMES * 128 * 0.9
+    assert totals["send_failures"] == 0
+
+
+def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], str], tmp_path: Path) -> None:
+    bus, log = vcan(), tmp_path / "faults.jsonl"
+    options = ("--boards", "7,8", "--pattern", "cycle", "--lose", "0.01", "--log", str(log))
+    with running("skin-emulate", "--bus", bus, *options) as emulator:
+        emulator.wait_for("ready")
+        with running("skin-driver", "--bus", bus, "--slots", "64") as driver:
+            driver.wait_for("ready")
+            with DriverReader("roboskin") as reader:
+                frames = reader.in_order(timeout_s=60)
+                for _ in range(200):
+                    check_no_torn_module(next(frames))
+            stopped = driver.stop()
+        emulator.stop()
+    events = [json.loads(line) for line in log.read_text().splitlines()]
+    halves = [(e["board"], e["triangle"], e["cycle"]) for e in events if e["event"] == "lost_half"]
+    both = len(halves) - len(set(halves))
+    orphans = sum(patch["orphans"] for patch in stopped["patches"])
+    late = sum(patch["late"] for patch in stopped["patches"])
+    assert len(halves) > 50
+    # at the very start and end, a half can be lost while nobody listens
+    assert len(halves) - 2 * both - 6 <= orphans - 2 * late <= len(halves) - 2 * both + 2
+
+
+def test_a_dead_board_beside_a_living_one(vcan: Callable[[], str]) -> None:
+    bus = vcan()
+    faults = ("--boards", "7,8", "--dead", "8", "--dead-after-cycles", "20")
+    with running("skin-emulate", "--bus", bus, *faults) as emulator:
+        emulator.wait_for("ready")
+        with running("skin-driver", "--bus", bus) as driver:
+            driver.wait_for("ready")
+            with DriverReader("roboskin") as reader:
+                frame = read_until(reader, lambda f: f.patch_state.tolist() == [PatchState.LIVE, PatchState.STALE])
+                assert (frame.status[192:] & Status.STALE).all()
+            assert "board 8 fell silent" in driver.errors
+
+
+def test_link_down_and_up_and_interface_deleted_and_made_again(vcan: Callable[[], str]) -> None:
+    bus = vcan()
+    with running("skin-emulate", "--bus", bus, "--boards", "7") as emulator:
+        emulator.wait_for("ready")
+        with running("skin-driver", "--bus", bus) as driver:
+            driver.wait_for("ready")
+            with DriverReader("roboskin") as reader:
+                frame = read_until(reader, lambda f: not f.status.any())
+                ip("link", "set", bus, "down")
+                read_until(reader, lambda f: f.bus_state[0] == BusState.DOWN)
+                ip("link", "set", bus, "up")
+                read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.status.any())
+                ip("link", "del", bus)
+                read_until(reader, lambda f: f.bus_state[0] == BusState.GONE)
+                ip("link", "add", "dev", bus, "type", "vcan")
+                ip("link", "set", bus, "up")
+                back = read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.status.any())
+                assert back.generation == frame.generation
+            assert driver.errors.count("went down") == 1
+
+
+def test_a_killed_driver_and_its_restart_with_the_reader_kept(vcan: Callable[[], str]) -> None:
+    bus = vcan()
+    with running("skin-emulate", "--bus", bus, "--boards", "7,8") as emulator:
+        emulator.wait_for("ready")
+        with DriverReaderWhenItComes(bus) as (reader, driver):
+            last = reader.read()
+            driver.stop(signal.SIGKILL)
+            assert not reader.alive
+            assert reader.read().stale
+            with running("skin-driver", "--bus", bus, "--boards", "7,8") as again:
+                again.wait_for("ready")
+                frame = reader.read(newer_than=last, timeout_s=60)
+                assert frame.generation != last.generation
+                read_until(reader, lambda f: not f.status.any())
+
+
+class DriverReaderWhenItComes:
+    """A driver on a bus and a reader that has seen a whole fresh frame of it."""
+
+    def __init__(self, bus: str) -> None:
+        self._driver = running("skin-driver", "--bus", bus, "--boards", "7,8")
+
+    def __enter__(self) -> tuple[DriverReader, Any]:
+        driver = self._driver.__enter__()
+        driver.wait_for("ready")
+        self._reader = DriverReader("roboskin")
+        read_until(self._reader, lambda f: not f.status.any())
+        return self._reader, driver
+
+    def __exit__(self, *raised: Any) -> None:
+        self._reader.close()
+        self._driver.__exit__(*raised)
+
+
+def test_two_controllers_at_1_mbit(can_pair: tuple[str, str]) -> None:
+    with running("skin-emulate", "--bus", can_pair[0], "--boards", "7,8") as emulator:
+        emulator.wait_for("ready")
+        with running("skin-driver", "--bus", can_pair[1]) as driver:
+            assert driver.wait_for("ready")["patches"] == 2
+            with DriverReader("roboskin") as reader:
+                read_until(reader, lambda f: not f.status.any())
+
+
+def fingertip_trial() -> tuple[list[list[int]], str]:
+    """(slices of 5 fingers x 12 values, where from): a real trial where the data is present, else made up."""
+    path = TRIALS / "full_vitamin_water_3.txt"
+    if not path.exists():
+        made = np.random.default_rng(1).integers(142, 256, (20, 60))
+        return made.tolist(), "made up"
+    slices: list[list[int]] = []
+    fingers: list[int] = []
+    for line in path.read_text().splitlines():
+        numbers = [float(text) for text in line.split()]
+        if len(numbers) == 12:
+            fingers += [int(number) for number in numbers]
+            if len(fingers) == 60:
+                slices.append(fingers)
+                fingers = []
+    return slices, path.name
+
+
+def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any) -> None:
+    """Fingertips of board 1 send the slices, one per cycle, the last one for ever."""
+    from skinware_drivers.can.socketcan import SocketCanBus
+    from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
+    from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+    from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+
+    def source(_board: int, triangle: int, cycle: int, _time_ns: int) -> Sequence[int]:
+        values = slices[min(cycle, len(slices) - 1)]
+        return values[12 * triangle : 12 * triangle + 12] if triangle < 5 else [240] * 12
+
+    options = RoboskinOptions(boards=(1,))
+    hardware = EmulatedRoboskin(options, source=source)
+    bus = SocketCanBus(bus_name)
+    with open(os.devnull, "w") as nowhere, SignalWatch() as stop:
+        ready.set()
+        Emulation(bus, hardware, JsonReport(nowhere)).run(stop, bus_name=bus_name, driver="roboskin", options=options)
+
+
+def test_real_fingertip_data_reaches_a_reader_unchanged(vcan: Callable[[], str]) -> None:
+    slices, _ = fingertip_trial()
+    assert len(slices) >= 10
+    bus = vcan()
+    ready = SPAWN.Event()
+    emulator = SPAWN.Process(target=replay, args=(bus, slices, ready))
+    emulator.start()
+    try:
+        assert ready.wait(120)
+        with running("skin-driver", "--bus", bus, "--boards", "1", "--skin-type", "1", "--slots", "64") as driver:
+            expected = [tuple(s) for s in slices]
+            seen: list[tuple[int, ...]] = []
+            with DriverReader("roboskin", timeout_s=120) as reader:
+                frames = reader.in_order(timeout_s=120)
+                while len(seen) < len(expected):
+                    frame = next(frames)
+                    fingers = frame.status[:60]
+                    if not fingers.any():
+                        seen.append(tuple(frame.values[:60].tolist()))
+            driver.wait_for("ready")
+        distinct = [s for n, s in enumerate(seen) if n == 0 or s != seen[n - 1]]
+        wanted = [s for n, s in enumerate(expected) if n == 0 or s != expected[n - 1]]
+        start = wanted.index(distinct[0])
+        assert distinct == wanted[start : start + len(distinct)]
+        assert start <= 1
+        assert frame.structure.module_kind[0] == b"fingertip"
+    finally:
+        if emulator.is_alive():
+            os.kill(emulator.pid or 0, signal.SIGINT)
+        emulator.join(60)
+        emulator.close()
+
+
+def test_an_interface_that_is_down_is_exit_code_3(vcan: Callable[[], str]) -> None:
+    bus = vcan()
+    ip("link", "set", bus, "down")
+    result = run("skin-driver", "--bus", bus)
+    assert result.returncode == 3
+    assert f"ip link set {bus} up" in result.stderr
+    assert run("skin-driver", "--bus", "vcan99").returncode == 3
+
+
+def test_python_cans_own_socketcan_users_hear_us(vcan: Callable[[], str]) -> None:
+    import can
+
+    bus = vcan()
+    with can.Bus(channel=bus, interface="socketcan") as other:
+        with running("skin-emulate", "--bus", bus, "--boards", "7", "--streaming") as emulator:
+            emulator.wait_for("ready")
+            message = other.recv(60)
+            assert message is not None
+            assert message.arbitration_id >> 4 == 0x47

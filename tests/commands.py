@@ -1,0 +1,97 @@
+"""Our commands as processes of their own, as a person or a script would run them."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+BIN = Path(sys.executable).parent
+PATIENCE_S = 120.0
+"""How long a command may take for its next line: the CAN lab's processor is emulated."""
+
+
+def run(command: str, *arguments: str, timeout_s: float = PATIENCE_S) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [BIN / command, *arguments], capture_output=True, text=True, timeout=timeout_s, stdin=subprocess.DEVNULL
+    )
+
+
+class Running:
+    """A command that runs, with its JSON lines."""
+
+    def __init__(self, command: str, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [BIN / command, *arguments, "--json"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._events: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._errors: list[str] = []
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        self._threads = [
+            threading.Thread(target=self._read_events, args=(self.process.stdout,)),
+            threading.Thread(target=self._read_errors, args=(self.process.stderr,)),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def errors(self) -> str:
+        """What it has written to stderr so far."""
+        return "".join(self._errors)
+
+    def wait_for(self, event: str) -> dict[str, Any]:
+        """The next event of a kind."""
+        while True:
+            try:
+                found = self._events.get(timeout=PATIENCE_S)
+            except queue.Empty:
+                raise AssertionError(f"no event {event!r}; stderr: {self.errors}") from None
+            if found["event"] == event:
+                return found
+
+    def stop(self, number: int = signal.SIGINT) -> dict[str, Any]:
+        """Interrupt it; its last event, if it had the time to say one."""
+        if self.process.poll() is None:
+            os.kill(self.process.pid, number)
+        self.process.wait(PATIENCE_S)
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+        for stream in (self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+        last: dict[str, Any] = {}
+        while not self._events.empty():
+            last = self._events.get()
+        return last
+
+    def _read_events(self, stream: IO[str]) -> None:
+        for line in stream:
+            self._events.put(json.loads(line))
+
+    def _read_errors(self, stream: IO[str]) -> None:
+        self._errors.extend(stream)
+
+
+@contextmanager
+def running(command: str, *arguments: str) -> Iterator[Running]:
+    """A command that is interrupted at the end, whatever happens."""
+    started = Running(command, *arguments)
+    try:
+        yield started
+    finally:
+        if started.process.returncode is None:
+            started.stop()

@@ -26,8 +26,8 @@ _LEAST_SILENCE_NS = NS_PER_S // 5
 class Publisher:
     """Copies the state of the skin into the ring at the right moments.
 
-    By cycle: as soon as every module that lives was heard, or one period after the first of them; and always before
-    a module would be shown twice, so that no cycle is overwritten before it was published. Otherwise at deadlines
+    By cycle: as soon as every module that lives was heard; and always before a module would be shown twice, so that
+    no cycle is overwritten before it was published. If neither happens, half a period after the cycle is over. Otherwise at deadlines
     that the runner keeps. With nothing to show it publishes four times a second, so that readers see the states.
 
     Args:
@@ -44,6 +44,8 @@ class Publisher:
         self._watch = watch
         self._period_ns = round(period_s * NS_PER_S)
         self._by_cycle = by_cycle
+        # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
+        self._patience_ns = self._period_ns * 3 // 2
         self._silence_ns = max(_SILENT_PERIODS * self._period_ns, _LEAST_SILENCE_NS)
         structure = decoder.tables.structure
         self._module_patch = structure.module_patch
@@ -68,7 +70,7 @@ class Publisher:
         if not self._by_cycle:
             return self._last_published_ns + self._period_ns
         idle_ns = self._last_published_ns + max(_IDLE_NS, 2 * self._period_ns)
-        return min(self._first_touch_ns + self._period_ns, idle_ns) if self._first_touch_ns else idle_ns
+        return min(self._first_touch_ns + self._patience_ns, idle_ns) if self._first_touch_ns else idle_ns
 
     def take(self, batch: FrameBatch, updates: Updates) -> None:
         """Show the updates of a batch, publishing as often as needed for none to be overwritten unseen."""

@@ -325,6 +325,7 @@ class Runner:
     def _publish_when_due(self) -> None:
         if self.publisher is None:
             return
+        self._on_readable()  # what has arrived comes first: this may be late
         self._update_bus_states()
         if now_ns() >= self.publisher.deadline_ns:
             self.publisher.publish()

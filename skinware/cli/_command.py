@@ -46,9 +46,13 @@ def run(command: click.Command) -> NoReturn:
 
 def _exit_code(command: click.Command) -> int:
     try:
-        result = command.main(standalone_mode=False)
+        # not command.main(): it has exit codes of its own for a closed pipe
+        with command.make_context(command.name, sys.argv[1:]) as context:
+            command.invoke(context)
         sys.stdout.flush()
-        return result if isinstance(result, int) else 0
+        return 0
+    except click.exceptions.Exit as leaving:
+        return leaving.exit_code
     except (KeyboardInterrupt, click.Abort):
         return 0
     except BrokenPipeError:

@@ -16,6 +16,7 @@ import pytest
 from skinware import BusState, DriverReader, PatchState, Status
 from tests.can.conftest import ip
 from tests.commands import run, running
+from tests.conftest import wait_until
 from tests.sdk.driving import read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(400)]
@@ -87,7 +88,7 @@ def test_a_dead_board_beside_a_living_one(vcan: Callable[[], str]) -> None:
             with DriverReader("roboskin") as reader:
                 frame = read_until(reader, lambda f: f.patch_state.tolist() == [PatchState.LIVE, PatchState.STALE])
                 assert (frame.status[192:] & Status.STALE).all()
-            assert "board 8 fell silent" in driver.errors
+            wait_until(lambda: "board 8 fell silent" in driver.errors)
 
 
 def test_link_down_and_up_and_interface_deleted_and_made_again(vcan: Callable[[], str]) -> None:

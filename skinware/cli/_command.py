@@ -1,21 +1,47 @@
-"""What all commands share: exit codes, one clear line per error, JSON lines, the namespace option."""
+"""What all commands share: how they end, one clear line per error, JSON lines, and the common options.
+
+A command is a module with a click command and::
+
+    def main() -> None:
+        run(command)
+"""
 
 from __future__ import annotations
 
-import json
+import contextlib
+import math
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeVar
 
 import click
 
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
-EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 1, 2, 3
+EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
+
+CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
+"""For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
 
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
+
+
+class Seconds(click.FloatRange):
+    """A time in seconds, 0 or more; refuses ``nan`` and ``inf``."""
+
+    name = "seconds"
+
+    def __init__(self) -> None:
+        super().__init__(min=0)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number, checked."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a number of seconds.", param, ctx)
+        return number
 
 
 def namespace_option(command: _Decorated) -> _Decorated:
@@ -30,42 +56,74 @@ def json_option(command: _Decorated) -> _Decorated:
 
 
 def print_json(data: object) -> None:
-    """One object on one line, at once."""
-    sys.stdout.write(json.dumps(data, separators=(",", ":")) + "\n")
-    sys.stdout.flush()
+    """One object on one line, at once. Numbers that JSON does not have (``nan``, ``inf``) become null."""
+    import msgspec
+
+    click.echo(msgspec.json.encode(data).decode())
+
+
+def warn(text: str) -> None:
+    """One line on stderr under the running command's name, for what is worth knowing but no error."""
+    click.echo(f"{click.get_current_context().info_name}: {text}", err=True)
 
 
 def run(command: click.Command) -> NoReturn:
-    """Run a command and exit: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus.
+    """Run a command with the arguments of this process, and exit as :func:`exit_status` says.
 
-    SIGTERM ends a command as Ctrl-C does. A reader of our output that goes away ends it in silence.
+    SIGTERM ends a command as Ctrl-C does.
     """
     signal.signal(signal.SIGTERM, _interrupt)
-    sys.exit(_exit_code(command))
+    sys.exit(exit_status(command, sys.argv[1:]))
 
 
-def _exit_code(command: click.Command) -> int:
+def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
+    """Run a command: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 bus not available.
+
+    Every expected error becomes one line on stderr. Output that nobody reads any more (``| head -1``) ends the command
+    in silence.
+    """
+    name = command.name or os.path.basename(sys.argv[0])
+    if f"_{name}_COMPLETE".upper().replace("-", "_") in os.environ:
+        command.main(list(arguments), prog_name=name)  # the shell asks for completions
     try:
-        # not command.main(): it has exit codes of its own for a closed pipe
-        with command.make_context(command.name, sys.argv[1:]) as context:
+        # not command.main(): that one makes a closed pipe a failure
+        with command.make_context(name, list(arguments)) as context:
             command.invoke(context)
-        sys.stdout.flush()
-        return 0
-    except click.exceptions.Exit as leaving:
-        return leaving.exit_code
+        _flush_output()
+        return EXIT_DONE
     except (KeyboardInterrupt, click.Abort):
-        return 0
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it exits
-        return 0
+        return EXIT_DONE
+    except click.exceptions.Exit as done:
+        return done.exit_code
     except click.ClickException as error:
         error.show()
         return error.exit_code
+    except BrokenPipeError:
+        _discard_output()
+        return EXIT_DONE
     except SkinwareError as error:
-        click.echo(f"{command.name}: {error}", err=True)
+        click.echo(f"{name}: {error}", err=True)
         if isinstance(error, ConfigurationError):
             return EXIT_USAGE
         return EXIT_NO_BUS if isinstance(error, BusNotAvailable) else EXIT_FAILED
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        click.echo(f"{name}: {where}{error.strerror or error}", err=True)
+        _discard_output()
+        return EXIT_FAILED
+
+
+def _flush_output() -> None:
+    if sys.stdout is not None:  # None: started with stdout closed
+        sys.stdout.flush()
+
+
+def _discard_output() -> None:
+    """Send what is still buffered nowhere, or Python complains about it when it exits."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
 
 
 def _interrupt(_signal: int, _frame: object) -> None:

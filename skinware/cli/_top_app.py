@@ -1,121 +1,273 @@
-"""The live view of ``skin-top``, with Textual: drivers and patches above, the chosen patch below."""
+"""The live view of ``skin-top``, with Textual: a list of drivers, buses and patches, and a picture of one of them."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import signal
 from typing import ClassVar
 
+from rich.console import JustifyMethod
+from rich.text import Text
 from textual.app import App, ComposeResult
-from textual.containers import VerticalScroll
+from textual.binding import Binding, BindingType
+from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware.cli._skin_view import driver_line, heat_map, patch_rows
-from skinware.errors import ServiceTimeout, SkinwareError, StructureError
+from skinware.cli._format import plural
+from skinware.cli._health import LIVE, life_of
+from skinware.cli._heat_widget import HeatMap
+from skinware.cli._live import LiveDrivers
+from skinware.cli._picture import Picture, describe_sensor
+from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
+from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
-from skinware.skin import Skin, Snapshot
 
-_COLUMNS = ("driver", "bus", "patch", "state", "age ms", "fresh", "orphans", "updates")
+_REDRAWS_HZ = 15
+_LIST_PERIOD_S = 0.5
+_WIDTHS = (19, 10, 7, 6, 11, 5, 7, 60)
+_LEFT_COLUMNS = (0, 1, 7)
+_STATE_COLOURS = {
+    "live": "#6cc070",
+    "connecting": "#5fb3d9",
+    "starting": "#5fb3d9",
+    "expected": "#5fb3d9",
+    "restarted": "#5fb3d9",
+    "paused": "#5fb3d9",
+    "stale": "#e6c440",
+    "silent": "#e6c440",
+    "down": "#e8453c",
+    "gone": "#e8453c",
+    "dead": "#e8453c",
+}
+_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_NOTHING = """\
+No driver runs in namespace {name!r} now.
+
+Start one in another terminal, for example:
+
+  skin-driver --bus virtual    an emulated skin, needs no hardware
+  skin-driver --bus can0       ROBOSKIN patches on a CAN bus
+
+It appears here by itself.  q quits."""
 
 
 class SkinTop(App[None]):
-    """Drivers, patches and the touch on the patch under the cursor."""
+    """Drivers, buses and patches, and what the sensors of the one under the cursor feel.
 
-    CSS = """
-    #drivers { height: auto; padding: 0 1; background: $panel; }
-    #patches { height: auto; max-height: 40%; }
-    #map { height: auto; padding: 1 1 0 1; }
+    Args:
+        namespace: where to look.
+        type_name: type of sensors to draw first; default: each driver's first.
+        duration_s: end after this time; None = until told to.
     """
-    BINDINGS: ClassVar = [("q", "quit", "Quit"), ("t", "next_type", "Next sensor type")]
-    TITLE = "skin-top"
 
-    def __init__(self, namespace: Namespace, type_name: str, duration_s: float | None, redraws_hz: float) -> None:
+    TITLE = "skin-top"
+    ENABLE_COMMAND_PALETTE = False
+    CSS = """
+    Screen { background: #121212; }
+    #head { height: 1; background: #22304f; color: #e0e0e0; padding: 0 1; }
+    #nothing { height: 1fr; align: center middle; }
+    #why { width: auto; max-width: 76; padding: 1 3; border: round #27548a; }
+    #all { height: 1fr; }
+    #list {
+        height: auto; max-height: 45%; background: #121212; overflow-x: hidden; scrollbar-size-vertical: 1;
+    }
+    #list > .datatable--header { background: #121212; color: #8a8a8a; text-style: none; }
+    #list > .datatable--cursor { background: #27548a; text-style: none; }
+    #above { height: 1; background: #22304f; color: #e0e0e0; padding: 0 1; }
+    #title { width: 1fr; text-style: bold; }
+    #scale { width: auto; }
+    #map { height: 1fr; margin: 0 1; background: #121212; scrollbar-size-vertical: 1; }
+    #marks, #detail { height: 1; padding: 0 1; }
+    #detail { color: #8a8a8a; }
+    Footer { background: #22304f; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("q", "quit", "Quit"),
+        Binding("ctrl+c", "quit", show=False, priority=True),
+        Binding("down", "choose(1)", "Choose", key_display="↑↓"),
+        Binding("up", "choose(-1)", show=False),
+        Binding("t", "next_type", "Sensor type"),
+        Binding("s", "other_scale", "Colour scale"),
+        Binding("pagedown", "scroll(1)", "Scroll", key_display="PgUp/PgDn"),
+        Binding("pageup", "scroll(-1)", show=False),
+    ]
+
+    def __init__(self, namespace: Namespace, type_name: str | None = None, duration_s: float | None = None) -> None:
         super().__init__()
-        self._skin = Skin(namespace)
-        self._type_name = type_name
+        self._drivers = LiveDrivers(namespace)
         self._duration_s = duration_s
-        self._period_s = 1 / redraws_hz
-        self._snapshot: Snapshot | None = None
-        self._patches: list[tuple[int, int]] = []
-        self._layout: object = None
+        self._picture = Picture(type_name)
+        self._rows: list[Row] = []
+        self._pointed: int | None = None
+        self._must_draw = True
 
     def compose(self) -> ComposeResult:
         """Lay the screen out."""
-        yield Static(id="drivers", markup=False)
-        yield DataTable(id="patches", cursor_type="row", zebra_stripes=True)
-        with VerticalScroll():
-            yield Static(id="map")
+        yield Static(id="head", markup=False)
+        with Container(id="nothing"):
+            yield Static(id="why", markup=False)
+        with Vertical(id="all"):
+            table = DataTable[Text](id="list", cursor_type="row")
+            table.can_focus = False  # keys go to the app: nobody has to think about focus
+            yield table
+            with Horizontal(id="above"):
+                yield Static(id="title", markup=False)
+                yield Static(id="scale", markup=False)
+            yield HeatMap(id="map")
+            yield Static(id="marks", markup=False)
+            yield Static(id="detail", markup=False)
         yield Footer()
 
     def on_mount(self) -> None:
-        """Start to read."""
-        table = self.query_one(DataTable)
-        for name in _COLUMNS:
-            table.add_column(name, key=name)
-        table.focus()
-        self.set_interval(self._period_s, self._refresh)
+        """Start to look."""
+        for column, title in enumerate(COLUMNS):
+            self._table.add_column(_cell(title, column), key=title, width=_WIDTHS[column])
+        loop = asyncio.get_running_loop()
+        for number in _ENDING_SIGNALS:
+            with contextlib.suppress(ValueError, RuntimeError):  # we are not in the main thread
+                loop.add_signal_handler(number, self.exit)
+        self._update_list()
+        self.set_interval(_LIST_PERIOD_S, self._update_list)
+        self.set_interval(1 / _REDRAWS_HZ, self._update_picture)
         if self._duration_s is not None:
             self.set_timer(self._duration_s, self.exit)
 
     def on_unmount(self) -> None:
         """Let go of the drivers."""
-        self._skin.close()
+        for number in _ENDING_SIGNALS:
+            asyncio.get_running_loop().remove_signal_handler(number)
+        self._drivers.close()
+
+    # -- what the person does -----------------------------------------------------------------------------------
+
+    def action_choose(self, step: int) -> None:
+        """Go up or down in the list."""
+        self._table.move_cursor(row=self._table.cursor_row + step)
+
+    def action_scroll(self, pages: int) -> None:
+        """Scroll a picture that is higher than its window."""
+        heat_map = self.query_one(HeatMap)
+        heat_map.scroll_relative(y=pages * max(1, heat_map.size.height - 1), animate=False)
 
     def action_next_type(self) -> None:
         """Draw another type of sensors."""
-        types = self._snapshot.layout.types if self._snapshot else ()
-        if types:
-            at = types.index(self._type_name) + 1 if self._type_name in types else 0
-            self._type_name = types[at % len(types)]
+        row = self._chosen
+        driver = self._drivers.get(row.key.driver) if row else None
+        if driver is not None:
+            self._picture.next_type(driver.reader.structure)
+            self._update_picture(must_draw=True)
 
-    def _refresh(self) -> None:
-        drivers = self.query_one("#drivers", Static)
+    def action_other_scale(self) -> None:
+        """Change what the colours span: the type's range, or the values seen from now on."""
+        self._picture.other_scale()
+        self._update_picture(must_draw=True)
+
+    def on_data_table_row_highlighted(self) -> None:
+        """Another row was chosen, by key or mouse."""
+        self._pointed = None
+        self._update_picture(must_draw=True)
+
+    def on_heat_map_pointed(self, event: HeatMap.Pointed) -> None:
+        """Say what the mouse points at."""
+        self._pointed = event.sensor
+        self._update_picture(must_draw=True)
+
+    def on_resize(self) -> None:
+        """The room for the picture changes with the next layout."""
+        self._must_draw = True
+
+    # -- what is shown ------------------------------------------------------------------------------------------
+
+    @property
+    def _table(self) -> DataTable[Text]:
+        return self.query_one("#list", DataTable)
+
+    @property
+    def _chosen(self) -> Row | None:
+        at = self._table.cursor_row
+        return self._rows[at] if 0 <= at < len(self._rows) else None
+
+    def _update_list(self) -> None:
+        rows: list[Row] = []
+        why = _NOTHING.format(name=self._drivers.namespace.name)
+        count = 0
         try:
-            snapshot = self._skin.read(timeout_s=0.0)
-        except ServiceTimeout as silence:
-            self._snapshot, self._layout = None, None
-            self.query_one(DataTable).clear()
-            self.query_one("#map", Static).update("")
-            drivers.update(str(silence))
-            return
-        except SkinwareError as error:
-            drivers.update(str(error))
-            return
-        lines = [
-            driver_line(self._skin.reader(name), frame)
-            for name, frame in zip(snapshot.layout.drivers, snapshot.frames, strict=True)
-        ]
-        drivers.update("\n".join(lines))
-        self._snapshot = snapshot
-        self._fill_table(snapshot)
-        self._draw_map(snapshot)
+            for driver in self._drivers.look():
+                self._drivers.poll(driver)
+                count += 1
+                rows += rows_of(driver.reader, driver.frame, driver.health())
+        except NamespaceError as error:
+            why = str(error)
+        self._set("#head", f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}")
+        self._set("#why", why)
+        self.query_one("#nothing").display = not rows
+        self.query_one("#all").display = bool(rows)
+        self._fill(rows)
+        self._update_picture(must_draw=True)
 
-    def _fill_table(self, snapshot: Snapshot) -> None:
-        table = self.query_one(DataTable)
-        rows = []
-        patches = []
-        for driver, name in enumerate(snapshot.layout.drivers):
-            for patch, row in enumerate(patch_rows(self._skin.reader(name), snapshot.frames[driver])):
-                rows.append((name, *row))
-                patches.append((driver, patch))
-        if self._layout is not snapshot.layout:
+    def _fill(self, rows: list[Row]) -> None:
+        table, before, chosen = self._table, self._rows, self._chosen
+        keys = [row.key for row in rows]
+        self._rows = rows
+        if keys != [row.key for row in before]:
             table.clear()
-            for number, row in enumerate(rows):
-                table.add_row(*row, key=str(number))
-            self._layout = snapshot.layout
-            self._patches = patches
+            for row in rows:
+                table.add_row(*_cells(row), key=_text_key(row.key))
+            if chosen is not None and chosen.key in keys:
+                table.move_cursor(row=keys.index(chosen.key))
             return
-        for number, row in enumerate(rows):
-            for column, cell in zip(_COLUMNS, row, strict=True):
-                if table.get_cell(str(number), column) != cell:
-                    table.update_cell(str(number), column, cell)
+        for row, old in zip(rows, before, strict=True):
+            for column, title in enumerate(COLUMNS):
+                if row.cells[column] != old.cells[column]:
+                    table.update_cell(_text_key(row.key), title, _cells(row)[column])
 
-    def _draw_map(self, snapshot: Snapshot) -> None:
-        cursor = self.query_one(DataTable).cursor_row
-        if not 0 <= cursor < len(self._patches):
+    def _update_picture(self, must_draw: bool = False) -> None:
+        row = self._chosen
+        driver = self._drivers.get(row.key.driver) if row else None
+        heat_map = self.query_one(HeatMap)
+        if row is None or driver is None or not heat_map.size.area:
             return
-        driver, patch = self._patches[cursor]
-        try:
-            drawn = heat_map(snapshot.frames[driver], patch, self._type_name)
-        except StructureError as error:
-            self.query_one("#map", Static).update(str(error))
+        is_newer = self._drivers.poll(driver)
+        frame = driver.frame
+        if frame is None or not (is_newer or must_draw or self._must_draw):
             return
-        self.query_one("#map", Static).update(drawn)
+        self._must_draw = False
+        picture = self._picture
+        life = LIVE if is_newer else life_of(driver.reader, frame)
+        picture.draw(row.key, frame, heat_map.size.width, heat_map.size.height, life)
+        if picture.arrangement is not None:
+            heat_map.show(picture.arrangement, picture.pixels)
+        self._set("#title", picture.title)
+        self._set("#scale", picture.scale)
+        self._set("#marks", picture.marks)
+        detail = counters_text(row.counters)
+        if self._pointed is not None and self._pointed < frame.structure.n_sensors:
+            detail = describe_sensor(frame, self._pointed)
+        self._set("#detail", detail)
+
+    def _set(self, selector: str, text: str | Text) -> None:
+        """Change a line of text, if it is another one."""
+        line = self.query_one(selector, Static)
+        if line.content != text:
+            line.update(text)
+
+
+def _cells(row: Row) -> list[Text]:
+    cells = [_cell(text, column) for column, text in enumerate(row.cells)]
+    cells[1].stylize(_STATE_COLOURS.get(row.state, ""))
+    if row.key.kind == "driver":
+        cells[0].stylize("bold")
+    fresh, _, total = row.cells[4].partition("/")
+    if fresh != total:
+        cells[4].stylize(_STATE_COLOURS["stale"])
+    return cells
+
+
+def _cell(text: str, column: int) -> Text:
+    justify: JustifyMethod = "left" if column in _LEFT_COLUMNS else "right"
+    return Text(text, justify=justify, no_wrap=True, overflow="ellipsis")
+
+
+def _text_key(key: RowKey) -> str:
+    return f"{key.driver} {key.kind} {key.number}"

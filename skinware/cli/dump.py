@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-import sys
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import json_option, namespace_option, print_json, run
+from skinware.cli._command import CONTEXT_SETTINGS, Seconds, json_option, namespace_option, print_json, run, warn
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from skinware.driver_service import DriverFrame, DriverReader
     from skinware.memory.namespace import Namespace
+    from skinware.structure import Index, Structure
+
+_LOOK_EVERY_S = 0.1
 
 
-@click.command("skin-dump")
+@click.command("skin-dump", context_settings=CONTEXT_SETTINGS)
 @click.argument("name", required=False)
-@click.option("-n", "count", type=click.IntRange(min=1), help="Stop after this many frames.")
-@click.option("-T", "timeout_s", type=float, help="Stop (with exit status 1) after this many seconds without a frame.")
-@click.option("--type", "type_name", metavar="TYPE", help="Only sensors of this type, such as pressure.")
-@click.option("--physical", is_flag=True, help="With --type: values in the type's unit instead of raw counts.")
-@click.option("--rate", "rate_hz", type=float, help="The newest frame at this rate; otherwise every frame in order.")
+@click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
+@click.option("-T", "timeout_s", type=Seconds(), help="Fail after SECONDS without a frame; also wait for the driver.")
+@click.option("--type", "type_name", metavar="TYPE", help="Only the sensors of one type, such as pressure.")
+@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
+@click.option("--physical", is_flag=True, help="Values in the unit of their type instead of raw counts.")
 @namespace_option
 @json_option
 def command(
@@ -29,84 +34,204 @@ def command(
     count: int | None,
     timeout_s: float | None,
     type_name: str | None,
-    physical: bool,
     rate_hz: float | None,
+    physical: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Print the frames of driver NAME (or of the only driver there is)."""
+    r"""Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
+
+    A line of text has the least, mean and greatest value of the fresh sensors of each type. JSON has everything.
+
+    \b
+    skin-dump -n 3                              three frames
+    skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s
+    skin-dump --json --rate 10 > frames.jsonl   ten frames a second
+    """
     from skinware.memory.namespace import Namespace
 
-    if physical and not type_name:
-        raise click.UsageError("--physical needs --type: each type has its own unit")
-    place = Namespace(namespace)
-    with _attach(place, name, timeout_s) as reader:
-        if type_name:
-            reader.structure.type(type_name)
-        for taken, frame in enumerate(_frames(reader, rate_hz, timeout_s), start=1):
+    taken = 0
+    with _attach(Namespace(namespace), name, timeout_s) as reader:
+        _check_type(reader.structure, type_name)
+        for frame in _frames(reader, rate_hz, timeout_s):
             if as_json:
                 print_json(as_data(reader, frame, type_name, physical))
             else:
-                click.echo(as_line(reader, frame, type_name))
+                click.echo(as_line(reader, frame, type_name, physical))
+            taken += 1
             if taken == count:
                 return
 
 
 def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, physical: bool) -> dict[str, Any]:
-    """One frame as JSON prints it."""
-    index = frame.structure.index(type_name) if type_name else slice(None)
-    values = frame.physical(type_name) if type_name and physical else frame.values[index]
+    """One frame as JSON prints it; with ``type_name`` only those sensors, and their uids."""
+    index: Index = slice(None) if type_name is None else frame.structure.index(type_name)
+    values = _physical(frame)[index] if physical else frame.values[index]
     data = {
         "driver": reader.name,
         "sequence": frame.sequence,
         "acquired_ns": frame.acquired_ns,
         "age_ms": round(frame.age_ns / 1e6, 3),
+        "lost": reader.lost,
         "values": values.tolist(),
         "status": frame.status[index].tolist(),
-        "lost": reader.lost,
     }
-    if type_name:
+    if type_name is not None:
         data["uids"] = frame.structure.sensor_uid[index].tolist()
     return data
 
 
-def as_line(reader: DriverReader, frame: DriverFrame, type_name: str | None) -> str:
-    """One frame for people: per type, the least, mean and greatest physical value."""
-    parts = []
+def as_line(reader: DriverReader, frame: DriverFrame, type_name: str | None, physical: bool) -> str:
+    """One frame for people: least / mean / greatest value of the fresh sensors of each type."""
+    import numpy as np
+
+    from skinware.cli._format import age_text
+
+    parts = [f"{reader.name} #{frame.sequence}", f"age {age_text(frame.age_ns)}"]
+    all_values = _physical(frame) if physical else frame.values
+    not_fresh = 0
     for sensor_type in frame.structure.types:
         if type_name in (None, sensor_type.name):
-            values = frame.physical(sensor_type.name)
-            least, mean, most = values.min(), values.mean(), values.max()
-            parts.append(f"{sensor_type.name} {least:.4g} / {mean:.4g} / {most:.4g} {sensor_type.unit}")
-    not_fresh = int((frame.status != 0).sum())
-    age_ms = frame.age_ns / 1e6
-    return f"{reader.name} #{frame.sequence}  age {age_ms:.1f} ms  {'  '.join(parts)}  not fresh {not_fresh}"
+            index = frame.structure.index(sensor_type.name)
+            fresh = frame.status[index] == 0
+            not_fresh += int(np.count_nonzero(~fresh))
+            values = all_values[index][fresh]
+            figures = f"{values.min():.5g} / {values.mean():.5g} / {values.max():.5g}" if len(values) else "-"
+            parts.append(f"{sensor_type.name} {figures} {sensor_type.unit if physical else 'raw'}")
+    parts.append(f"not fresh {not_fresh}")
+    if reader.lost:
+        parts.append(f"lost {reader.lost}")
+    return "  ".join(parts)
+
+
+def _physical(frame: DriverFrame) -> npt.NDArray[Any]:
+    """(n_sensors,) float32: every value in the unit of its type."""
+    import numpy as np
+
+    values = np.empty(frame.structure.n_sensors, np.float32)
+    for sensor_type in frame.structure.types:
+        values[frame.structure.index(sensor_type.name)] = frame.physical(sensor_type.name)
+    return values
+
+
+def _check_type(structure: Structure, type_name: str | None) -> None:
+    from skinware.errors import ConfigurationError, StructureError
+
+    try:
+        if type_name is not None:
+            structure.type(type_name)
+    except StructureError as error:
+        raise ConfigurationError(str(error)) from None
 
 
 def _attach(namespace: Namespace, name: str | None, timeout_s: float | None) -> DriverReader:
     from skinware.driver_service import DriverReader
+
+    end_s = time.monotonic() + (timeout_s or 0.0)
+    if name is None:
+        name = _only_driver(namespace, end_s)
+    reader = DriverReader(name, namespace=namespace, timeout_s=max(0.0, end_s - time.monotonic()))
+    if not reader.alive:
+        warn(f"driver {name!r} is dead; this is its last frame. Waiting for it to come back")
+    return reader
+
+
+def _only_driver(namespace: Namespace, end_s: float) -> str:
+    """The one living driver, else the one dead one.
+
+    Raises:
+        ConfigurationError: there are several.
+        ServiceNotFound: there is none by ``end_s`` of CLOCK_MONOTONIC.
+    """
     from skinware.errors import ConfigurationError, ServiceNotFound
 
-    if name is None:
-        names = namespace.services()
-        if len(names) > 1:
-            raise ConfigurationError(f"which driver? namespace {namespace.name!r} has: {', '.join(names)}")
-        if not names:
-            raise ServiceNotFound(f"no driver in namespace {namespace.name!r}; start one: skin-driver --bus virtual")
-        name = names[0]
-    return DriverReader(name, namespace=namespace, timeout_s=timeout_s or 0.0)
+    while True:
+        living = _drivers(namespace)
+        candidates = [name for name, alive in living.items() if alive] or list(living)
+        if len(candidates) == 1:
+            return candidates[0]
+        if candidates:
+            raise ConfigurationError(
+                f"which driver? Namespace {namespace.name!r} has: {', '.join(candidates)}; give one as NAME"
+            )
+        if time.monotonic() >= end_s:
+            raise ServiceNotFound(
+                f"no driver in namespace {namespace.name!r}; start one (skin-driver --bus ...), or wait for it with -T"
+            )
+        time.sleep(_LOOK_EVERY_S)
+
+
+def _drivers(namespace: Namespace) -> dict[str, bool]:
+    """Name of every driver, and whether it lives."""
+    from skinware.driver_service import KIND
+    from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
+    from skinware.memory.ring import Frame
+    from skinware.service import ServiceReader
+
+    found = {}
+    for name in namespace.services():
+        try:
+            with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
+                if service.kind == KIND:
+                    found[name] = service.alive
+        except (BadServiceFile, ConfigurationError, ServiceNotFound):
+            continue  # nothing that can be read, or just withdrawn
+    return found
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverFrame]:
-    """Frames for ever, over restarts with another structure too."""
+    """Frames for ever, over restarts of the driver; says on stderr when it came back."""
     from skinware.errors import StructureChanged
 
+    generation = reader.generation
     while True:
         try:
-            yield from reader.frames(rate_hz) if rate_hz else reader.in_order(timeout_s=timeout_s)
+            frames = reader.in_order(timeout_s=timeout_s) if rate_hz is None else _sampled(reader, rate_hz, timeout_s)
+            for frame in frames:
+                if frame.generation != generation:
+                    generation = frame.generation
+                    warn(f"driver {reader.name!r} was started again")
+                yield frame
         except StructureChanged:
+            _reattach(reader, timeout_s)
+            generation = reader.generation
+            warn(f"driver {reader.name!r} came back with another structure: {reader.structure.n_sensors} sensors now")
+
+
+def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
+    """Go over to the driver's new structure; if it is gone again already, wait for it.
+
+    Raises:
+        ServiceNotFound: it was gone for ``timeout_s``.
+    """
+    from skinware.errors import ServiceNotFound
+
+    end_s = None if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        try:
             reader.reattach()
-            print(f"skin-dump: {reader.name} came back as {reader.structure!r}", file=sys.stderr)  # noqa: T201
+            return
+        except ServiceNotFound:
+            if end_s is not None and time.monotonic() >= end_s:
+                raise
+        time.sleep(_LOOK_EVERY_S)
+
+
+def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverFrame]:
+    """The newest frame at the deadlines of a rate, each frame once.
+
+    Raises:
+        StructureChanged: the driver came back with another structure.
+        ServiceTimeout: no newer frame for ``timeout_s``.
+    """
+    from skinware.realtime import Periodic
+
+    timer = Periodic(rate_hz)
+    newest: DriverFrame | None = None
+    while True:
+        newest = reader.read(newer_than=newest, timeout_s=timeout_s)
+        yield newest
+        timer.wait()
 
 
 def main() -> None:

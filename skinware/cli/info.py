@@ -2,27 +2,39 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import json_option, namespace_option, print_json, run
+from skinware.cli._command import CONTEXT_SETTINGS, json_option, namespace_option, print_json, run
+from skinware.cli._format import age_text, count_text, plural, rate_text, table
 
 if TYPE_CHECKING:
-    from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
-    from skinware.service import ServiceReader
+
+_WATCH_PERIOD_S = 1.0
+_LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
-@click.command("skin-info")
+@click.command("skin-info", context_settings=CONTEXT_SETTINGS)
 @click.argument("name", required=False)
-@click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in frame order.")
+@click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
 @click.option("--watch", is_flag=True, help="Again every second, until interrupted.")
 @namespace_option
 @json_option
 def command(name: str | None, sensors: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
-    """Show the drivers and services of a namespace, their buses and patches, and who reads them."""
+    r"""Show what is attached: drivers, their buses and patches, other services, and who reads them.
+
+    With NAME: only that driver or service.
+
+    \b
+    skin-info                        everything in this namespace
+    skin-info roboskin --sensors     every sensor of one driver, in frame order
+    skin-info --json | jq '.drivers[] | {name, rate_hz}'
+    """
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
@@ -30,162 +42,155 @@ def command(name: str | None, sensors: bool, watch: bool, namespace: str | None,
         if name is None:
             raise click.UsageError("--sensors lists one driver: give its NAME")
         _show_sensors(place, name, as_json)
-        return
-    while True:
-        report = collect(place, name)
+    elif watch:
+        _watch(place, name, as_json)
+    else:
+        from skinware.cli._report import report
+
+        found = report(place, name)
         if as_json:
-            print_json(report)
+            print_json(found)
         else:
-            if watch:
-                click.clear()
-            click.echo(as_text(report))
-        if not watch:
-            return
-        time.sleep(1)
+            click.echo("\n".join(as_text(found)))
 
 
-def collect(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
-    """Everything that can be seen of a namespace, as JSON prints it.
-
-    Raises:
-        ServiceNotFound: ``only`` names nothing here.
-        NamespaceError: the namespace cannot be trusted or read.
-    """
-    from skinware.driver_service import DriverReader
-    from skinware.errors import BadServiceFile, ServiceNotFound
-    from skinware.memory.announcement import living_readers
-    from skinware.service import ServiceReader
-
-    drivers: list[dict[str, Any]] = []
-    services: list[dict[str, Any]] = []
-    problems: list[str] = []
-    readers = [{name: getattr(r, name) for name in r.__struct_fields__} for r in living_readers(namespace)]
-    for name in [only] if only else namespace.services():
-        own = [r for r in readers if r["service"] == name]
-        try:
-            service: ServiceReader[Any]
-            with ServiceReader(name, namespace=namespace, announce=False) as service:
-                common = _common(service, own)
-                if service.kind != "driver":
-                    services.append(common)
-                    continue
-            with DriverReader(name, namespace=namespace, announce=False) as driver:
-                drivers.append({**common, **_driver(driver)})
-        except ServiceNotFound:
-            if only:
-                raise
-        except BadServiceFile as error:
-            problems.append(str(error))
-    report: dict[str, Any] = {"namespace": namespace.name, "drivers": drivers, "services": services}
-    return {**report, "problems": problems} if problems else report
+def as_text(found: dict[str, Any]) -> list[str]:
+    """The report for people, as lines with colours (which ``click.echo`` takes out where there is no terminal)."""
+    drivers, services = found["drivers"], found["services"]
+    lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
+    if not drivers and not services:
+        lines += ["", "Nothing runs here yet. Start a driver:", "  skin-driver --bus virtual    (needs no hardware)"]
+    for driver in drivers:
+        lines += ["", *_driver_lines(driver)]
+    for service in services:
+        lines += ["", _life_line("service", service), *_indented(_reader_lines(service))]
+    if found["problems"]:
+        lines += ["", *(click.style("problem: ", fg="red") + text for text in found["problems"])]
+    return lines
 
 
-def _common(service: ServiceReader[Any], readers: list[dict[str, Any]]) -> dict[str, Any]:
-    latest = service.latest
-    frame = service.read(timeout_s=0) if latest else None
-    return {
-        "name": service.name,
-        "alive": service.alive,
-        "paused": service.paused,
-        "pid": service.writer_pid,
-        "generation": service.generation,
-        "sequence": latest[1] if latest else 0,
-        "rate_hz": service.rate_hz(),
-        "age_ms": round(frame.age_ns / 1e6, 3) if frame else None,
-        "missed_periods": service.missed_periods,
-        "readers": readers,
-    }
-
-
-def _driver(driver: DriverReader) -> dict[str, Any]:
-    from skinware.status import BusState, PatchState
-
-    structure = driver.structure
-    counts = [int((structure.sensor_type == t.id).sum()) for t in structure.types]
-    told: dict[str, Any] = {
-        "driver_type": driver.driver_type,
-        "dtype": structure.dtype.name,
-        "sensors": structure.n_sensors,
-        "modules": structure.n_modules,
-        "patches": structure.n_patches,
-        "types": [{"name": t.name, "sensors": n, "unit": t.unit} for t, n in zip(structure.types, counts, strict=True)],
-        "buses": [{"name": name} for name in structure.buses],
-        "patch_list": [],
-    }
-    if driver.latest is None:
-        return told
-    frame = driver.read(timeout_s=0)
-    for bus, state, counters in zip(told["buses"], frame.bus_state, driver.bus_counters(frame), strict=True):
-        bus |= {"state": BusState(state).name.lower(), **counters}
-    names = [bytes(name).decode() for name in structure.patch_name]
-    for patch, counters in enumerate(driver.patch_counters(frame)):
-        state = PatchState(frame.patch_state[patch]).name.lower()
-        bus_name = structure.buses[structure.patch_bus[patch]]
-        fresh = int((frame.status[structure.patch_index(patch)] == 0).sum())
-        told["patch_list"].append(
-            {"name": names[patch], "bus": bus_name, "state": state, "fresh_sensors": fresh, **counters}
+def _driver_lines(driver: dict[str, Any]) -> list[str]:
+    types = ", ".join(
+        f"{count_text(t['sensors'])} {t['name']}" + (f" ({t['unit']})" if t["unit"] else "") for t in driver["types"]
+    )
+    size = ", ".join(
+        (
+            plural(driver["patches"], "patch", "patches"),
+            plural(driver["modules"], "module"),
+            plural(driver["sensors"], "sensor"),
         )
-    return told
+    )
+    kind = f"{driver['driver_type']} driver, " if driver["driver_type"] else ""
+    was = "was " if driver["state"] in ("dead", "silent", "paused") else ""
+    lines = [f"{kind}{size} of {driver['dtype']}: {types}", ""]
+    lines += _counter_table(
+        driver["buses"], ("bus", "state"), lambda bus: (bus["name"], was + (bus["state"] or "-")), {"frames", "lost"}
+    )
+    lines.append("")
+    lines += _counter_table(
+        driver["patch_list"],
+        ("patch", "bus", "state", "fresh sensors", "age"),
+        lambda patch: (
+            patch["name"],
+            patch["bus"],
+            was + (patch["state"] or "-"),
+            f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
+            age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+        ),
+        {"orphans"},
+    )
+    return [_life_line("driver", driver), *_indented([*lines, "", *_reader_lines(driver)])]
 
 
-def as_text(report: dict[str, Any]) -> str:
-    """The report for people."""
-    lines = [f"namespace {report['namespace']}"]
-    if not report["drivers"] and not report["services"]:
-        lines.append("  nothing here yet; start a driver: skin-driver --bus virtual")
-    for driver in report["drivers"]:
-        types = ", ".join(f"{t['sensors']} {t['name']}" for t in driver["types"])
-        lines.append(f"driver {driver['name']} ({driver['driver_type']}): {_life(driver)}")
-        lines.append(f"  {driver['patches']} patches, {driver['modules']} modules, {types}")
-        lines += _table(driver["buses"], "  bus")
-        lines += _table(driver["patch_list"], "  patch")
-        lines += _readers(driver)
-    for service in report["services"]:
-        lines.append(f"service {service['name']}: {_life(service)}")
-        lines += _readers(service)
-    lines += [f"problem: {problem}" for problem in report.get("problems", ())]
-    return "\n".join(lines)
+def _life_line(what: str, entry: dict[str, Any]) -> str:
+    life, age = entry["state"], age_text(None if entry["age_ms"] is None else entry["age_ms"] * 1e6)
+    parts = [click.style(life, fg=_LIFE_COLOURS.get(life), bold=True)]
+    if entry["age_ms"] is None:
+        parts.append("nothing published yet")
+    elif life == "dead":
+        parts += [f"its last data is {age} old and stays readable", f"{count_text(entry['sequence'])} frames"]
+    elif life == "silent":
+        parts += [f"its process runs but publishes nothing, newest data {age} old"]
+    else:
+        parts += [rate_text(entry["rate_hz"]), f"newest data {age} old", f"frame {count_text(entry['sequence'])}"]
+    if entry["missed_periods"]:
+        parts.append(f"{plural(entry['missed_periods'], 'period')} missed")
+    parts.append(f"pid {entry['pid']}")
+    return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
-def _life(entry: dict[str, Any]) -> str:
-    rate = f"{entry['rate_hz']:.1f} Hz" if entry["rate_hz"] else "no rate yet"
-    age = "nothing published" if entry["age_ms"] is None else f"newest data {entry['age_ms']:.0f} ms old"
-    life = f"pid {entry['pid']}" if entry["alive"] else "DEAD (its last frame stays readable)"
-    return f"{life}, {rate}, {age}"
+_OWN_KEYS = {"name", "state", "bus", "age_ms", "modules", "sensors", "fresh"}
 
 
-def _readers(entry: dict[str, Any]) -> list[str]:
-    shown = [{k: v for k, v in reader.items() if k != "service"} for reader in entry["readers"]]
-    return _table(shown, "  reader") or ["  no readers"]
+def _counter_table(rows: list[dict[str, Any]], titles: tuple[str, ...], cells: Any, always: set[str]) -> list[str]:
+    """Rows with those of their counters that are not 0 everywhere (and ``always``, where there are such counters)."""
+    names = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in _OWN_KEYS]
+    shown = [name for name in names if name in always or any(row.get(name) for row in rows)]
+    return table(
+        [*titles, *(name.replace("_", " ") for name in shown)],
+        [[*cells(row), *(count_text(row.get(name)) for name in shown)] for row in rows],
+        left=min(len(titles), 3),
+    )
 
 
-def _table(rows: list[dict[str, Any]], title: str) -> list[str]:
-    """Rows of equal keys as aligned columns, with the keys above them; columns of zeros only are left out."""
-    if not rows:
-        return []
-    keys = [key for key in rows[0] if any(row.get(key) not in (0, None) for row in rows)]
-    cells = [[key.replace("_", " ") for key in keys]] + [[str(row.get(key, "")) for key in keys] for row in rows]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(keys))]
-    padded = ["  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip() for line in cells]
-    return [f"{title}  {line}" if n == 0 else f"{' ' * len(title)}  {line}" for n, line in enumerate(padded)]
+def _reader_lines(entry: dict[str, Any]) -> list[str]:
+    if not entry["readers"]:
+        return ["no readers"]
+    rows = [
+        [
+            reader["program"],
+            reader["kind"],
+            str(reader["pid"]),
+            rate_text(reader["rate_hz"]),
+            age_text(reader["age_ms"] * 1e6),
+            count_text(reader["frames"]),
+            count_text(reader["lost"]),
+        ]
+        for reader in entry["readers"]
+    ]
+    return table(("reader", "how", "pid", "rate", "data age", "frames", "not taken"), rows, left=2)
+
+
+def _indented(lines: list[str]) -> list[str]:
+    return [f"  {line}" if line else "" for line in lines]
 
 
 def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
-    from skinware.driver_service import DriverReader
+    from skinware.cli._report import sensors
 
-    with DriverReader(name, namespace=namespace, announce=False) as driver:
-        structure = driver.structure
-    type_name = {t.id: t.name for t in structure.types}
-    columns = (structure.sensor_uid, structure.sensor_type, structure.sensor_module, structure.sensor_patch)
-    rows = [
-        {"uid": uid, "type": type_name[kind], "module": module, "patch": patch}
-        for uid, kind, module, patch in zip(*(column.tolist() for column in columns), strict=True)
-    ]
+    rows = sensors(namespace, name)
     if as_json:
         print_json(rows)
-    else:
-        for row in rows:
-            click.echo(f"{row['uid']:#018x}  {row['type']:<16}  module {row['module']:<5}  patch {row['patch']}")
+        return
+    cells = [[f"{row['uid']:#x}", row["type"], str(row["module"]), str(row["patch"])] for row in rows]
+    numbered = [[str(position), *row] for position, row in enumerate(cells)]
+    click.echo("\n".join(table(("position", "uid", "type", "module", "patch"), numbered, left=0)))
+
+
+def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
+    from skinware.cli._report import report
+    from skinware.errors import ServiceNotFound
+
+    while True:
+        try:
+            found = report(namespace, name)
+        except ServiceNotFound as error:  # it may come
+            found = {"namespace": namespace.name, "drivers": [], "services": [], "problems": [str(error)]}
+        if as_json:
+            print_json(found)
+        elif sys.stdout.isatty():
+            _redraw(as_text(found))
+        else:
+            click.echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
+        time.sleep(_WATCH_PERIOD_S)
+
+
+def _redraw(lines: list[str]) -> None:
+    """Put lines in the place of what is on the terminal, without flicker; what does not fit is cut."""
+    height = shutil.get_terminal_size().lines - 1
+    if len(lines) > height:
+        lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
+    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False)
 
 
 def main() -> None:

@@ -9,51 +9,90 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import namespace_option, run
+from skinware.cli._command import CONTEXT_SETTINGS, Seconds, json_option, namespace_option, print_json, run, warn
 
 if TYPE_CHECKING:
+    from skinware.cli._live import LiveDrivers
     from skinware.memory.namespace import Namespace
 
-_MAX_REDRAWS_HZ = 15
+_LINE_PERIOD_S = 1.0
+_TAKE_PERIOD_S = 0.1
 
 
-@click.command("skin-top")
-@click.option("--plain", is_flag=True, help="One line a second for each driver; the default without a terminal.")
-@click.option("-T", "duration_s", type=float, help="End after this many seconds.")
-@click.option("--type", "type_name", metavar="TYPE", default="pressure", show_default=True, help="What to draw.")
+@click.command("skin-top", context_settings=CONTEXT_SETTINGS)
+@click.option("--plain", is_flag=True, help="One line a second for each driver; so it is without a terminal.")
+@click.option("-T", "duration_s", type=Seconds(), help="End after SECONDS.")
+@click.option("--type", "type_name", metavar="TYPE", help="Sensors to draw first.  [default: the driver's first type]")
 @namespace_option
-def command(plain: bool, duration_s: float | None, type_name: str, namespace: str | None) -> None:
-    """Show the drivers of a namespace live: patches, states, ages, losses, and the touch itself."""
+@json_option
+@click.pass_context
+def command(
+    context: click.Context,
+    plain: bool,
+    duration_s: float | None,
+    type_name: str | None,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    r"""Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels.
+
+    \b
+    skin-top                    in the terminal (needs: pip install 'skinware[top]')
+    skin-top --type proximity   draw another type of sensors
+    skin-top --plain -T 10      ten seconds of plain lines
+    """
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
-    if not plain and sys.stdout.isatty():
+    if not plain and not as_json and _on_terminal():
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 
-            SkinTop(place, type_name, duration_s, _MAX_REDRAWS_HZ).run()
-            return
-        click.echo("skin-top: for the live view: pip install 'skinware[top]'", err=True)
-    show_lines(place, duration_s)
+            app = SkinTop(place, type_name, duration_s)
+            app.run()
+            context.exit(app.return_code or 0)
+        warn("for the live view: pip install 'skinware[top]'. Going on with plain lines")
+    show_lines(place, duration_s, as_json)
 
 
-def show_lines(namespace: Namespace, duration_s: float | None) -> None:
-    """Print a line per driver each second."""
-    from skinware.cli._skin_view import driver_line
-    from skinware.errors import ServiceTimeout
-    from skinware.skin import Skin
+def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
+    """Print a line per driver each second, until the time is over."""
+    from skinware.cli._live import LiveDrivers
 
-    end = None if duration_s is None else time.monotonic() + duration_s
-    with Skin(namespace) as skin:
-        while end is None or time.monotonic() < end:
-            try:
-                snapshot = skin.read(timeout_s=1.0)
-            except ServiceTimeout as silence:
-                click.echo(str(silence))
-                continue
-            for name, frame in zip(snapshot.layout.drivers, snapshot.frames, strict=True):
-                click.echo(driver_line(skin.reader(name), frame))
-            time.sleep(1 if end is None else max(0.0, min(1.0, end - time.monotonic())))
+    start_s = time.monotonic()
+    end_s = None if duration_s is None else start_s + duration_s
+    drivers = LiveDrivers(namespace)
+    try:
+        lines_at_s = start_s
+        while end_s is None or time.monotonic() < end_s:
+            for driver in drivers.look():
+                drivers.poll(driver)
+            if time.monotonic() >= lines_at_s:
+                _print_lines(drivers, as_json)
+                lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
+            next_s = time.monotonic() + _TAKE_PERIOD_S
+            time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
+    finally:
+        drivers.close()
+
+
+def _on_terminal() -> bool:
+    """Whether there are a keyboard and a screen (Textual draws on stderr)."""
+    streams = (sys.stdin, sys.stdout, sys.stderr)
+    return all(stream is not None and stream.isatty() for stream in streams)
+
+
+def _print_lines(drivers: LiveDrivers, as_json: bool) -> None:
+    from skinware.cli._top_rows import as_data, plain_line
+
+    healths = [driver.health() for driver in drivers.look()]
+    for health in healths:
+        if as_json:
+            print_json(as_data(health))
+        else:
+            click.echo(plain_line(health))
+    if not healths and not as_json:
+        click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
 
 
 def main() -> None:

@@ -170,7 +170,7 @@ def test_a_name_in_use_is_refused() -> None:
 
 
 def test_nobody_there_is_said() -> None:
-    assert "nothing here yet" in run("skin-info").stdout
+    assert "Nothing runs here yet" in run("skin-info").stdout
     result = run("skin-dump")
     assert result.returncode == 1
     assert "start one: skin-driver" in result.stderr

@@ -1,0 +1,66 @@
+"""A picture of a skin as a Textual widget."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from textual import events
+from textual.geometry import Size
+from textual.message import Message
+from textual.scroll_view import ScrollView
+from textual.strip import Strip
+
+from skinware.cli._heat_map import Arrangement
+from skinware.cli._painting import changed_lines, lines_of_segments
+
+
+class HeatMap(ScrollView, can_focus=False):
+    """A picture line by line; only lines that changed are drawn again."""
+
+    class Pointed(Message):
+        """The mouse points at a sensor (its position in the frame), or at none."""
+
+        def __init__(self, sensor: int | None) -> None:
+            super().__init__()
+            self.sensor = sensor
+
+    def __init__(self, *, id: str) -> None:  # noqa: A002 - Textual's name
+        super().__init__(id=id)
+        self._arrangement: Arrangement | None = None
+        self._pixels: npt.NDArray[np.uint8] | None = None
+        self._strips: list[Strip] = []
+
+    def show(self, arrangement: Arrangement, pixels: npt.NDArray[np.uint8]) -> None:
+        """Draw what changed since the last time.
+
+        Args:
+            arrangement: where everything is.
+            pixels: (2 * lines, columns) uint8, what ``arrangement.draw`` made; not changed afterwards.
+        """
+        before = self._pixels if arrangement is self._arrangement else None
+        if before is None:
+            self._strips = [Strip.blank(0)] * arrangement.lines
+            self.virtual_size = Size(arrangement.columns, arrangement.lines)
+            self.refresh()
+        self._arrangement, self._pixels = arrangement, pixels
+        lines = changed_lines(before, pixels)
+        for line, segments in zip(lines, lines_of_segments(pixels, arrangement, lines), strict=True):
+            self._strips[line] = Strip(segments, arrangement.columns)
+            self.refresh_line(line)
+
+    def render_line(self, y: int) -> Strip:
+        """One line of the window."""
+        left, top = self.scroll_offset
+        line = y + top
+        strip = self._strips[line] if line < len(self._strips) else Strip.blank(0)
+        return strip.crop_extend(left, left + self.size.width, None).apply_style(self.rich_style)
+
+    def on_mouse_move(self, event: events.MouseMove) -> None:
+        """Tell what the mouse points at."""
+        if self._arrangement is not None:
+            left, top = self.scroll_offset
+            self.post_message(self.Pointed(self._arrangement.sensor_at(event.y + top, event.x + left)))
+
+    def on_leave(self) -> None:
+        """The mouse points at nothing here any more."""
+        self.post_message(self.Pointed(None))

@@ -1,0 +1,161 @@
+"""What can be seen of a namespace without taking part in it: the data behind ``skin-info``."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from skinware.cli._health import bus_state_name, life_of, patch_ages_ns, patch_state_name, rate_now_hz, status_now
+from skinware.driver_service import KIND, DriverFrame, DriverReader
+from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.memory.announcement import living_readers
+from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
+from skinware.service import ServiceReader
+
+FrameT = TypeVar("FrameT", bound=Frame)
+
+
+def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
+    """Everything that can be seen of a namespace, as ``skin-info --json`` prints it.
+
+    Args:
+        namespace: where to look.
+        only: name of the one service to look at.
+
+    Raises:
+        ServiceNotFound: ``only`` names nothing here.
+        NamespaceError: the namespace cannot be trusted or read.
+        ConfigurationError: ``only`` cannot be a name.
+    """
+    drivers: list[dict[str, Any]] = []
+    services: list[dict[str, Any]] = []
+    problems: list[str] = []
+    readers = [msgspec.structs.asdict(record) for record in living_readers(namespace)]
+    for name in [only] if only is not None else namespace.services():
+        try:
+            entry = _describe(namespace, name)
+        except BadServiceFile as error:
+            problems.append(str(error))
+            continue
+        except (ServiceNotFound, ConfigurationError) as error:
+            if only is not None:
+                raise
+            if isinstance(error, ConfigurationError):  # a file whose name cannot be a service's
+                problems.append(f"{namespace.ring_path(name)}: {error}")
+            continue  # otherwise it was withdrawn this very moment
+        entry["readers"] = [record for record in readers if record["service"] == name]
+        (drivers if entry["kind"] == KIND else services).append(entry)
+    return {"namespace": namespace.name, "drivers": drivers, "services": services, "problems": problems}
+
+
+def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
+    """Every sensor of a driver in the order of its frames.
+
+    Raises:
+        ServiceNotFound: there is no such driver.
+        BadServiceFile: this is not a driver, or cannot be read safely.
+        NamespaceError: the namespace cannot be trusted or read.
+    """
+    with DriverReader(driver, namespace=namespace, announce=False) as reader:
+        structure = reader.structure
+    names = {sensor_type.id: sensor_type.name for sensor_type in structure.types}
+    columns = (structure.sensor_uid, structure.sensor_type, structure.sensor_module, structure.sensor_patch)
+    return [
+        {"uid": uid, "type": names[type_id], "module": module, "patch": patch}
+        for uid, type_id, module, patch in zip(*(column.tolist() for column in columns), strict=True)
+    ]
+
+
+def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
+    with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
+        if service.kind != KIND:
+            return _common(service, _newest(service))
+    with DriverReader(name, namespace=namespace, announce=False) as driver:
+        frame = _newest(driver)
+        common = _common(driver, frame)
+        return {**common, **_skin(driver, frame, common["state"])}
+
+
+def _newest(service: ServiceReader[FrameT]) -> FrameT | None:
+    if service.latest is None:
+        return None
+    try:
+        return service.read(timeout_s=0.0)
+    except (ServiceTimeout, Overrun):
+        return None  # between two lives of its writer, or too fast for a copy
+
+
+def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
+    life = life_of(service, frame)
+    return {
+        "name": service.name,
+        "kind": service.kind,
+        "state": life,
+        "alive": service.alive,
+        "paused": service.paused,
+        "pid": service.writer_pid,
+        "rate_hz": rate_now_hz(life, service.rate_hz()),
+        "sequence": frame.sequence if frame else 0,
+        "age_ms": round(frame.age_ns / 1e6, 3) if frame else None,
+        "missed_periods": service.missed_periods,
+        "generation": service.generation,
+    }
+
+
+def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[str, Any]:
+    structure = driver.structure
+    return {
+        "driver_type": driver.driver_type,
+        "dtype": structure.dtype.name,
+        "sensors": structure.n_sensors,
+        "modules": structure.n_modules,
+        "patches": structure.n_patches,
+        "types": [
+            {"name": t.name, "sensors": int((structure.sensor_type == t.id).sum()), "unit": t.unit}
+            for t in structure.types
+        ],
+        "buses": _buses(driver, frame),
+        "patch_list": _patches(driver, frame, life),
+    }
+
+
+def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, Any]]:
+    if frame is None:
+        return [{"name": name, "state": None} for name in driver.structure.buses]
+    return [
+        _with_counters({"name": name, "state": bus_state_name(state)}, counters)
+        for name, state, counters in zip(
+            frame.structure.buses, frame.bus_state.tolist(), driver.bus_counters(frame), strict=True
+        )
+    ]
+
+
+def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list[dict[str, Any]]:
+    structure = driver.structure if frame is None else frame.structure
+    modules = np.bincount(structure.module_patch, minlength=structure.n_patches).tolist()
+    patch_sensors = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
+    entries: list[dict[str, Any]] = [
+        {"name": name.decode(), "bus": structure.buses[bus], "state": None, "age_ms": None}
+        for name, bus in zip(structure.patch_name.tolist(), structure.patch_bus.tolist(), strict=True)
+    ]
+    for patch, entry in enumerate(entries):
+        entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0}
+    if frame is None:
+        return entries
+    is_fresh = status_now(life, frame.status) == 0
+    fresh = np.bincount(structure.sensor_patch[is_fresh], minlength=structure.n_patches).tolist()
+    for patch, (entry, age_ns) in enumerate(zip(entries, patch_ages_ns(frame), strict=True)):
+        entry["state"] = patch_state_name(int(frame.patch_state[patch]))
+        entry["age_ms"] = None if age_ns is None else round(age_ns / 1e6, 3)
+        entry["fresh"] = fresh[patch]
+    return [
+        _with_counters(entry, counters) for entry, counters in zip(entries, driver.patch_counters(frame), strict=True)
+    ]
+
+
+def _with_counters(own: dict[str, Any], counters: dict[str, int]) -> dict[str, Any]:
+    """``own`` keys first; a counter never takes the place of one."""
+    return own | {name: count for name, count in counters.items() if name not in own}

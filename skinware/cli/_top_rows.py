@@ -1,0 +1,177 @@
+"""The list of ``skin-top``: a row per driver, bus and patch, and the same as plain lines and JSON. Pure functions."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text
+from skinware.cli._health import (
+    DEAD,
+    LIVE,
+    SILENT,
+    STARTING,
+    WITHOUT_NEWS,
+    SkinHealth,
+    bus_state_name,
+    patch_ages_ns,
+    patch_state_name,
+    status_now,
+)
+from skinware.driver_service import DriverFrame, DriverReader
+
+COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
+"""Titles of the cells of a row."""
+
+_OWN_COLUMNS = ("lost", "orphans")
+"""Counters that have columns of their own."""
+
+DRIVER, BUS, PATCH = "driver", "bus", "patch"
+
+
+class RowKey(NamedTuple):
+    """What a row is about; the same thing keeps its key when drivers come and go."""
+
+    driver: str
+    kind: str
+    """``driver``, ``bus`` or ``patch``."""
+    number: int
+    """Which bus or patch of the driver; 0 for the driver itself."""
+
+
+class Row(NamedTuple):
+    """One row of the list."""
+
+    key: RowKey
+    cells: tuple[str, ...]
+    """One text per column."""
+    state: str
+    """The state's name, which gives the row its colour."""
+    counters: dict[str, int]
+    """Every counter that the driver publishes for this row, by name."""
+
+
+def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth) -> list[Row]:
+    """The driver, then each of its buses with its patches below it."""
+    name = health.name
+    first = Row(
+        RowKey(name, DRIVER, 0),
+        (
+            name,
+            health.life,
+            rate_text(health.rate_hz),
+            age_text(health.age_ns),
+            f"{health.statuses.get('fresh', 0)}/{health.sensors}",
+            count_text(health.counters.get("lost")),
+            count_text(health.counters.get("orphans")),
+            "",
+        ),
+        health.life,
+        health.counters,
+    )
+    if frame is None:
+        return [first]
+    structure = frame.structure
+    patches = _patch_rows(reader, frame, health.life)
+    was = "was " if health.life in WITHOUT_NEWS else ""
+    rows = [first]
+    for bus, counters in enumerate(reader.bus_counters(frame)):
+        state = bus_state_name(int(frame.bus_state[bus]))
+        lost, others = count_text(counters.get("lost")), counters_text(counters, besides=_OWN_COLUMNS)
+        cells = (f"  {structure.buses[bus]}", was + state, "", "", "", lost, "", others)
+        rows.append(Row(RowKey(name, BUS, bus), cells, was + state, counters))
+        rows += [patches[patch] for patch in np.flatnonzero(structure.patch_bus == bus).tolist()]
+    return rows
+
+
+def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row]:
+    structure, status = frame.structure, status_now(life, frame.status)
+    was = "was " if life in WITHOUT_NEWS else ""
+    total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
+    fresh = np.bincount(structure.sensor_patch[status == 0], minlength=structure.n_patches).tolist()
+    ages_ns = patch_ages_ns(frame)
+    rows = []
+    for patch, counters in enumerate(reader.patch_counters(frame)):
+        state = was + patch_state_name(int(frame.patch_state[patch]))
+        cells = (
+            f"    {structure.patch_name[patch].decode()}",
+            state,
+            "",
+            age_text(ages_ns[patch]),
+            f"{fresh[patch]}/{total[patch]}",
+            "",
+            count_text(counters.get("orphans")),
+            counters_text(counters, besides=_OWN_COLUMNS),
+        )
+        rows.append(Row(RowKey(reader.name, PATCH, patch), cells, state, counters))
+    return rows
+
+
+def patches_of(key: RowKey, frame: DriverFrame) -> list[int]:
+    """The patches that a row stands for: its own, those of its bus, or all of its driver."""
+    structure = frame.structure
+    if key.kind == PATCH:
+        return [key.number] if key.number < structure.n_patches else []
+    if key.kind == BUS:
+        found: list[int] = np.flatnonzero(structure.patch_bus == key.number).tolist()
+        return found
+    return list(range(structure.n_patches))
+
+
+def title_of(key: RowKey, frame: DriverFrame, type_name: str, sensors: int) -> str:
+    """What is drawn, in words."""
+    structure = frame.structure
+    if key.kind == PATCH:
+        kinds = structure.module_kind[structure.module_patch == key.number]
+        kind = kinds[0].decode() if len(kinds) and (kinds == kinds[0]).all() else ""
+        modules = plural(len(kinds), f"{kind} module".strip())
+        where = f"{structure.patch_name[key.number].decode()} on {structure.buses[structure.patch_bus[key.number]]}"
+        return f"{where}: {modules}, {plural(sensors, f'{type_name} sensor')}"
+    patches = plural(len(patches_of(key, frame)), "patch", "patches")
+    name = structure.buses[key.number] if key.kind == BUS else key.driver
+    return f"{name}: {patches}, {plural(sensors, f'{type_name} sensor')}"
+
+
+def counters_text(counters: dict[str, int], *, besides: tuple[str, ...] = ()) -> str:
+    """The counters that are not 0, in the driver's own words; those in ``besides`` are left out."""
+    return "  ".join(
+        f"{name.replace('_', ' ')} {count_text(count)}"
+        for name, count in counters.items()
+        if count and name not in besides
+    )
+
+
+def plain_line(health: SkinHealth) -> str:
+    """One driver on one line, for pipes."""
+    if health.life == STARTING:
+        return f"{health.name}  starting, no frame yet  sensors {health.sensors}"
+    life = {
+        LIVE: rate_text(health.rate_hz),
+        DEAD: "DEAD, this is its last frame",
+        SILENT: "SILENT, its process publishes nothing",
+    }.get(health.life, health.life)
+    statuses = [
+        f"{name.replace('_', ' ')} {count}"
+        for name, count in health.statuses.items()
+        if count or name in ("fresh", "stale")
+    ]
+    patches = ", ".join(f"{count} {state}" for state, count in health.patches.items()) or NO_VALUE
+    losses = [f"{name} {health.counters[name]}" for name in ("lost", "orphans") if name in health.counters]
+    age = f"age {age_text(health.age_ns)}"
+    sensors = f"sensors {health.sensors} ({', '.join(statuses)})"
+    return "  ".join([health.name, life, age, sensors, f"patches {patches}", *losses])
+
+
+def as_data(health: SkinHealth) -> dict[str, Any]:
+    """One driver as JSON prints it."""
+    return {
+        "driver": health.name,
+        "state": health.life,
+        "rate_hz": None if health.rate_hz is None else round(health.rate_hz, 3),
+        "age_ms": None if health.age_ns is None else round(health.age_ns / 1e6, 3),
+        "sensors": health.sensors,
+        "status": health.statuses,
+        "patches": health.patches,
+        "counters": health.counters,
+    }

@@ -27,8 +27,8 @@ class Publisher:
     """Copies the state of the skin into the ring at the right moments.
 
     By cycle: as soon as every module that lives was heard; and always before a module would be shown twice, so that
-    no cycle is overwritten before it was published. If neither happens, half a period after the cycle is over. Otherwise at deadlines
-    that the runner keeps. With nothing to show it publishes four times a second, so that readers see the states.
+    no cycle is overwritten before it was published. If neither happens, half a period after the cycle is over.
+    Otherwise at deadlines that the runner keeps. With nothing to show it publishes four times a second, so that readers see the states.
 
     Args:
         writer: where to.
@@ -52,6 +52,7 @@ class Publisher:
         self._sensor_module = structure.sensor_module
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
         self._behind = np.zeros(structure.n_modules, bool)
+        self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
         self._first_at = np.zeros(structure.n_modules, np.int64)
         self._first_touch_ns = 0
         self._last_published_ns = now_ns()
@@ -82,6 +83,7 @@ class Publisher:
                 self.publish()
                 updates = updates.take(slice(fits, None))
         self._apply(batch, updates)
+        self._welcome_patches(updates)
         if not self._first_touch_ns and state.touched.any():
             self._first_touch_ns = now_ns()
         if self._by_cycle and self._is_complete():
@@ -119,6 +121,16 @@ class Publisher:
     def _apply(self, batch: FrameBatch, updates: Updates) -> None:
         self._decoder.apply(batch, updates)
         self._watch.look(self._decoder.state, updates)
+
+    def _welcome_patches(self, updates: Updates) -> None:
+        """Expect all modules of a patch that begins to send: its first cycle is not over after its first module."""
+        patch_sends = np.zeros(len(self._patch_heard_ns), bool)
+        patch_sends[self._module_patch[updates.module]] = True
+        time_ns = now_ns()
+        begins = patch_sends & (time_ns - self._patch_heard_ns > self._silence_ns)
+        if begins.any():
+            self._module_heard_ns[begins[self._module_patch]] = time_ns
+        self._patch_heard_ns[patch_sends] = time_ns
 
     def _has_repeats(self, updates: Updates) -> bool:
         updated = self._decoder.state.updated

@@ -8,7 +8,7 @@ and the level its value. Few codes mean few redraws: that keeps a terminal over 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,9 +88,8 @@ def codes_of(levels: npt.NDArray[np.uint8], marks: npt.NDArray[np.uint8]) -> npt
 
 @dataclass(frozen=True)
 class Label:
-    """A word beside or above sensors, at a line and a column of the terminal."""
+    """A word beside or above sensors, at a column of the terminal."""
 
-    line: int
     column: int
     text: str
 
@@ -102,13 +101,13 @@ class Arrangement:
     Attributes:
         sensors: (n,) int64, positions in a frame of the sensors that are drawn.
         pixels: (2 * lines, columns) int64, index into ``sensors`` of the sensor at each pixel; -1 = none.
-        labels: words in the free places.
+        labels: words in the free places, by line of the terminal.
         zoom: pixels along the side of a sensor.
     """
 
     sensors: npt.NDArray[np.int64]
     pixels: npt.NDArray[np.int64]
-    labels: tuple[Label, ...]
+    labels: Mapping[int, Sequence[Label]]
     zoom: int
 
     @property
@@ -156,7 +155,7 @@ def arrange(structure: Structure, patches: Sequence[int], type_name: str, width:
     order = np.argsort(structure.sensor_module[positions], kind="stable")
     positions = positions[order]
     if not len(positions):
-        return Arrangement(positions, np.full((0, 1), -1, np.int64), (), 1)
+        return Arrangement(positions, np.full((0, 1), -1, np.int64), {}, 1)
     modules, starts = np.unique(structure.sensor_module[positions], return_index=True)
     blocks = [
         _Block(module, int(structure.module_patch[module]), start, end)
@@ -257,24 +256,24 @@ def _place(blocks: list[_Block], names: dict[int, str], grid: _Grid, positions: 
     width = grid.margin + grid.per_line * across - gap
     height = 2 * sum(grid.group_lines(len(group)) for group in groups)
     pixels = np.full((height, width), -1, np.int64)
-    labels = []
+    labels: dict[int, list[Label]] = {}
     line = 0
     for group in groups:
         if grid.margin:
             name = names[group[0].patch]
-            labels.append(Label(line + (1 if grid.head else 0), 0, name[:_LONGEST_NAME]))
+            labels.setdefault(line + (1 if grid.head else 0), []).append(Label(0, name[:_LONGEST_NAME]))
         for number, block in enumerate(group):
             top = 2 * line + number // grid.per_line * grid.pitch
             left = grid.margin + number % grid.per_line * across
             if grid.head:
-                labels.append(Label(top // 2, left, str(block.module)))
+                labels.setdefault(top // 2, []).append(Label(left, str(block.module)))
             cells = np.full(grid.rows * grid.columns, -1, np.int64)
             cells[: block.end - block.start] = np.arange(block.start, block.end)
             square = cells.reshape(grid.rows, grid.columns).repeat(grid.zoom, axis=0).repeat(grid.zoom, axis=1)
             top += grid.head
             pixels[top : top + len(square), left : left + grid.width] = square
         line += grid.group_lines(len(group))
-    return Arrangement(positions, pixels[: 2 * grid.lines(groups)], tuple(labels), grid.zoom)
+    return Arrangement(positions, pixels[: 2 * grid.lines(groups)], labels, grid.zoom)
 
 
 def _by_patch(blocks: list[_Block]) -> list[list[_Block]]:

@@ -11,7 +11,7 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from skinware.cli._heat_map import Arrangement
-from skinware.cli._painting import changed_lines, lines_of_segments
+from skinware.cli._painting import changed_lines, segments_of
 
 
 class HeatMap(ScrollView, can_focus=False):
@@ -28,7 +28,7 @@ class HeatMap(ScrollView, can_focus=False):
         super().__init__(id=id)
         self._arrangement: Arrangement | None = None
         self._pixels: npt.NDArray[np.uint8] | None = None
-        self._strips: list[Strip] = []
+        self._strips: dict[int, Strip] = {}
 
     def show(self, arrangement: Arrangement, pixels: npt.NDArray[np.uint8]) -> None:
         """Draw what changed since the last time.
@@ -38,22 +38,32 @@ class HeatMap(ScrollView, can_focus=False):
             pixels: (2 * lines, columns) uint8, what ``arrangement.draw`` made; not changed afterwards.
         """
         before = self._pixels if arrangement is self._arrangement else None
+        self._arrangement, self._pixels = arrangement, pixels
         if before is None:
-            self._strips = [Strip.blank(0)] * arrangement.lines
+            self._strips.clear()
             self.virtual_size = Size(arrangement.columns, arrangement.lines)
             self.refresh()
-        self._arrangement, self._pixels = arrangement, pixels
-        lines = changed_lines(before, pixels)
-        for line, segments in zip(lines, lines_of_segments(pixels, arrangement, lines), strict=True):
-            self._strips[line] = Strip(segments, arrangement.columns)
-            self.refresh_line(line)
+            return
+        top = self.scroll_offset.y
+        for line in changed_lines(before, pixels):
+            self._strips.pop(line, None)
+            if top <= line < top + self.size.height:
+                self.refresh_line(line)
 
     def render_line(self, y: int) -> Strip:
         """One line of the window."""
         left, top = self.scroll_offset
-        line = y + top
-        strip = self._strips[line] if line < len(self._strips) else Strip.blank(0)
+        strip = self._strips.get(y + top) or self._strip(y + top)
         return strip.crop_extend(left, left + self.size.width, None).apply_style(self.rich_style)
+
+    def _strip(self, line: int) -> Strip:
+        arrangement, pixels = self._arrangement, self._pixels
+        if arrangement is None or pixels is None or line >= arrangement.lines:
+            return Strip.blank(0)
+        upper, lower = pixels[2 * line : 2 * line + 2]
+        segments = segments_of(upper, lower, arrangement.labels.get(line, ()))
+        strip = self._strips[line] = Strip(segments, arrangement.columns)
+        return strip
 
     def on_mouse_move(self, event: events.MouseMove) -> None:
         """Tell what the mouse points at."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -13,7 +14,7 @@ from rich.style import Style
 from rich.text import Text
 
 from skinware.cli import _heat_map as heat
-from skinware.cli._heat_map import BACKGROUND, LEVELS, Arrangement
+from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
 from skinware.sensor_types import SensorType
 
 _ANCHORS = ("#22304f", "#243c66", "#27548a", "#2a7f96", "#3aa882", "#8cc152", "#e6c440", "#f08c38", "#e8453c")
@@ -69,40 +70,31 @@ def colour_of(code: int) -> ColorTriplet:
     return _mixed(RAMP[level], _GROUND, 0.6) if mark == heat.STALE else RAMP[level]
 
 
-def lines_of_segments(pixels: npt.NDArray[np.uint8], arrangement: Arrangement, lines: list[int]) -> list[list[Segment]]:
-    """Some lines of a map as segments.
-
-    Args:
-        pixels: (2 * lines, columns) uint8, what ``Arrangement.draw`` made.
-        arrangement: its labels are put in.
-        lines: which lines.
-    """
-    pairs = pixels[0::2].astype(np.uint16) << 8 | pixels[1::2]
-    labels = {line: [label for label in arrangement.labels if label.line == line] for line in lines}
-    return [_line(pairs[line], labels[line]) for line in lines]
-
-
-def changed_lines(before: npt.NDArray[np.uint8] | None, now: npt.NDArray[np.uint8]) -> list[int]:
-    """Lines in which any pixel has another code than before."""
-    if before is None or before.shape != now.shape:
-        return list(range(len(now) // 2))
+def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> list[int]:
+    """Lines in which any pixel has another code than before; both are (2 * lines, columns) uint8."""
     differs = (before != now).any(axis=1)
     lines: list[int] = np.flatnonzero(differs[0::2] | differs[1::2]).tolist()
     return lines
 
 
-def _line(pairs: npt.NDArray[np.uint16], labels: list[heat.Label]) -> list[Segment]:
-    edges = np.flatnonzero(pairs[1:] != pairs[:-1]) + 1
-    starts = [0, *edges.tolist()]
-    ends = [*edges.tolist(), len(pairs)]
+def segments_of(upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label]) -> list[Segment]:
+    """One line of a map.
+
+    Args:
+        upper: (columns,) uint8, codes of the pixels in the upper half of the line.
+        lower: (columns,) uint8, codes of those in the lower half.
+        labels: words to put in.
+    """
+    pairs = upper.astype(np.uint16) << 8 | lower
+    edges = (np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist()
     segments = []
-    for start, end in zip(starts, ends, strict=True):
+    for start, end in zip([0, *edges], [*edges, len(pairs)], strict=True):
         character, style = _cell(int(pairs[start]))
         segments.append(Segment(character * (end - start), style))
     for label in labels:
-        before, after = label.column, label.column + len(label.text)
-        left, _, right = Segment.divide(segments, [before, after, max(after, len(pairs))])
-        segments = [*left, Segment(label.text, _LABEL), *right]
+        end = label.column + len(label.text)
+        before, _, after = Segment.divide(segments, [label.column, end, max(end, len(pairs))])
+        segments = [*before, Segment(label.text, _LABEL), *after]
     return segments
 
 

@@ -100,6 +100,7 @@ class SkinTop(App[None]):
         self._picture = Picture(type_name)
         self._rows: list[Row] = []
         self._pointed: int | None = None
+        self._missed: RowKey | None = None  # the chosen row, while its driver is away
         self._must_draw = True
 
     def compose(self) -> ComposeResult:
@@ -143,6 +144,7 @@ class SkinTop(App[None]):
 
     def action_choose(self, step: int) -> None:
         """Go up or down in the list."""
+        self._missed = None
         self._table.move_cursor(row=self._table.cursor_row + step)
 
     def action_scroll(self, pages: int) -> None:
@@ -156,22 +158,26 @@ class SkinTop(App[None]):
         driver = self._drivers.get(row.key.driver) if row else None
         if driver is not None:
             self._picture.next_type(driver.reader.structure)
-            self._update_picture(must_draw=True)
+            self._must_draw = True
 
     def action_other_scale(self) -> None:
         """Change what the colours span: the type's range, or the values seen from now on."""
         self._picture.other_scale()
-        self._update_picture(must_draw=True)
+        self._must_draw = True
 
     def on_data_table_row_highlighted(self) -> None:
         """Another row was chosen, by key or mouse."""
         self._pointed = None
-        self._update_picture(must_draw=True)
+        self._must_draw = True
+
+    def on_data_table_row_selected(self) -> None:
+        """A row was clicked."""
+        self._missed = None
 
     def on_heat_map_pointed(self, event: HeatMap.Pointed) -> None:
         """Say what the mouse points at."""
         self._pointed = event.sensor
-        self._update_picture(must_draw=True)
+        self._must_draw = True
 
     def on_resize(self) -> None:
         """The room for the picture changes with the next layout."""
@@ -204,25 +210,28 @@ class SkinTop(App[None]):
         self.query_one("#nothing").display = not rows
         self.query_one("#all").display = bool(rows)
         self._fill(rows)
-        self._update_picture(must_draw=True)
+        self._must_draw = True  # counters and ages, even if no frame comes
 
     def _fill(self, rows: list[Row]) -> None:
-        table, before, chosen = self._table, self._rows, self._chosen
+        table, before = self._table, self._rows
+        wanted = self._missed or (self._chosen.key if self._chosen else None)
         keys = [row.key for row in rows]
         self._rows = rows
         if keys != [row.key for row in before]:
             table.clear()
             for row in rows:
                 table.add_row(*_cells(row), key=_text_key(row.key))
-            if chosen is not None and chosen.key in keys:
-                table.move_cursor(row=keys.index(chosen.key))
+            is_here = wanted in keys
+            self._missed = None if is_here else wanted
+            if wanted is not None and is_here:
+                table.move_cursor(row=keys.index(wanted))
             return
         for row, old in zip(rows, before, strict=True):
             for column, title in enumerate(COLUMNS):
                 if row.cells[column] != old.cells[column]:
                     table.update_cell(_text_key(row.key), title, _cells(row)[column])
 
-    def _update_picture(self, must_draw: bool = False) -> None:
+    def _update_picture(self) -> None:
         row = self._chosen
         driver = self._drivers.get(row.key.driver) if row else None
         heat_map = self.query_one(HeatMap)
@@ -230,7 +239,7 @@ class SkinTop(App[None]):
             return
         is_newer = self._drivers.poll(driver)
         frame = driver.frame
-        if frame is None or not (is_newer or must_draw or self._must_draw):
+        if frame is None or not (is_newer or self._must_draw):
             return
         self._must_draw = False
         picture = self._picture

@@ -282,6 +282,19 @@ def test_a_burst_that_waited_is_published_cycle_by_cycle() -> None:
         assert set(steps.tolist()) <= {0, 1}
 
 
+def test_a_frame_holds_one_burst_of_a_board_from_the_first_on() -> None:
+    """Set-up takes longer than a patch may be silent; the first burst must not be taken for whole too early."""
+    bus = emulated(boards=(7,), pattern="cycle")
+    with driving(bus, wait=False), DriverReader("roboskin", timeout_s=30) as reader:
+        whole = 0
+        for frame in reader.in_order(timeout_s=30):
+            if not frame.status.any():
+                assert len(set(frame.values.tolist())) == 1
+                whole += 1
+            if whole == 10:
+                break
+
+
 def test_a_full_batch_loses_nothing() -> None:
     bus = emulated(boards=(7, 8))
     bus.open()

@@ -28,7 +28,9 @@ class Publisher:
 
     By cycle: as soon as every module that lives was heard; and always before a module would be shown twice, so that
     no cycle is overwritten before it was published. If neither happens, half a period after the cycle is over.
-    Otherwise at deadlines that the runner keeps. With nothing to show it publishes four times a second, so that readers see the states.
+    Otherwise at deadlines that the runner keeps.
+
+    With nothing to show it publishes four times a second, so that readers see the states.
 
     Args:
         writer: where to.

@@ -75,11 +75,10 @@ class Picture:
         sensor_type = self.type_in(frame.structure)
         made_for = (key, frame.structure, sensor_type, width, height)
         if self.arrangement is None or made_for != self._made_for:
-            self.arrangement = arrange(
-                frame.structure, patches_of(key, frame), sensor_type.name, width=width, height=height
-            )
+            patches = patches_of(key, frame)
+            self.arrangement = arrange(frame.structure, patches, sensor_type.name, width, height)
             self._made_for, self._levels = made_for, None
-            self.title = title_of(key, frame, sensor_type.name, len(self.arrangement.sensors))
+            self.title = title_of(key, frame.structure, patches, sensor_type.name, len(self.arrangement.sensors))
             if self._wanted not in (None, sensor_type.name):
                 self.title += f" (there are no {self._wanted} sensors)"
         sensors = self.arrangement.sensors

@@ -20,6 +20,7 @@ from skinware.cli._health import (
     status_now,
 )
 from skinware.driver_service import DriverFrame, DriverReader
+from skinware.structure import Structure
 
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
 """Titles of the cells of a row."""
@@ -119,18 +120,27 @@ def patches_of(key: RowKey, frame: DriverFrame) -> list[int]:
     return list(range(structure.n_patches))
 
 
-def title_of(key: RowKey, frame: DriverFrame, type_name: str, sensors: int) -> str:
-    """What is drawn, in words."""
-    structure = frame.structure
+def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: str, sensors: int) -> str:
+    """What is drawn, in words.
+
+    Args:
+        key: the row.
+        structure: of its driver now, which may have changed since the list was made.
+        patches: what ``patches_of`` said.
+        type_name: the type of sensors that are drawn.
+        sensors: how many there are.
+    """
+    if not patches:
+        return "no patches here"
+    drawn = plural(sensors, f"{type_name} sensor")
     if key.kind == PATCH:
         kinds = structure.module_kind[structure.module_patch == key.number]
         kind = kinds[0].decode() if len(kinds) and (kinds == kinds[0]).all() else ""
         modules = plural(len(kinds), f"{kind} module".strip())
-        where = f"{structure.patch_name[key.number].decode()} on {structure.buses[structure.patch_bus[key.number]]}"
-        return f"{where}: {modules}, {plural(sensors, f'{type_name} sensor')}"
-    patches = plural(len(patches_of(key, frame)), "patch", "patches")
+        bus = structure.buses[structure.patch_bus[key.number]]
+        return f"{structure.patch_name[key.number].decode()} on {bus}: {modules}, {drawn}"
     name = structure.buses[key.number] if key.kind == BUS else key.driver
-    return f"{name}: {patches}, {plural(sensors, f'{type_name} sensor')}"
+    return f"{name}: {plural(len(patches), 'patch', 'patches')}, {drawn}"
 
 
 def counters_text(counters: dict[str, int], *, besides: tuple[str, ...] = ()) -> str:

@@ -1,0 +1,109 @@
+"""When frames are published, with a clock that the test owns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader, DriverWriter, Status
+from skinware_drivers import publisher as publisher_module
+from skinware_drivers.adapter import Watch
+from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
+
+PERIOD_S = 0.05
+
+
+class Clock:
+    now_ns = 10_000 * MS
+
+
+class Desk:
+    """A publisher of one board, or more, in front of a real ring."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...] = (7,)) -> None:
+        self.clock = clock = Clock()
+        monkeypatch.setattr(publisher_module, "now_ns", lambda: clock.now_ns)
+        self.rig = Rig(boards=boards)
+        tables = self.rig.decoder.tables
+        self.writer = DriverWriter(
+            "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
+        )
+        self.publisher = Publisher(self.writer, self.rig.decoder, Watch(tables), PERIOD_S, True)
+        self.reader = DriverReader("desk")
+
+    def feed(self, frames: list[Wire]) -> None:
+        decoder, batch = self.rig.decoder, self.rig.batch
+        decoder.put_back(batch)
+        for time_ns, identifier, payload in frames:
+            batch.append(0, time_ns, identifier, payload)
+        for updates in decoder.decode(batch)[0]:
+            self.publisher.take(batch, updates)
+
+    def burst(self, value: int, triangles: range = range(16), board: int = 7) -> list[Wire]:
+        frames = []
+        for triangle in triangles:
+            frames += halves(triangle, value, time_ns=self.clock.now_ns + triangle * 260_000, board=board)
+        return frames
+
+    def close(self) -> None:
+        self.reader.close()
+        self.writer.close()
+
+
+def test_the_first_burst_of_a_patch_is_not_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch)
+    desk.clock.now_ns += 600 * MS  # set-up takes longer than a patch may be silent
+    desk.feed(desk.burst(1, range(3)))
+    assert desk.writer.sequence == 0
+    desk.feed(desk.burst(1, range(3, 16)))
+    assert desk.writer.sequence == 1
+    frame = desk.reader.read()
+    assert not frame.status.any()
+    assert set(frame.values.tolist()) == {1}
+    desk.close()
+
+
+def test_a_cycle_with_a_lost_module_is_published_before_the_next_one_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch)
+    desk.feed(desk.burst(1))
+    desk.clock.now_ns += 50 * MS
+    desk.feed(desk.burst(2, range(15)))  # both halves of triangle 15 got lost
+    assert desk.writer.sequence == 1
+    desk.clock.now_ns += 50 * MS
+    desk.feed(desk.burst(3))
+    assert desk.writer.sequence == 3
+    frames = [desk.reader._ring.copy(sequence) for sequence in (2, 3)]
+    assert [set(f.values[:180].tolist()) for f in frames if f] == [{2}, {3}]
+    assert [set(f.status[180:].tolist()) for f in frames if f] == [{int(Status.STALE)}, {0}]
+    desk.close()
+
+
+def test_many_cycles_at_once_become_a_frame_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch)
+    frames: list[Wire] = []
+    for value in range(1, 6):
+        desk.clock.now_ns += 50 * MS
+        frames += desk.burst(value)
+    desk.feed(frames)
+    assert desk.writer.sequence == 5
+    copies = [desk.reader._ring.copy(sequence) for sequence in range(1, 6)]
+    assert [set(f.values.tolist()) for f in copies if f] == [{1}, {2}, {3}, {4}, {5}]
+    desk.close()
+
+
+def test_a_missing_board_holds_nothing_up_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch, boards=(7, 8))
+    desk.feed(desk.burst(1))
+    assert desk.writer.sequence == 0
+    assert desk.publisher.deadline_ns - desk.clock.now_ns == 75 * MS
+    for value in range(2, 10):
+        desk.clock.now_ns += 50 * MS
+        desk.feed(desk.burst(value))
+    assert desk.writer.sequence >= 7  # at first it is waited for, then it does not count as living
+    assert np.all(desk.reader.read().status[192:] == Status.NEVER_SEEN)
+    before = desk.writer.sequence
+    desk.clock.now_ns += 50 * MS
+    desk.feed(desk.burst(10))
+    assert desk.writer.sequence == before + 1
+    desk.close()

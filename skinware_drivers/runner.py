@@ -55,6 +55,7 @@ class BusLine:
         self.patches: Sequence[Patch] | None = None
         self.state = BusState.CONNECTING
         self.heard_ns = 0
+        self.opened_ns = 0
         self.started = False
         self.lost = asyncio.Event()
 
@@ -348,6 +349,7 @@ class Runner:
     def _opened(self, line: BusLine) -> None:
         self._epoll.register(line.bus.fileno(), select.EPOLLIN)
         line.state = BusState.SILENT
+        line.opened_ns = now_ns()
         line.lost.clear()
         if line.bus.note:
             log.warning("%s", line.bus.note)
@@ -387,6 +389,8 @@ class Runner:
     async def _recover_silent_patches(self, line: BusLine) -> None:
         if self._listen_only or line.lost.is_set():
             return
+        if now_ns() - line.opened_ns < 2 * self._silence_s() * NS_PER_S:
+            return  # the bus was away, not the boards: they are set up, and to do it again would move their baseline
         for patch in [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]:
             publisher, watch = self.publisher, self._watch
             if publisher is None or watch is None:

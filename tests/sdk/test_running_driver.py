@@ -248,7 +248,8 @@ class Together:
 
 
 def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:
-    first, second = emulated(boards=(7,)), emulated(boards=(7,))
+    log: list[msgspec.Struct] = []
+    first, second = emulated(boards=(7,)), emulated(log, boards=(7,))
     with caplog.at_level(logging.WARNING), driving(first, second) as running, DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())
         assert frame.structure.sensor_uid[192] == 1 << 32 | 7 << 16
@@ -257,8 +258,11 @@ def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: py
         later = read_until(reader, lambda f: f.sequence >= frame.sequence + 20)
         assert later.bus_state[0] == BusState.LIVE
         assert not (later.status[:192] & Status.STALE).any()
+        before = len(commands(log))
         running.do(second.come_back)
-        read_until(reader, lambda f: f.bus_state[1] == BusState.LIVE and not f.status.any())
+        back = read_until(reader, lambda f: f.bus_state[1] == BusState.LIVE and not f.status.any())
+        read_until(reader, lambda f: f.sequence >= back.sequence + 20)
+        assert len(commands(log)) == before  # boards that sent all the time are not set up again
         assert reader.generation == frame.generation
     assert caplog.text.count("went away") == 1
 

@@ -28,20 +28,24 @@ CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
 
 
-class Seconds(click.FloatRange):
-    """A time in seconds, 0 or more; refuses ``nan`` and ``inf``."""
+def seconds(text: str) -> float:
+    """A time in seconds, 0 or more and finite; for ``click.option(type=...)``.
 
-    name = "seconds"
+    Raises:
+        click.BadParameter: it is not one.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise click.BadParameter(f"{text!r} is not a number of seconds.")
+    return number
 
-    def __init__(self) -> None:
-        super().__init__(min=0)
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number, checked."""
-        number = float(super().convert(value, param, ctx))
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a number of seconds.", param, ctx)
-        return number
+def examples(*lines: str) -> str:
+    """Examples for ``click.command(epilog=...)``, which keep their line breaks."""
+    return "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
 
 
 def namespace_option(command: _Decorated) -> _Decorated:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, Seconds, json_option, namespace_option, print_json, run, warn
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    warn,
+)
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -20,10 +29,18 @@ if TYPE_CHECKING:
 _LOOK_EVERY_S = 0.1
 
 
-@click.command("skin-dump", context_settings=CONTEXT_SETTINGS)
+@click.command(
+    "skin-dump",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-dump -n 3                              three frames",
+        "skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s",
+        "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
+    ),
+)
 @click.argument("name", required=False)
 @click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
-@click.option("-T", "timeout_s", type=Seconds(), help="Fail after SECONDS without a frame; also wait for the driver.")
+@click.option("-T", "timeout_s", type=seconds, help="Fail after SECONDS without a frame; also wait for the driver.")
 @click.option("--type", "type_name", metavar="TYPE", help="Only the sensors of one type, such as pressure.")
 @click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
 @click.option("--physical", is_flag=True, help="Values in the unit of their type instead of raw counts.")
@@ -39,14 +56,9 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    r"""Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
+    """Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
 
     A line of text has the least, mean and greatest value of the fresh sensors of each type. JSON has everything.
-
-    \b
-    skin-dump -n 3                              three frames
-    skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s
-    skin-dump --json --rate 10 > frames.jsonl   ten frames a second
     """
     from skinware.memory.namespace import Namespace
 
@@ -57,7 +69,8 @@ def command(
             if as_json:
                 print_json(as_data(reader, frame, type_name, physical))
             else:
-                click.echo(as_line(reader, frame, type_name, physical))
+                lost = f"  lost {reader.lost}" if reader.lost and rate_hz is None else ""
+                click.echo(f"{reader.name} {as_line(frame, type_name, physical)}{lost}")
             taken += 1
             if taken == count:
                 return
@@ -81,13 +94,13 @@ def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, phy
     return data
 
 
-def as_line(reader: DriverReader, frame: DriverFrame, type_name: str | None, physical: bool) -> str:
+def as_line(frame: DriverFrame, type_name: str | None, physical: bool) -> str:
     """One frame for people: least / mean / greatest value of the fresh sensors of each type."""
     import numpy as np
 
     from skinware.cli._format import age_text
 
-    parts = [f"{reader.name} #{frame.sequence}", f"age {age_text(frame.age_ns)}"]
+    parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
     all_values = _physical(frame) if physical else frame.values
     not_fresh = 0
     for sensor_type in frame.structure.types:
@@ -98,10 +111,7 @@ def as_line(reader: DriverReader, frame: DriverFrame, type_name: str | None, phy
             values = all_values[index][fresh]
             figures = f"{values.min():.5g} / {values.mean():.5g} / {values.max():.5g}" if len(values) else "-"
             parts.append(f"{sensor_type.name} {figures} {sensor_type.unit if physical else 'raw'}")
-    parts.append(f"not fresh {not_fresh}")
-    if reader.lost:
-        parts.append(f"lost {reader.lost}")
-    return "  ".join(parts)
+    return "  ".join([*parts, f"not fresh {not_fresh}"])
 
 
 def _physical(frame: DriverFrame) -> npt.NDArray[Any]:
@@ -156,7 +166,7 @@ def _only_driver(namespace: Namespace, end_s: float) -> str:
             )
         if time.monotonic() >= end_s:
             raise ServiceNotFound(
-                f"no driver in namespace {namespace.name!r}; start one (skin-driver --bus ...), or wait for it with -T"
+                f"no driver in namespace {namespace.name!r}; start one: skin-driver --bus virtual (-T waits for one)"
             )
         time.sleep(_LOOK_EVERY_S)
 

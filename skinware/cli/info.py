@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, json_option, namespace_option, print_json, run
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
 from skinware.cli._format import age_text, count_text, plural, rate_text, table
 
 if TYPE_CHECKING:
@@ -19,21 +19,24 @@ _WATCH_PERIOD_S = 1.0
 _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
-@click.command("skin-info", context_settings=CONTEXT_SETTINGS)
+@click.command(
+    "skin-info",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-info                       everything in this namespace",
+        "skin-info roboskin --sensors    every sensor of one driver, in frame order",
+        "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
+    ),
+)
 @click.argument("name", required=False)
 @click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
 @click.option("--watch", is_flag=True, help="Again every second, until interrupted.")
 @namespace_option
 @json_option
 def command(name: str | None, sensors: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
-    r"""Show what is attached: drivers, their buses and patches, other services, and who reads them.
+    """Show what is attached: drivers, their buses and patches, other services, and who reads them.
 
     With NAME: only that driver or service.
-
-    \b
-    skin-info                        everything in this namespace
-    skin-info roboskin --sensors     every sensor of one driver, in frame order
-    skin-info --json | jq '.drivers[] | {name, rate_hz}'
     """
     from skinware.memory.namespace import Namespace
 

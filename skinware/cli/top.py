@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, Seconds, json_option, namespace_option, print_json, run, warn
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    warn,
+)
 
 if TYPE_CHECKING:
     from skinware.cli._live import LiveDrivers
@@ -19,9 +28,17 @@ _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
 
 
-@click.command("skin-top", context_settings=CONTEXT_SETTINGS)
+@click.command(
+    "skin-top",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-top                    in the terminal (needs: pip install 'skinware[top]')",
+        "skin-top --type proximity   draw another type of sensors",
+        "skin-top --plain -T 10      ten seconds of plain lines",
+    ),
+)
 @click.option("--plain", is_flag=True, help="One line a second for each driver; so it is without a terminal.")
-@click.option("-T", "duration_s", type=Seconds(), help="End after SECONDS.")
+@click.option("-T", "duration_s", type=seconds, help="End after SECONDS.")
 @click.option("--type", "type_name", metavar="TYPE", help="Sensors to draw first.  [default: the driver's first type]")
 @namespace_option
 @json_option
@@ -34,13 +51,7 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    r"""Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels.
-
-    \b
-    skin-top                    in the terminal (needs: pip install 'skinware[top]')
-    skin-top --type proximity   draw another type of sensors
-    skin-top --plain -T 10      ten seconds of plain lines
-    """
+    """Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels."""
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)

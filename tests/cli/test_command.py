@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+
+import click
+import pytest
+
+from skinware.cli._command import examples, exit_status, print_json, seconds, warn
+from skinware.errors import BadServiceFile, BusNotAvailable, BusSendError, ConfigurationError, ServiceNotFound
+
+
+def command_that(raises: BaseException | None = None) -> click.Command:
+    @click.command("skin-try", epilog=examples("skin-try      one", "skin-try -x   two"))
+    @click.option("-T", "timeout_s", type=seconds)
+    def command(timeout_s: float | None) -> None:
+        click.echo(f"timeout {timeout_s}")
+        if raises is not None:
+            raise raises
+
+    return command
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (None, 0),
+        (KeyboardInterrupt(), 0),
+        (click.exceptions.Exit(7), 7),
+        (ServiceNotFound("no such skin"), 1),
+        (BadServiceFile("no such skin"), 1),
+        (BusSendError("no such skin"), 1),
+        (ConfigurationError("no such skin"), 2),
+        (click.UsageError("no such skin"), 2),
+        (BusNotAvailable("no such skin"), 3),
+        (OSError(errno.ENOSPC, "no such skin"), 1),
+        (BrokenPipeError(errno.EPIPE, "nobody reads"), 0),
+    ],
+)
+def test_every_end_has_its_exit_status(
+    error: BaseException | None, status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(command_that(error), []) == status
+    printed = capsys.readouterr()
+    assert printed.out == "timeout None\n"
+    assert ("no such skin" in printed.err) == (status not in (0, 7))
+    assert "Traceback" not in printed.err
+
+
+def test_an_error_is_one_line_under_the_name_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    exit_status(command_that(ServiceNotFound("no such skin")), [])
+    assert capsys.readouterr().err == "skin-try: no such skin\n"
+
+
+def test_an_error_that_nobody_expects_is_not_hidden() -> None:
+    with pytest.raises(ZeroDivisionError):
+        exit_status(command_that(ZeroDivisionError()), [])
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-1", "soon", "1e400", ""])
+def test_a_time_must_be_a_time(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command_that(), ["-T", text]) == 2
+    assert "is not a number of seconds" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "number"), [("0", 0.0), ("2", 2.0), ("0.5", 0.5), ("1e3", 1000.0)])
+def test_times_are_understood(text: str, number: float, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command_that(), ["-T", text]) == 0
+    assert capsys.readouterr().out == f"timeout {number}\n"
+
+
+def test_unknown_options_are_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command_that(), ["--nonsense"]) == 2
+    assert "No such option" in capsys.readouterr().err
+
+
+def test_examples_keep_their_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command_that(), ["--help"]) == 0
+    assert "    skin-try      one\n    skin-try -x   two\n" in capsys.readouterr().out
+
+
+def test_json_is_one_line_that_every_program_can_read(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"values": [1.5, float("nan"), float("inf")], "uid": 2**64 - 1, "name": "Füße"})
+    line = capsys.readouterr().out
+    assert line.count("\n") == 1
+    assert json.loads(line, parse_constant=pytest.fail) == {
+        "values": [1.5, None, None],
+        "uid": 2**64 - 1,
+        "name": "Füße",
+    }
+
+
+def test_warnings_name_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with click.Context(command_that(), info_name="skin-try"):
+        warn("it came back")
+    assert capsys.readouterr() == ("", "skin-try: it came back\n")
+
+
+def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
+    code = "import sys, skinware.cli.top; assert not {'textual', 'rich'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

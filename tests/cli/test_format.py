@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import pytest
+
+from skinware.cli._format import age_text, count_text, plural, rate_text, table
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "text"),
+    [
+        (None, "-"),
+        (-5, "0.0 ms"),
+        (600_000, "0.6 ms"),
+        (9_949_999, "9.9 ms"),
+        (12_400_000, "12 ms"),
+        (999_400_000, "999 ms"),
+        (999_600_000, "1.0 s"),
+        (99_900_000_000, "99.9 s"),
+        (100_000_000_000, "2 min"),
+        (99 * 60 * 10**9, "99 min"),
+        (7 * 3600 * 10**9, "7 h"),
+    ],
+)
+def test_ages_have_units(age_ns: int | None, text: str) -> None:
+    assert age_text(age_ns) == text
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "text"), [(None, "-"), (0.0, "0.0 Hz"), (0.25, "0.25 Hz"), (20.04, "20.0 Hz"), (1000.2, "1000 Hz")]
+)
+def test_rates_have_units(rate_hz: float | None, text: str) -> None:
+    assert rate_text(rate_hz) == text
+
+
+def test_counts_and_plurals() -> None:
+    assert (count_text(30848), count_text(None)) == ("30,848", "-")
+    assert (plural(1, "patch", "patches"), plural(4, "patch", "patches")) == ("1 patch", "4 patches")
+    assert plural(0, "reader") == "0 readers"
+
+
+def test_tables_are_aligned() -> None:
+    assert table(("name", "how", "count"), [("a", "x", "1"), ("longer", "yy", "12345")], left=2) == [
+        "name    how  count",
+        "a       x        1",
+        "longer  yy   12345",
+    ]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import sys
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
-from skinware.cli._format import age_text, count_text, plural, rate_text, table
+from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, table
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -73,36 +74,41 @@ def as_text(found: dict[str, Any]) -> list[str]:
 
 
 def _driver_lines(driver: dict[str, Any]) -> list[str]:
-    types = ", ".join(
-        f"{count_text(t['sensors'])} {t['name']}" + (f" ({t['unit']})" if t["unit"] else "") for t in driver["types"]
-    )
-    size = ", ".join(
-        (
-            plural(driver["patches"], "patch", "patches"),
-            plural(driver["modules"], "module"),
-            plural(driver["sensors"], "sensor"),
-        )
-    )
-    kind = f"{driver['driver_type']} driver, " if driver["driver_type"] else ""
-    was = "was " if driver["state"] in ("dead", "silent", "paused") else ""
-    lines = [f"{kind}{size} of {driver['dtype']}: {types}", ""]
-    lines += _counter_table(
-        driver["buses"], ("bus", "state"), lambda bus: (bus["name"], was + (bus["state"] or "-")), {"frames", "lost"}
-    )
-    lines.append("")
-    lines += _counter_table(
-        driver["patch_list"],
-        ("patch", "bus", "state", "fresh sensors", "age"),
-        lambda patch: (
-            patch["name"],
-            patch["bus"],
-            was + (patch["state"] or "-"),
-            f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
-            age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+    counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
+    size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
+    units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
+    lines = [
+        f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
+        f"sensors: {', '.join(units)}",
+        "",
+        *_counter_table(
+            driver["buses"],
+            ("bus", "state"),
+            lambda bus: (bus["name"], _state(driver, bus)),
+            {"frames", "lost"},
         ),
-        {"orphans"},
-    )
+        "",
+        *_counter_table(
+            driver["patch_list"],
+            ("patch", "bus", "state", "fresh sensors", "age"),
+            lambda patch: (
+                patch["name"],
+                patch["bus"],
+                _state(driver, patch),
+                f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
+                age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+            ),
+            {"orphans"},
+        ),
+    ]
     return [_life_line("driver", driver), *_indented([*lines, "", *_reader_lines(driver)])]
+
+
+def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
+    """State of a bus or patch: the last one that is known, where the driver says nothing new."""
+    if part["state"] is None:
+        return NO_VALUE
+    return part["state"] if driver["state"] == "live" else f"was {part['state']}"
 
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:
@@ -125,7 +131,12 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
 _OWN_KEYS = {"name", "state", "bus", "age_ms", "modules", "sensors", "fresh"}
 
 
-def _counter_table(rows: list[dict[str, Any]], titles: tuple[str, ...], cells: Any, always: set[str]) -> list[str]:
+def _counter_table(
+    rows: list[dict[str, Any]],
+    titles: tuple[str, ...],
+    cells: Callable[[dict[str, Any]], tuple[str, ...]],
+    always: set[str],
+) -> list[str]:
     """Rows with those of their counters that are not 0 everywhere (and ``always``, where there are such counters)."""
     names = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in _OWN_KEYS]
     shown = [name for name in names if name in always or any(row.get(name) for row in rows)]

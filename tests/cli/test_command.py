@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import errno
 import json
-import subprocess
-import sys
 
 import click
 import pytest
@@ -96,8 +94,3 @@ def test_warnings_name_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     with click.Context(command_that(), info_name="skin-try"):
         warn("it came back")
     assert capsys.readouterr() == ("", "skin-try: it came back\n")
-
-
-def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
-    code = "import sys, skinware.cli.top; assert not {'textual', 'rich'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader
+from skinware.cli import _health
+from skinware.cli._health import (
+    bus_state_name,
+    count_statuses,
+    health_of,
+    life_of,
+    patch_ages_ns,
+    patch_state_name,
+    rate_now_hz,
+)
+from skinware.memory.ring import Frame
+from skinware.status import Status
+from tests.cli.fake_skin import FakeSkin, fake_structure
+
+SECOND = 1_000_000_000
+NOW_NS = 10**15
+
+
+def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool = True, paused: bool = False) -> str:
+    """Life of a service whose newest frame came ``silence_s`` ago (None: none came)."""
+    service = SimpleNamespace(alive=alive, paused=paused, rate_hz=lambda: rate_hz)
+    published_ns = NOW_NS - round((silence_s or 0) * SECOND)
+    frame = None if silence_s is None else SimpleNamespace(published_ns=published_ns)
+    return life_of(cast(Any, service), cast(Frame | None, frame))
+
+
+@pytest.fixture(autouse=True)
+def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_health, "now_ns", lambda: NOW_NS)
+
+
+def test_lives() -> None:
+    assert life(None) == "starting"
+    assert life(None, alive=False) == "dead"
+    assert life(0.1) == "live"
+    assert life(0.1, alive=False) == "dead"
+    assert life(0.1, paused=True) == "paused"
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "silence_s", "expected"),
+    [
+        (1000.0, 0.99, "live"),  # never before a second has passed
+        (1000.0, 1.01, "silent"),
+        (None, 1.01, "silent"),
+        (2.0, 2.49, "live"),  # and never within five periods
+        (2.0, 2.51, "silent"),
+    ],
+)
+def test_a_held_lock_is_no_progress(rate_hz: float | None, silence_s: float, expected: str) -> None:
+    assert life(silence_s, rate_hz) == expected
+
+
+def test_nothing_comes_from_who_is_not_live() -> None:
+    assert rate_now_hz("live", 20.0) == 20.0
+    assert rate_now_hz("live", None) is None
+    assert [rate_now_hz(life, 20.0) for life in ("silent", "paused", "dead", "starting")] == [0.0] * 4
+
+
+def test_statuses_are_counted_by_bit() -> None:
+    status = np.array([0, 0, Status.STALE, Status.STALE | Status.SUSPECT, Status.MASKED], np.uint8)
+    counts = count_statuses(status)
+    assert list(counts)[:2] == ["fresh", "stale"]
+    assert {name: count for name, count in counts.items() if count} == {
+        "fresh": 2,
+        "stale": 2,
+        "suspect": 1,
+        "masked": 1,
+    }
+
+
+def test_states_of_a_later_version_stay_numbers() -> None:
+    assert [patch_state_name(state) for state in (0, 1, 2, 3, 9)] == ["expected", "live", "stale", "restarted", "9"]
+    assert [bus_state_name(state) for state in (0, 1, 2, 3, 4, 9)] == [
+        "connecting",
+        "live",
+        "silent",
+        "down",
+        "gone",
+        "9",
+    ]
+
+
+def test_a_driver_in_a_few_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()  # the real clock
+    with FakeSkin("a", fake_structure(2, 4)) as skin, DriverReader("a") as reader:
+        assert health_of(reader, None, None).life == "starting"
+        skin.break_some()
+        skin.publish()
+        health = health_of(reader, reader.read(), 19.5)
+    assert (health.name, health.life, health.rate_hz, health.sensors) == ("a", "live", 19.5, 96)
+    assert health.statuses["fresh"] == 48 - 7
+    assert health.patches == {"live": 1, "stale": 1}
+    assert health.counters == {"frames": 5156, "lost": 2, "errors": 0, "unknown": 7, "orphans": 3, "updates": 640}
+
+
+def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:
+    skin = FakeSkin("a", fake_structure(1, 2))
+    skin.publish()
+    with DriverReader("a") as reader:
+        frame = reader.read()
+        skin.close()
+        health = health_of(reader, frame, 20.0)
+    assert (health.life, health.rate_hz) == ("dead", 0.0)
+    assert (health.statuses["fresh"], health.statuses["stale"]) == (0, 24)
+    assert health.patches == {"was live": 1}
+
+
+def test_a_patch_is_as_old_as_its_newest_module(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_health, "now_ns", lambda: 5000)
+    structure = fake_structure(3, 2)
+    frame = SimpleNamespace(structure=structure, module_time_ns=np.array([1000, 4000, 0, 2000, 0, 0]))
+    assert patch_ages_ns(cast(Any, frame)) == [1000, 3000, None]

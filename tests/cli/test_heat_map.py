@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skinware import Status, Structure
+from skinware.cli import _heat_map as heat
+from skinware.cli._heat_map import BACKGROUND, LEVELS, arrange, block_columns, codes_of, levels_of, marks_of
+from skinware.errors import StructureError
+from skinware.sensor_types import PRESSURE, TEMPERATURE
+from tests.cli.fake_skin import fake_structure
+
+
+def skin_of(modules_per_patch: list[int], sensors_per_module: int) -> Structure:
+    """Patches of modules of pressure sensors; every sensor has a temperature sensor beside it."""
+    n_modules = sum(modules_per_patch)
+    n_sensors = n_modules * sensors_per_module
+    return Structure(
+        types=[PRESSURE, TEMPERATURE],
+        buses=["bus"],
+        patch_name=[f"patch {number}" for number in range(len(modules_per_patch))],
+        patch_bus=[0] * len(modules_per_patch),
+        module_patch=np.repeat(np.arange(len(modules_per_patch)), modules_per_patch),
+        module_kind=["tip"] * n_modules,
+        sensor_uid=np.repeat(np.arange(n_sensors), 2),
+        sensor_type=[PRESSURE.id, TEMPERATURE.id] * n_sensors,
+        sensor_module=np.repeat(np.arange(n_modules), 2 * sensors_per_module),
+        dtype="u2",
+    )
+
+
+def test_the_worst_that_is_known_of_a_sensor_is_shown() -> None:
+    status = np.array(
+        [
+            0,
+            Status.STALE,
+            Status.OUT_OF_RANGE,
+            Status.SUSPECT | Status.OUT_OF_RANGE,
+            Status.STALE | Status.SUSPECT,
+            Status.NO_ACK | Status.STALE,
+            Status.MASKED | Status.NO_ACK,
+            Status.NEVER_SEEN | Status.STALE,
+            Status.NOT_CONNECTED | Status.NEVER_SEEN,
+            128,
+        ],
+        np.uint8,
+    )
+    assert marks_of(status).tolist() == [
+        heat.FRESH,
+        heat.STALE,
+        heat.OUT_OF_RANGE,
+        heat.SUSPECT,
+        heat.STALE,
+        heat.NO_ACK,
+        heat.MASKED,
+        heat.NEVER_SEEN,
+        heat.NOT_CONNECTED,
+        heat.SUSPECT,  # a bit that only a later version knows
+    ]
+
+
+def test_levels_span_the_range() -> None:
+    values = np.array([-9, 0, 15.9, 16, 127.9, 128, 255, 999, np.nan, np.inf, -np.inf], np.float32)
+    assert levels_of(values, 0, 256).tolist() == [0, 0, 0, 1, 7, 8, 15, 15, 0, 15, 0]
+    assert levels_of(values[:3], 5, 5).tolist() == [0, 0, 15]  # no range at all
+
+
+def test_a_level_is_kept_while_the_value_is_near() -> None:
+    before = np.array([4, 4, 4, 4], np.uint8)
+    values = np.array([3.8, 5.2, 3.7, 5.3], np.float32)  # in levels
+    assert levels_of(values, 0, LEVELS, before).tolist() == [4, 4, 3, 5]
+
+
+def test_what_means_nothing_has_no_level() -> None:
+    marks = np.array([heat.FRESH, heat.STALE, heat.NO_ACK, heat.NOT_CONNECTED], np.uint8)
+    levels = np.full(4, 9, np.uint8)
+    assert codes_of(levels, marks).tolist() == [9, 16 + 9, heat.NO_ACK * 16, heat.NOT_CONNECTED * 16]
+    assert heat.NOT_CONNECTED * LEVELS + LEVELS <= BACKGROUND
+
+
+@pytest.mark.parametrize(
+    ("count", "columns"), [(1, 1), (2, 2), (4, 2), (7, 4), (10, 5), (12, 4), (16, 4), (192, 16), (256, 16)]
+)
+def test_blocks_are_compact(count: int, columns: int) -> None:
+    assert block_columns(count) == columns
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    modules=st.lists(st.integers(1, 20), min_size=1, max_size=6),
+    sensors=st.integers(1, 40),
+    width=st.integers(1, 200),
+    height=st.integers(1, 60),
+    several=st.booleans(),
+)
+def test_every_sensor_has_a_square_of_its_own(
+    modules: list[int], sensors: int, width: int, height: int, several: bool
+) -> None:
+    structure = skin_of(modules, sensors)
+    patches = list(range(len(modules))) if several else [len(modules) - 1]
+    arranged = arrange(structure, patches, "pressure", width, height)
+    wanted = [s for s in range(0, structure.n_sensors, 2) if structure.sensor_patch[s] in patches]
+    assert arranged.sensors.tolist() == wanted
+    assert arranged.pixels.shape == (2 * arranged.lines, arranged.columns)
+    numbers, counts = np.unique(arranged.pixels[arranged.pixels >= 0], return_counts=True)
+    assert numbers.tolist() == list(range(len(wanted)))
+    assert set(counts.tolist()) == {arranged.zoom**2}
+    assert arranged.columns <= max(8, width)
+    if arranged.zoom > 1:
+        assert arranged.lines <= height
+    for line, labels in arranged.labels.items():
+        for label in labels:
+            assert label.column >= 0
+            assert label.column + len(label.text) <= max(arranged.columns, 8)
+            cells = arranged.pixels[2 * line : 2 * line + 2, label.column : label.column + len(label.text)]
+            assert (cells == -1).all()
+
+
+def test_sensors_are_drawn_as_large_as_they_fit() -> None:
+    structure = skin_of([1], 16)
+    assert [arrange(structure, [0], "pressure", 80, height).zoom for height in (1, 4, 8, 12, 16, 99)] == [
+        1,
+        2,
+        4,
+        6,
+        8,
+        8,
+    ]
+
+
+def test_modules_have_their_numbers_and_patches_their_names() -> None:
+    structure = fake_structure(4, 16)
+    one = arrange(structure, [1], "pressure", 80, 12)
+    assert one.zoom == 2
+    assert [label.text for line in sorted(one.labels) for label in one.labels[line]] == [str(m) for m in range(16, 32)]
+    everything = arrange(structure, [0, 1, 2, 3], "pressure", 80, 12)
+    assert (everything.zoom, everything.lines) == (1, 12)
+    assert [(line, label.text) for line, labels in everything.labels.items() for label in labels] == [
+        (0, "board 7"),
+        (3, "board 8"),
+        (6, "board 9"),
+        (9, "board 10"),
+    ]
+    assert arrange(structure, [0, 1], "pressure", 40, 12).labels == {}  # no room for names
+
+
+def test_what_does_not_fit_is_higher() -> None:
+    arranged = arrange(fake_structure(8, 16), range(8), "pressure", 80, 5)
+    assert (arranged.zoom, arranged.lines > 5) == (1, True)
+
+
+def test_no_sensors_and_no_such_type() -> None:
+    structure = fake_structure(1, 1)
+    nothing = arrange(structure, [], "pressure", 80, 24)
+    assert (len(nothing.sensors), nothing.lines) == (0, 0)
+    assert nothing.draw(np.zeros(0, np.uint8)).shape == (0, 1)
+    with pytest.raises(StructureError, match="it has: pressure, temperature"):
+        arrange(structure, [0], "presure", 80, 24)
+
+
+def test_codes_come_to_their_pixels() -> None:
+    arranged = arrange(skin_of([2], 2), [0], "pressure", 12, 2)
+    assert arranged.zoom == 2
+    pixels = arranged.draw(np.array([1, 2, 3, 4], np.uint8))
+    row = [1, 1, 2, 2, BACKGROUND, BACKGROUND, 3, 3, 4, 4]
+    assert pixels[-1].tolist() == row
+    assert pixels[-2].tolist() == row
+
+
+def test_a_place_is_a_sensor() -> None:
+    arranged = arrange(skin_of([2], 2), [0], "pressure", 12, 2)
+    assert [arranged.sensor_at(1, column) for column in range(-1, 11)] == [
+        None,
+        0,
+        0,
+        2,
+        2,
+        None,
+        None,
+        4,
+        4,
+        6,
+        6,
+        None,
+    ]
+    assert arranged.sensor_at(0, 0) is None  # the module's number
+    assert arranged.sensor_at(2, 0) is None
+    assert arranged.sensor_at(-1, 0) is None

@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+from itertools import islice
+from typing import Any
+
+import pytest
+
+from skinware import DriverReader, Namespace, ServiceWriter
+from skinware.cli._command import exit_status
+from skinware.cli.info import as_text, command
+from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
+from tests.commands import BIN, PATIENCE_S
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
+    """What ``skin-info --json`` prints."""
+    assert exit_status(command, [*arguments, "--json"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    return json.loads(printed.out)
+
+
+def text(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert exit_status(command, list(arguments)) == 0
+    return capsys.readouterr().out
+
+
+def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
+        skin.break_some()
+        skin.publish(3)
+        reader.read()
+        report = told(capsys)
+    assert report["namespace"] == namespace.name
+    assert (report["services"], report["problems"]) == ([], [])
+    (driver,) = report["drivers"]
+    assert driver["name"] == "torso"
+    assert driver["alive"] is True
+    assert driver["pid"] == os.getpid()
+    assert (driver["sensors"], driver["modules"], driver["patches"]) == (96, 8, 2)
+    assert driver["types"] == [
+        {"name": "pressure", "sensors": 80, "unit": "counts"},
+        {"name": "temperature", "sensors": 16, "unit": "degC"},
+    ]
+    assert driver["sequence"] == 3
+    assert driver["age_ms"] >= 0
+    assert driver["rate_hz"] > 0
+    assert driver["buses"] == [
+        {"name": "can0", "state": "live", "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
+        {"name": "can1", "state": "live", "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
+    ]
+    (record,) = driver["readers"]
+    assert (record["service"], record["pid"]) == ("torso", os.getpid())
+    assert record.keys() == {"service", "pid", "program", "kind", "frames", "lost", "rate_hz", "age_ms"}
+    assert (driver["state"], driver["driver_type"], driver["dtype"]) == ("live", "fake", "uint8")
+    assert (driver["paused"], driver["missed_periods"]) == (False, 0)
+    first, second = driver["patch_list"]
+    assert first.pop("age_ms") >= 0
+    assert first == {
+        "name": "board 7",
+        "bus": "can0",
+        "state": "live",
+        "modules": 4,
+        "sensors": 48,
+        "fresh": 41,
+        "orphans": 3,
+        "updates": 640,
+    }
+    assert (second["bus"], second["state"], second["fresh"]) == ("can1", "stale", 0)
+
+
+def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = {"namespace": namespace.name, "drivers": [], "services": [], "problems": []}
+    assert told(capsys) == empty
+    out = text(capsys)
+    assert "0 drivers, 0 services" in out
+    assert "Nothing runs here yet" in out
+    assert "skin-driver --bus virtual" in out
+
+
+def test_the_rate_is_that_of_the_frames_in_the_ring(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a") as skin, DriverReader("a", announce=False) as reader:
+        assert told(capsys)["drivers"][0]["rate_hz"] == 0.0
+        skin.publish()
+        assert told(capsys)["drivers"][0]["rate_hz"] is None  # one frame makes no rate
+        frames = reader.in_order()
+        first = next(frames)
+        skin.publish(4)
+        *_, last = islice(frames, 4)
+        rate_hz = 4 * 1e9 / (last.published_ns - first.published_ns)
+        assert told(capsys)["drivers"][0]["rate_hz"] == pytest.approx(rate_hz, abs=0.001)
+
+
+def test_a_driver_that_has_published_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a", fake_structure(1, 1)):
+        (driver,) = told(capsys)["drivers"]
+        assert (driver["state"], driver["alive"], driver["sequence"], driver["age_ms"]) == ("starting", True, 0, None)
+        assert driver["buses"] == [{"name": "can0", "state": None}]
+        (patch,) = driver["patch_list"]
+        assert (patch["state"], patch["age_ms"], patch["sensors"], patch["fresh"]) == (None, None, 12, 0)
+        assert "driver a: starting, nothing published yet" in text(capsys)
+
+
+def test_a_dead_driver_stays_to_be_seen(capsys: pytest.CaptureFixture[str]) -> None:
+    with fake_process("a", "--patches", "1", "--modules", "2") as process:
+        kill(process)
+        (driver,) = told(capsys)["drivers"]
+        assert (driver["alive"], driver["state"], driver["rate_hz"]) == (False, "dead", 0.0)
+        assert driver["pid"] == process.pid
+        assert driver["patch_list"][0]["fresh"] == 0
+        out = text(capsys)
+        assert "driver a: dead, its last data is " in out
+        assert re.search(r"board 7 +can0 +was live +0 of 24", out)
+
+
+def test_a_stopped_driver_is_silent(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from skinware.cli import _health
+    from skinware.realtime import now_ns
+
+    with FakeSkin("a") as skin:
+        skin.publish(3)
+        monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 3_000_000_000)
+        (driver,) = told(capsys)["drivers"]
+        assert (driver["alive"], driver["state"], driver["rate_hz"]) == (True, "silent", 0.0)
+        assert "driver a: silent, its process runs but publishes nothing" in text(capsys)
+
+
+def test_other_services_are_shown_beside_drivers(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a"), ServiceWriter("contacts", {"force": ("f4", 3)}) as contacts:
+        contacts.begin()
+        contacts.commit(0)
+        report = told(capsys)
+        (service,) = report["services"]
+        assert [driver["name"] for driver in report["drivers"]] == ["a"]
+        assert (service["name"], service["alive"], service["sequence"], service["kind"]) == (
+            "contacts",
+            True,
+            1,
+            "data",
+        )
+        assert service["age_ms"] > 0
+        assert service["readers"] == []
+        assert "service contacts: live" in text(capsys)
+
+
+def test_a_name_narrows_it_down(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a"), FakeSkin("b"), ServiceWriter("contacts", {"force": ("f4", 3)}):
+        assert [driver["name"] for driver in told(capsys, "b")["drivers"]] == ["b"]
+        report = told(capsys, "contacts")
+        assert report["drivers"] == []
+        assert [service["name"] for service in report["services"]] == ["contacts"]
+
+
+def test_refused_files_are_problems_and_no_crash(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a"):
+        strange = [namespace.ring_path("broken"), namespace.ring_path("not a name"), namespace.ring_path("pipe")]
+        strange[0].write_bytes(b"no ring at all")
+        strange[1].write_bytes(b"")
+        os.mkfifo(strange[2])
+        try:
+            report = told(capsys)
+            assert [driver["name"] for driver in report["drivers"]] == ["a"]
+            assert len(report["problems"]) == 3
+            assert all(any(str(path) in problem for problem in report["problems"]) for path in strange)
+            assert text(capsys).count("problem: ") == 3
+            assert told(capsys, "broken")["problems"] == [report["problems"][0]]
+        finally:
+            for path in strange:
+                path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["nobody"], 1, "no service 'nobody'"),
+        (["a/b"], 2, "service name 'a/b'"),
+        (["--namespace", "a b"], 2, "namespace name 'a b'"),
+        (["--sensors"], 2, "give its NAME"),
+        (["nobody", "--sensors"], 1, "no service 'nobody'"),
+        (["one", "two"], 2, "unexpected extra argument"),
+    ],
+)
+def test_mistakes(arguments: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command, arguments) == status
+    assert words in capsys.readouterr().err
+
+
+def test_a_namespace_that_others_can_write_is_refused(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a"):
+        namespace.path.chmod(0o777)
+        assert exit_status(command, []) == 1
+        assert "can be written by others" in capsys.readouterr().err
+        namespace.path.chmod(0o2750)
+
+
+def test_sensors_in_the_order_of_the_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a", fake_structure(2, 1)):
+        rows = told(capsys, "a", "--sensors")
+        assert len(rows) == 24
+        assert rows[0] == {"uid": 1000, "type": "pressure", "module": 0, "patch": 0}
+        assert rows[23] == {"uid": 1023, "type": "temperature", "module": 1, "patch": 1}
+        lines = text(capsys, "a", "--sensors").splitlines()
+        assert lines[0].split() == ["position", "uid", "type", "module", "patch"]
+        assert lines[24].split() == ["23", "0x3ff", "temperature", "1", "1"]
+
+
+def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:
+    with FakeSkin("a"):
+        assert told(capsys, "--namespace", namespace.name)["drivers"]
+        assert told(capsys, "--namespace", f"{namespace.name}x") == {
+            "namespace": f"{namespace.name}x",
+            "drivers": [],
+            "services": [],
+            "problems": [],
+        }
+
+
+def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
+        skin.break_some()
+        skin.publish(3)
+        reader.read()
+        out = text(capsys)
+    lines = out.splitlines()
+    assert re.fullmatch(r"namespace \S+: 1 driver, 0 services", lines[0])
+    assert re.fullmatch(r"driver torso: live, [\d.]+ Hz, newest data [\d.]+ ms old, frame 3, pid \d+", lines[2])
+    assert lines[3:5] == [
+        "  fake driver: 2 patches, 8 modules, 96 sensors (uint8)",
+        "  sensors: 80 pressure in counts, 16 temperature in degC",
+    ]
+    assert lines[6:9] == [
+        "  bus   state  frames  lost  unknown",  # no errors: not shown
+        "  can0  live    5,156     2        7",
+        "  can1  live        0     0        0",
+    ]
+    assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
+    assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
+    assert re.fullmatch(r"  board 8  can1  stale +0 of 48 +[\d.]+ ms +0 +0", lines[12])
+    assert lines[14].split()[:3] == ["reader", "how", "pid"]
+    assert "on demand" in lines[15]
+    assert max(map(len, lines)) <= 100
+    assert "\x1b" not in out  # no colours without a terminal
+
+
+def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
+    report = {"namespace": "x", "drivers": [], "services": [], "problems": ["refused"]}
+    assert "\x1b[31mproblem: \x1b[0mrefused" in as_text(report)
+
+
+def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:
+    with FakeSkin("a", fake_structure(1, 1)) as skin:
+        skin.publish()
+        for arguments, wanted in (["--watch"], "driver a: "), (["--watch", "--json"], '"drivers":[{"name":"a"'):
+            watch = subprocess.Popen([BIN / "skin-info", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+            assert watch.stdout is not None
+            seen = 0
+            for line in watch.stdout:
+                seen += wanted in line.decode()
+                if seen == 2:
+                    break
+            watch.send_signal(signal.SIGINT)
+            _, errors = watch.communicate(timeout=PATIENCE_S)
+            assert (watch.returncode, errors) == (0, b"")
+
+
+def test_watch_redraws_a_terminal_and_waits_for_who_is_not_there_yet() -> None:
+    ours, theirs = pty.openpty()
+    watch = subprocess.Popen([BIN / "skin-info", "late", "--watch"], stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    try:
+        screen = read_until(ours, b"no service 'late'")
+        assert screen.startswith(b"\x1b[H")
+        with FakeSkin("late") as skin:
+            skin.publish()
+            assert b"\x1b[K" in read_until(ours, b"driver \x1b[1mlate")
+    finally:
+        watch.terminate()
+        assert watch.wait(PATIENCE_S) == 0
+        os.close(ours)
+
+
+def read_until(descriptor: int, wanted: bytes) -> bytes:
+    """What a terminal shows until something wanted is there (pytest's timeout ends a wait in vain)."""
+    seen = b""
+    while wanted not in seen:
+        seen += os.read(descriptor, 65536)
+    return seen

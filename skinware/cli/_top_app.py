@@ -98,6 +98,16 @@ class SkinTop(App[None]):
         self._drivers = LiveDrivers(namespace)
         self._duration_s = duration_s
         self._picture = Picture(type_name)
+        self._head = Static(id="head", markup=False)
+        self._nothing = Container(id="nothing")
+        self._why = Static(id="why", markup=False)
+        self._all = Vertical(id="all")
+        self._table = DataTable[Text](id="list", cursor_type="row")
+        self._title = Static(id="title", markup=False)
+        self._scale = Static(id="scale", markup=False)
+        self._heat_map = HeatMap(id="map")
+        self._marks = Static(id="marks", markup=False)
+        self._detail = Static(id="detail", markup=False)
         self._rows: list[Row] = []
         self._pointed: int | None = None
         self._missed: RowKey | None = None  # the chosen row, while its driver is away
@@ -105,19 +115,18 @@ class SkinTop(App[None]):
 
     def compose(self) -> ComposeResult:
         """Lay the screen out."""
-        yield Static(id="head", markup=False)
-        with Container(id="nothing"):
-            yield Static(id="why", markup=False)
-        with Vertical(id="all"):
-            table = DataTable[Text](id="list", cursor_type="row")
-            table.can_focus = False  # keys go to the app: nobody has to think about focus
-            yield table
+        yield self._head
+        with self._nothing:
+            yield self._why
+        with self._all:
+            self._table.can_focus = False  # keys go to the app: nobody has to think about focus
+            yield self._table
             with Horizontal(id="above"):
-                yield Static(id="title", markup=False)
-                yield Static(id="scale", markup=False)
-            yield HeatMap(id="map")
-            yield Static(id="marks", markup=False)
-            yield Static(id="detail", markup=False)
+                yield self._title
+                yield self._scale
+            yield self._heat_map
+            yield self._marks
+            yield self._detail
         yield Footer()
 
     def on_mount(self) -> None:
@@ -149,8 +158,7 @@ class SkinTop(App[None]):
 
     def action_scroll(self, pages: int) -> None:
         """Scroll a picture that is higher than its window."""
-        heat_map = self.query_one(HeatMap)
-        heat_map.scroll_relative(y=pages * max(1, heat_map.size.height - 1), animate=False)
+        self._heat_map.scroll_relative(y=pages * max(1, self._heat_map.size.height - 1), animate=False)
 
     def action_next_type(self) -> None:
         """Draw another type of sensors."""
@@ -186,15 +194,13 @@ class SkinTop(App[None]):
     # -- what is shown ------------------------------------------------------------------------------------------
 
     @property
-    def _table(self) -> DataTable[Text]:
-        return self.query_one("#list", DataTable)
-
-    @property
     def _chosen(self) -> Row | None:
         at = self._table.cursor_row
         return self._rows[at] if 0 <= at < len(self._rows) else None
 
     def _update_list(self) -> None:
+        if not self._detail.is_attached:
+            return  # the screen is being taken down
         rows: list[Row] = []
         why = _NOTHING.format(name=self._drivers.namespace.name)
         count = 0
@@ -205,10 +211,9 @@ class SkinTop(App[None]):
                 rows += rows_of(driver.reader, driver.frame, driver.health())
         except NamespaceError as error:
             why = str(error)
-        self._set("#head", f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}")
-        self._set("#why", why)
-        self.query_one("#nothing").display = not rows
-        self.query_one("#all").display = bool(rows)
+        _say(self._head, f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}")
+        _say(self._why, why)
+        self._nothing.display, self._all.display = not rows, bool(rows)
         self._fill(rows)
         self._must_draw = True  # counters and ages, even if no frame comes
 
@@ -232,34 +237,31 @@ class SkinTop(App[None]):
                     table.update_cell(_text_key(row.key), title, _cells(row)[column])
 
     def _update_picture(self) -> None:
-        row = self._chosen
+        row, size = self._chosen, self._heat_map.size
         driver = self._drivers.get(row.key.driver) if row else None
-        heat_map = self.query_one(HeatMap)
-        if row is None or driver is None or not heat_map.size.area:
+        if row is None or driver is None or not size.area or not self._detail.is_attached:
             return
         is_newer = self._drivers.poll(driver)
-        frame = driver.frame
+        frame, picture = driver.frame, self._picture
         if frame is None or not (is_newer or self._must_draw):
             return
         self._must_draw = False
-        picture = self._picture
-        life = LIVE if is_newer else life_of(driver.reader, frame)
-        picture.draw(row.key, frame, heat_map.size.width, heat_map.size.height, life)
+        picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
         if picture.arrangement is not None:
-            heat_map.show(picture.arrangement, picture.pixels)
-        self._set("#title", picture.title)
-        self._set("#scale", picture.scale)
-        self._set("#marks", picture.marks)
-        detail = counters_text(row.counters)
+            self._heat_map.show(picture.arrangement, picture.pixels)
+        _say(self._title, picture.title)
+        _say(self._scale, picture.scale)
+        _say(self._marks, picture.marks)
         if self._pointed is not None and self._pointed < frame.structure.n_sensors:
-            detail = describe_sensor(frame, self._pointed)
-        self._set("#detail", detail)
+            _say(self._detail, describe_sensor(frame, self._pointed))
+        else:
+            _say(self._detail, counters_text(row.counters))
 
-    def _set(self, selector: str, text: str | Text) -> None:
-        """Change a line of text, if it is another one."""
-        line = self.query_one(selector, Static)
-        if line.content != text:
-            line.update(text)
+
+def _say(line: Static, text: str | Text) -> None:
+    """Change a line of text, if it is another one."""
+    if line.content != text:
+        line.update(text)
 
 
 def _cells(row: Row) -> list[Text]:

@@ -157,7 +157,7 @@ def plain_line(health: SkinHealth) -> str:
     if health.life == STARTING:
         return f"{health.name}  starting, no frame yet  sensors {health.sensors}"
     life = {
-        LIVE: rate_text(health.rate_hz),
+        LIVE: "? Hz" if health.rate_hz is None else rate_text(health.rate_hz),
         DEAD: "DEAD, this is its last frame",
         SILENT: "SILENT, its process publishes nothing",
     }.get(health.life, health.life)

@@ -63,6 +63,7 @@ class FakeSkin:
         self, name: str = "fake", structure: Structure | None = None, namespace: Namespace | None = None
     ) -> None:
         self.structure = structure or fake_structure()
+        self.is_hung = False
         self.values: npt.NDArray[Any] | None = None
         self.status = np.zeros(self.structure.n_sensors, np.uint8)
         self.patch_state = np.full(self.structure.n_patches, int(PatchState.LIVE), np.uint8)
@@ -128,7 +129,8 @@ def publishing(skin: FakeSkin, rate_hz: float = 100.0) -> Iterator[FakeSkin]:
 
     def publish() -> None:
         while not stop.wait(1 / rate_hz):
-            skin.publish()
+            if not skin.is_hung:
+                skin.publish()
 
     skin.publish()
     thread = threading.Thread(target=publish)

@@ -22,7 +22,7 @@ from skinware.status import Status
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 SECOND = 1_000_000_000
-NOW_NS = 10**15
+NOW_NS = 10**17
 
 
 def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool = True, paused: bool = False) -> str:
@@ -33,11 +33,13 @@ def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool =
     return life_of(cast(Any, service), cast(Frame | None, frame))
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_health, "now_ns", lambda: NOW_NS)
+    monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", SECOND)
 
 
+@pytest.mark.usefixtures("frozen_clock")
 def test_lives() -> None:
     assert life(None) == "starting"
     assert life(None, alive=False) == "dead"
@@ -46,6 +48,7 @@ def test_lives() -> None:
     assert life(0.1, paused=True) == "paused"
 
 
+@pytest.mark.usefixtures("frozen_clock")
 @pytest.mark.parametrize(
     ("rate_hz", "silence_s", "expected"),
     [
@@ -90,8 +93,7 @@ def test_states_of_a_later_version_stay_numbers() -> None:
     ]
 
 
-def test_a_driver_in_a_few_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()  # the real clock
+def test_a_driver_in_a_few_figures() -> None:
     with FakeSkin("a", fake_structure(2, 4)) as skin, DriverReader("a") as reader:
         assert health_of(reader, None, None).life == "starting"
         skin.break_some()

@@ -12,8 +12,10 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader, Namespace, ServiceWriter
+from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
+from skinware.realtime import now_ns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
@@ -120,12 +122,9 @@ def test_a_dead_driver_stays_to_be_seen(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_a_stopped_driver_is_silent(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    from skinware.cli import _health
-    from skinware.realtime import now_ns
-
     with FakeSkin("a") as skin:
         skin.publish(3)
-        monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 3_000_000_000)
+        monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 10**16)
         (driver,) = told(capsys)["drivers"]
         assert (driver["alive"], driver["state"], driver["rate_hz"]) == (True, "silent", 0.0)
         assert "driver a: silent, its process runs but publishes nothing" in text(capsys)

@@ -1,0 +1,12 @@
+"""A slow machine must not make a driver of these tests look silent."""
+
+from __future__ import annotations
+
+import pytest
+
+from skinware.cli import _health
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", 10**15)

@@ -1,0 +1,321 @@
+"""The live view, run by Textual without a terminal."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import DataTable, Static
+
+from skinware import DriverReader, Namespace, Status
+from skinware.cli import _health, _live, _top_app
+from skinware.cli._heat_widget import HeatMap
+from skinware.cli._top_app import SkinTop
+from skinware.realtime import now_ns
+from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
+
+SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
+
+
+@asynccontextmanager
+async def shown(
+    size: tuple[int, int] = (80, 24), type_name: str | None = None, duration_s: float | None = None
+) -> AsyncIterator[tuple[SkinTop, Pilot[None]]]:
+    app = SkinTop(Namespace(), type_name, duration_s)
+    async with app.run_test(size=size) as pilot:
+        await pilot.pause()
+        yield app, pilot
+
+
+async def until(pilot: Pilot[None], condition: Callable[[], bool]) -> None:
+    """Let the app run until a condition comes true (pytest's timeout ends a wait in vain)."""
+    while not condition():
+        await pilot.pause(0.02)
+
+
+def line(app: SkinTop, name: str) -> str:
+    """What a line of text says."""
+    return str(app.query_one(f"#{name}", Static).content)
+
+
+def listed(app: SkinTop) -> list[str]:
+    """Names and states in the list."""
+    table = app.query_one(DataTable)
+    return [" ".join(str(cell).strip() for cell in table.get_row_at(n)[:2]) for n in range(table.row_count)]
+
+
+def chosen(app: SkinTop) -> str:
+    """Name in the row under the cursor."""
+    table = app.query_one(DataTable)
+    return str(table.get_row_at(table.cursor_row)[0]).strip()
+
+
+def picture(app: SkinTop) -> list[str]:
+    """The heat map as characters."""
+    heat_map = app.query_one(HeatMap)
+    return [heat_map.render_line(y).text for y in range(heat_map.size.height)]
+
+
+def go(scene: Callable[[], Awaitable[None]]) -> None:
+    async def run() -> None:
+        await scene()
+
+    asyncio.run(run())
+
+
+@pytest.fixture(autouse=True)
+def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
+
+
+def test_nobody_runs_then_somebody_does_then_nobody() -> None:
+    async def scene() -> None:
+        async with shown() as (app, pilot):
+            assert app.query_one("#nothing").display
+            assert not app.query_one("#all").display
+            assert f"No driver runs in namespace '{Namespace().name}'" in line(app, "why")
+            assert "skin-driver --bus virtual" in line(app, "why")
+            with publishing(FakeSkin("a", fake_structure(1, 2))):
+                await until(pilot, lambda: listed(app) == ["a live", "can0 live", "board 7 live"])
+                assert app.query_one("#all").display
+                await until(pilot, lambda: line(app, "title") == "a: 1 patch, 20 pressure sensors")
+            await until(pilot, lambda: bool(app.query_one("#nothing").display))
+            assert line(app, "head").endswith("0 drivers")
+
+    go(scene)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_fits_every_terminal(size: tuple[int, int]) -> None:
+    async def scene() -> None:
+        skin = FakeSkin("a")
+        skin.break_some()
+        with publishing(skin):
+            async with shown(size) as (app, pilot):
+                await until(pilot, lambda: "pressure sensors" in line(app, "title"))
+                await pilot.press("down", "down", "t", "s", "pagedown", "pageup")
+                await until(pilot, lambda: "board 7 on can0" in line(app, "title"))
+                heat_map = app.query_one(HeatMap)
+                assert all(len(text) == heat_map.size.width for text in picture(app))
+                for widget in (app.query_one(DataTable), heat_map, app.query_one("#head")):
+                    assert app.screen.region.contains_region(widget.region)
+
+    go(scene)
+
+
+def test_what_a_newcomer_sees_at_80_by_24() -> None:
+    async def scene() -> None:
+        skin = FakeSkin("torso")
+        skin.break_some()
+        with publishing(skin):
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: bool(line(app, "marks")))
+                assert listed(app) == [
+                    "torso live",
+                    "can0 live",
+                    "board 7 live",
+                    "board 8 live",
+                    "board 9 live",
+                    "board 10 stale",
+                ]
+                assert line(app, "head").startswith("skin-top   namespace ")
+                assert line(app, "title") == "torso: 4 patches, 640 pressure sensors"
+                assert line(app, "scale").endswith("255 counts")
+                assert line(app, "detail") == "frames 5,156  lost 2  unknown 7  orphans 3  updates 640"
+                drawn = picture(app)
+                assert len(drawn) == 12  # all of it, unscrolled
+                assert [text[:8].strip() for text in drawn[::3]] == ["board 7", "board 8", "board 9", "board 10"]
+                await pilot.press("down", "down")
+                await until(pilot, lambda: "board 7 on can0" in line(app, "title"))
+                assert line(app, "title") == "board 7 on can0: 16 triangle modules, 160 pressure sensors"
+                assert line(app, "marks").startswith("155 fresh  ░ 2 stale  ^ 1 out of range")
+                assert line(app, "detail") == "orphans 3  updates 640"
+                drawn = picture(app)
+                assert drawn[0].split() == ["0", "1", "2", "3", "4", "5"]
+                assert "xx··" in drawn[2]
+                assert "░░░░" in drawn[2]
+
+    go(scene)
+
+
+def test_a_driver_dies_and_returns_changed() -> None:
+    async def scene() -> None:
+        async with shown() as (app, pilot):
+            with fake_process("a", "--patches", "1", "--modules", "2") as process:
+                await until(pilot, lambda: len(listed(app)) == 3)
+                await pilot.press("down", "down")
+                await until(pilot, lambda: line(app, "title").endswith("2 triangle modules, 20 pressure sensors"))
+                kill(process)
+                await until(pilot, lambda: listed(app) == ["a dead", "can0 was live", "board 7 was live"])
+                await until(pilot, lambda: line(app, "marks") == "0 fresh  ░ 20 stale")
+                with fake_process("a", "--patches", "2", "--modules", "3"):
+                    await until(pilot, lambda: listed(app)[:1] == ["a live"])
+                    await until(pilot, lambda: len(listed(app)) == 4)
+                    await until(pilot, lambda: line(app, "title").startswith("board 7 on can0: 3 triangle"))
+                    await until(pilot, lambda: line(app, "marks") == "30 fresh")
+                    assert chosen(app) == "board 7"
+
+    go(scene)
+
+
+def test_the_chosen_row_is_chosen_again_when_its_driver_comes_back() -> None:
+    async def scene() -> None:
+        with FakeSkin("other", fake_structure(1, 1)) as other:
+            other.publish()
+            async with shown() as (app, pilot):
+                for _ in range(2):
+                    with FakeSkin("a", fake_structure(2, 1)) as skin:
+                        skin.publish()
+                        await until(pilot, lambda: len(listed(app)) == 7)
+                        if chosen(app) != "board 8":
+                            await pilot.press("up")
+                        assert chosen(app) == "board 8"
+                    await until(pilot, lambda: len(listed(app)) == 3)
+                    assert chosen(app) == "other"
+                await pilot.press("down")  # a choice of its own ends the waiting
+                with FakeSkin("a", fake_structure(2, 1)) as skin:
+                    skin.publish()
+                    await until(pilot, lambda: len(listed(app)) == 7)
+                    assert chosen(app) == "can0"
+                    assert app.query_one(DataTable).cursor_row == 5
+
+    go(scene)
+
+
+def test_a_silent_driver_is_shown_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scene() -> None:
+        with publishing(FakeSkin("a", fake_structure(1, 1))) as skin:
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: line(app, "marks") == "10 fresh")
+                skin.is_hung = True
+                monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 10**16)
+                await until(pilot, lambda: listed(app)[:1] == ["a silent"])
+                await until(pilot, lambda: line(app, "marks") == "0 fresh  ░ 10 stale")
+
+    go(scene)
+
+
+def test_types_and_scales_take_turns() -> None:
+    async def scene() -> None:
+        with FakeSkin("a", fake_structure(1, 1)) as skin:
+            skin.publish()
+            async with shown(type_name="temperature") as (app, pilot):
+                await until(pilot, lambda: line(app, "title") == "a: 1 patch, 2 temperature sensors")
+                await pilot.press("t")
+                await until(pilot, lambda: line(app, "title") == "a: 1 patch, 10 pressure sensors")
+                assert line(app, "scale").endswith(" 255 counts")
+                await pilot.press("s")
+                await until(pilot, lambda: not line(app, "scale").endswith(" 255 counts"))
+
+    go(scene)
+
+
+def test_the_mouse_chooses_and_points() -> None:
+    async def scene() -> None:
+        skin = FakeSkin("a", fake_structure(2, 1))
+        skin.status[3] = Status.SUSPECT
+        with publishing(skin):
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: len(listed(app)) == 4)
+                await pilot.click(DataTable, offset=(5, 3))
+                await until(pilot, lambda: chosen(app) == "board 7")
+                await until(pilot, lambda: line(app, "title").startswith("board 7 on can0"))
+                heat_map = app.query_one(HeatMap)
+                column = picture(app)[0].index("?")
+                await pilot.hover(heat_map, offset=(column, 0))
+                await until(pilot, lambda: "pressure sensor 3: " in line(app, "detail"))
+                assert "suspect; module 0, uid 0x3eb" in line(app, "detail")
+                await pilot.hover("#head")
+                await until(pilot, lambda: "sensor 3" not in line(app, "detail"))
+
+    go(scene)
+
+
+def test_a_picture_that_does_not_fit_is_scrolled() -> None:
+    async def scene() -> None:
+        with FakeSkin("a", fake_structure(30, 16)) as skin:
+            skin.publish()
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: bool(line(app, "marks")))
+                heat_map = app.query_one(HeatMap)
+                before = picture(app)
+                await pilot.press("pagedown")
+                await until(pilot, lambda: heat_map.scroll_offset.y > 0)
+                assert picture(app) != before
+                await pilot.press("pageup")
+                await until(pilot, lambda: heat_map.scroll_offset.y == 0)
+                assert picture(app) == before
+
+    go(scene)
+
+
+def test_nothing_is_drawn_again_that_has_not_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[int] = []
+    monkeypatch.setattr(HeatMap, "refresh_line", lambda _, line: drawn.append(line))
+
+    async def scene() -> None:
+        with FakeSkin("a", fake_structure(4, 16)) as skin:
+            skin.values = skin.status * 0 + 200
+            skin.publish()
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: bool(line(app, "marks")))
+                skin.values[0] = 10
+                skin.publish()
+                await until(pilot, lambda: bool(drawn))
+                assert drawn == [0]
+                for _ in range(5):
+                    skin.publish()
+                    sequence = skin.writer.sequence
+                    await until(pilot, lambda: _taken(app) == sequence)  # noqa: B023
+                assert drawn == [0]
+
+    go(scene)
+
+
+def _taken(app: SkinTop) -> int:
+    driver = app._drivers.get("a")
+    return driver.frame.sequence if driver is not None and driver.frame is not None else 0
+
+
+@pytest.mark.parametrize("key", ["q", "ctrl+c"])
+def test_keys_end_it(key: str) -> None:
+    async def scene() -> None:
+        with FakeSkin("a") as skin:
+            skin.publish()
+            async with shown() as (app, pilot):
+                await pilot.press(key)
+                await until(pilot, lambda: not app.is_running)
+        assert app.return_code == 0
+
+    go(scene)
+
+
+def test_it_ends_by_itself_after_its_time(namespace: Namespace) -> None:
+    async def scene() -> None:
+        with FakeSkin("a") as skin, DriverReader("a", announce=False):
+            skin.publish()
+            async with shown(duration_s=0.2) as (app, pilot):
+                await until(pilot, lambda: not app.is_running)
+            assert list(namespace.reader_files()) == []
+        assert app.return_code == 0
+
+    go(scene)
+
+
+def test_a_namespace_that_cannot_be_trusted_is_explained(namespace: Namespace) -> None:
+    async def scene() -> None:
+        with FakeSkin("a") as skin:
+            skin.publish()
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: len(listed(app)) == 6)
+                with FakeSkin("b"):
+                    namespace.path.chmod(0o777)
+                    await until(pilot, lambda: "can be written by others" in line(app, "why"))
+                    namespace.path.chmod(0o2750)
+                    await until(pilot, lambda: "b starting" in listed(app))
+
+    go(scene)

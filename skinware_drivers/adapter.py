@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import SensorType
-from skinware_drivers.decoder import SkinState, Updates
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
+from skinware_drivers.skin_state import Updates
 
 
 class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,8 +35,8 @@ class Watch:
         self.tables = tables
         self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
 
-    def look(self, state: SkinState, updates: Updates) -> None:
-        """Called after updates were applied, with the state that now shows them."""
+    def look(self, updates: Updates) -> None:
+        """Called with updates that were just shown, if the wire may have flagged one of them."""
 
     def forget(self, patch: int) -> None:
         """Called when a patch was set up anew: what was held against it no longer counts."""

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import select
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,48 +16,21 @@ from skinware.errors import BusError, BusNotAvailable, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.service import DEFAULT_SLOTS
-from skinware.status import BusState, PatchState
+from skinware.status import PatchState
 from skinware_drivers.adapter import AnyAdapter, Watch
 from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
-from skinware_drivers.link import Link, split_by_bus
+from skinware_drivers.link import split_by_bus
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log = logging.getLogger("skinware.driver")
 
 _BATCH_FRAMES = 2048
 _TURNS = 8  # batches per wake-up before handshakes and timers get their turn
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
-_STOP_TIMEOUT_S = 2.0
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
-
-
-class BusLine:
-    """One bus of a running driver.
-
-    Attributes:
-        name: as the user wrote it.
-        adapter: the driver's object for this bus.
-        bus: the bus itself.
-        link: handshakes on it.
-        patches: what was found on it, None until it was asked.
-        state: what the bus is doing.
-    """
-
-    def __init__(self, name: str, ordinal: int, adapter: AnyAdapter, bus: Bus) -> None:
-        self.name = name
-        self.ordinal = ordinal
-        self.adapter = adapter
-        self.bus = bus
-        self.link = Link(bus)
-        self.patches: Sequence[Patch] | None = None
-        self.state = BusState.CONNECTING
-        self.heard_ns = 0
-        self.opened_ns = 0
-        self.started = False
-        self.lost = asyncio.Event()
 
 
 class Runner:
@@ -86,7 +59,10 @@ class Runner:
     ) -> None:
         self.name = name
         self.driver_type = driver_type
-        self.lines = [BusLine(bus_name, i, adapter, bus) for i, (bus_name, adapter, bus) in enumerate(lines)]
+        self._epoll = select.epoll()
+        self.lines = [
+            BusLine(bus_name, i, adapter, bus, self._epoll) for i, (bus_name, adapter, bus) in enumerate(lines)
+        ]
         self.writer: DriverWriter | None = None
         self.publisher: Publisher | None = None
         self.decoder: Decoder | None = None
@@ -97,7 +73,6 @@ class Runner:
         self._group = group
         self._on_ready = on_ready
         self._watch: Watch | None = None
-        self._epoll = select.epoll()
         self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size)
         self._stopping = asyncio.Event()
         self._built = asyncio.Condition()
@@ -124,8 +99,7 @@ class Runner:
         tasks: list[asyncio.Task[None]] = []
         try:
             for line in self.lines:
-                line.bus.open()
-                self._opened(line)
+                line.open()
             loop.add_reader(self._epoll.fileno(), self._on_readable)
             stopping = asyncio.create_task(self._wait_for_stop())
             tasks = [stopping, *(asyncio.create_task(self._serve(line)) for line in self.lines)]
@@ -151,9 +125,7 @@ class Runner:
 
     async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
         for line in self.lines:
-            if line.started and line.bus.fileno() >= 0:
-                with _complaining(f"{line.name}: not stopped in good order"):
-                    await asyncio.wait_for(line.adapter.stop(line.link), _STOP_TIMEOUT_S)
+            await line.stop()
         loop.remove_reader(self._epoll.fileno())
         if self._timer is not None:
             self._timer.cancel()
@@ -165,55 +137,20 @@ class Runner:
 
     async def _serve(self, line: BusLine) -> None:
         """One bus from discovery to the end: describe, set up, then look after it."""
-        await self._describe(line)
+        await line.describe(self._build)
         joining = asyncio.create_task(self._join_on_request(line))
         try:
             if not self._listen_only:
-                await self._set_up(line)
+                await line.set_up()
             await self._check_data(line)
             while True:
                 if line.lost.is_set():
-                    await self._reopen(line)
+                    await line.reopen()
                 await self._recover_silent_patches(line)
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(line.lost.wait(), self._silence_s())
+                    await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
         finally:
             joining.cancel()
-
-    async def _describe(self, line: BusLine) -> None:
-        pause_s = _FIRST_PAUSE_S
-        told = False
-        while not line.patches:
-            try:
-                line.patches = await line.adapter.describe(line.link)
-                why = "no patch answers"
-            except BusError as error:
-                line.patches = ()
-                why = str(error)
-            await self._build()
-            if line.patches:
-                return
-            if not told:
-                log.warning("%s: %s; waiting for one to appear", line.name, why)
-                told = True
-            if line.lost.is_set():
-                await self._reopen(line)
-            await asyncio.sleep(pause_s)
-            pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-
-    async def _set_up(self, line: BusLine) -> None:
-        pause_s = _FIRST_PAUSE_S
-        while not line.started:
-            try:
-                await line.adapter.configure(line.link)
-                await line.adapter.start(line.link)
-                line.started = True
-            except BusError as error:
-                log.warning("%s: set-up failed: %s; trying again", line.name, error)
-                if line.lost.is_set():
-                    await self._reopen(line)
-                await asyncio.sleep(pause_s)
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
 
     async def _check_data(self, line: BusLine) -> None:
         """Wait for the first data of every patch, and name those that send none."""
@@ -304,7 +241,7 @@ class Runner:
                     if line.bus.receive(self._batch, line.ordinal):
                         line.heard_ns = time_ns
                 except BusNotAvailable as error:
-                    self._lose(line, error)
+                    line.lose(error)
             self._digest()
 
     def _digest(self) -> None:
@@ -319,8 +256,7 @@ class Runner:
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
                 line.link.offer(batch, own)
         self._update_bus_states()
-        for updates in found:
-            self.publisher.take(batch, updates)
+        self.publisher.take(found)
         self._arm_timer()
 
     def _publish_when_due(self) -> None:
@@ -328,8 +264,7 @@ class Runner:
             return
         self._on_readable()  # what has arrived comes first: this may be late
         self._update_bus_states()
-        if now_ns() >= self.publisher.deadline_ns:
-            self.publisher.publish()
+        self.publisher.publish_if_due()
         self._log_patches()
         self._arm_timer()
 
@@ -346,50 +281,20 @@ class Runner:
 
     # -- buses and patches ----------------------------------------------------------------------------------------
 
-    def _opened(self, line: BusLine) -> None:
-        self._epoll.register(line.bus.fileno(), select.EPOLLIN)
-        line.state = BusState.SILENT
-        line.opened_ns = now_ns()
-        line.lost.clear()
-        if line.bus.note:
-            log.warning("%s", line.bus.note)
-
-    def _lose(self, line: BusLine, error: BusNotAvailable) -> None:
-        line.state = BusState.DOWN if error.is_down else BusState.GONE
-        log.warning("%s; waiting for it to come back", str(error))  # a record that kept the error would keep us
-        with contextlib.suppress(OSError):
-            self._epoll.unregister(line.bus.fileno())
-        line.bus.close()
-        line.lost.set()
-
-    async def _reopen(self, line: BusLine) -> None:
-        pause_s = _FIRST_PAUSE_S
-        while line.lost.is_set():
-            try:
-                line.bus.open()
-                self._opened(line)
-                log.warning("bus %s is back", line.name)
-            except BusNotAvailable as error:
-                line.state = BusState.DOWN if error.is_down else BusState.GONE
-                await asyncio.sleep(pause_s)
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-
     def _update_bus_states(self) -> None:
-        silence_ns = max(NS_PER_S // 2, round(self._silence_s() * NS_PER_S))
         for line in self.lines:
-            if line.bus.fileno() >= 0:
-                silent = now_ns() - line.heard_ns > silence_ns
-                line.state = BusState.SILENT if silent else BusState.LIVE
+            line.look(self._silence_ns)
             if self.publisher is not None:
                 self.publisher.bus_state[line.ordinal] = line.state
 
-    def _silence_s(self) -> float:
-        return self.publisher.silence_ns / NS_PER_S if self.publisher is not None else 0.5
+    @property
+    def _silence_ns(self) -> int:
+        return self.publisher.silence_ns if self.publisher is not None else NS_PER_S // 2
 
     async def _recover_silent_patches(self, line: BusLine) -> None:
         if self._listen_only or line.lost.is_set():
             return
-        if now_ns() - line.opened_ns < 2 * self._silence_s() * NS_PER_S:
+        if now_ns() - line.opened_ns < 2 * self._silence_ns:
             return  # the bus was away, not the boards: they are set up, and to do it again would move their baseline
         for patch in [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]:
             publisher, watch = self.publisher, self._watch
@@ -463,14 +368,3 @@ class Runner:
                 }
             )
         return {"sequence": self.writer.sequence, "buses": buses, "patches": patches}
-
-
-@contextlib.contextmanager
-def _complaining(what: str) -> Iterator[None]:
-    """Say what went wrong with a bus, and go on."""
-    try:
-        yield
-    except BusError as error:
-        log.warning("%s: %s", what, str(error))
-    except TimeoutError:
-        log.warning("%s: it took too long", what)

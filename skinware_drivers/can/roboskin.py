@@ -24,10 +24,10 @@ from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.status import Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.decoder import SkinState, Updates
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Heard, Link, Match
+from skinware_drivers.skin_state import Updates
 
 FIRST_BOARD, LAST_BOARD = 1, 14
 TRIANGLES = 16
@@ -136,12 +136,11 @@ class BaselineWatch(Watch):
 
     def __init__(self, tables: SkinTables) -> None:
         super().__init__(tables)
-        self._first_sensor = tables.channel_to_sensor.min(axis=1)
         self._not_acknowledged = np.zeros(tables.structure.n_patches, np.int64)
 
-    def look(self, state: SkinState, updates: Updates) -> None:
+    def look(self, updates: Updates) -> None:
         """Count what was not acknowledged, per board; see :class:`skinware_drivers.adapter.Watch`."""
-        status = state.status[self._first_sensor[updates.module]]
+        status = updates.status[:, 0]  # these flags are of all sensors of a triangle
         silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
         if not silent.any():
             return

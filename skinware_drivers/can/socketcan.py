@@ -1,4 +1,4 @@
-"""SocketCAN in batches: one ``recvmmsg`` moves up to 256 frames straight into the rows of a batch.
+"""SocketCAN in batches: one ``recvmmsg`` moves all that has arrived straight into the rows of a batch.
 
 Every frame comes with the kernel's own time stamp; what the kernel had to drop is known exactly.
 """
@@ -35,7 +35,6 @@ _TIMESTAMPING_SOFTWARE = 1 << 4
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 
-_BATCH = 256
 _CONTROL_WORDS = 8  # cmsghdr (2 words), then three timespecs: software, legacy, hardware
 WANTED_BUFFER_BYTES = 8 << 20
 """Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
@@ -87,12 +86,7 @@ class SocketCanBus(Bus):
         self._lost_before = 0
         self.granted_buffer = 0
         self._last_poll_ns = 0
-        self._control = np.zeros((_BATCH, _CONTROL_WORDS), np.int64)
-        self._iov = np.zeros(_BATCH, _IOVEC)
-        self._headers = np.zeros(_BATCH, _MMSGHDR)
-        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * np.arange(_BATCH)
-        self._headers["iov_count"] = 1
-        self._headers["control"] = self._control.ctypes.data + self._control.strides[0] * np.arange(_BATCH)
+        self._rows = _Rows(FrameBatch(1, payload_size))
 
     def open(self) -> None:
         """Open and bind the socket.
@@ -149,20 +143,18 @@ class SocketCanBus(Bus):
         return self._socket.fileno() if self._socket else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append up to 256 frames; see :class:`skinware_drivers.bus.Bus`."""
+        """Append what has arrived; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
-        room = min(_BATCH, batch.free)
-        if room <= 0:
+        if not batch.free:
             return 0
-        first, stride = batch.stop, batch.wire.strides[0]
-        self._iov["base"][:room] = batch.wire.ctypes.data + stride * first + stride * np.arange(room)
-        self._iov["length"][:room] = stride
-        self._headers["control_length"][:room] = 8 * _CONTROL_WORDS
-        count = _recvmmsg(self._socket.fileno(), self._headers.ctypes.data, room, socket.MSG_DONTWAIT, None)
+        if self._rows.batch is not batch:
+            self._rows = _Rows(batch)
+        first = batch.stop
+        count = self._rows.receive(self._socket.fileno())
         if count < 0:
             return self._nothing_received(ctypes.get_errno())
-        batch.time_ns[first : first + count] = self._stamps(count)
+        batch.time_ns[first : first + count] = self._stamps(self._rows.control[first : first + count])
         batch.bus[first : first + count] = ordinal
         kept = self._sort_out(batch, first, count)
         batch.stop += kept
@@ -198,11 +190,10 @@ class SocketCanBus(Bus):
             raise BusNotAvailable(f"bus {self.channel} went down", is_down=True)
         raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})")
 
-    def _stamps(self, count: int) -> npt.NDArray[np.int64]:
+    def _stamps(self, control: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Kernel stamps on our clock: CLOCK_REALTIME with an offset sampled now, so that clock steps do no harm."""
         poll_ns = now_ns()
         offset_ns = poll_ns - time.time_ns()
-        control = self._control[:count]
         stamps = control[:, 2] * NS_PER_S + control[:, 3] + offset_ns
         np.clip(stamps, self._last_poll_ns, poll_ns, out=stamps)
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
@@ -229,6 +220,37 @@ class SocketCanBus(Bus):
             return 0
         words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
         return words[_MEMINFO_DROPS]
+
+
+class _Rows:
+    """What ``recvmmsg`` needs to put frames straight into the rows of one batch, made once.
+
+    Attributes:
+        batch: the batch.
+        control: (capacity, 8) int64, ancillary data of each row.
+    """
+
+    def __init__(self, batch: FrameBatch) -> None:
+        capacity, rows = batch.capacity, np.arange(batch.capacity)
+        self.batch = batch
+        self.control = np.zeros((capacity, _CONTROL_WORDS), np.int64)
+        self._iov = np.zeros(capacity, _IOVEC)
+        self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
+        self._iov["length"] = batch.wire.strides[0]
+        self._headers = np.zeros(capacity, _MMSGHDR)
+        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * rows
+        self._headers["iov_count"] = 1
+        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
+        self._control_length = self._headers["control_length"]
+        self._address = self._headers.ctypes.data
+
+    def receive(self, fd: int) -> int:
+        """Fill the free rows of the batch; returns how many were filled, -1 on an error (errno)."""
+        first, free = self.batch.stop, self.batch.free
+        self._control_length[first:] = 8 * _CONTROL_WORDS  # the kernel wrote what it used
+        address = self._address + _MMSGHDR.itemsize * first
+        count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
+        return count
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:

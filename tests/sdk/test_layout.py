@@ -13,7 +13,7 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoder import PATCH_COUNTERS, Decoder
+from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import (
     Bits,
@@ -29,6 +29,7 @@ from skinware_drivers.layout import (
     Stamp,
     Values,
 )
+from skinware_drivers.skin_state import PATCH_COUNTERS
 
 TYPES = [PRESSURE.measured(unit="counts")]
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
@@ -42,8 +43,7 @@ def decode(
     decoder.put_back(batch)
     for number, (identifier, payload) in enumerate(frames):
         batch.append(0, 1 + number * gap_ns, identifier, payload)
-    for updates in decoder.decode(batch)[0]:
-        decoder.apply(batch, updates)
+    decoder.state.show(decoder.decode(batch)[0])
     return decoder
 
 
@@ -67,8 +67,8 @@ def quarters(base: int) -> list[tuple[int, bytes]]:
 
 def test_a_permuted_fingertip_of_four_frames() -> None:
     decoder = decode(fingertip(), [Module(taxels(16))], "<u2", quarters(1000))
-    assert decoder.state.values[:-1].tolist() == list(range(1000, 1016))
-    assert not decoder.state.status[:-1].any()
+    assert decoder.state.values.tolist() == list(range(1000, 1016))
+    assert not decoder.state.status.any()
 
 
 @pytest.mark.parametrize(
@@ -115,13 +115,13 @@ def test_a_cycle_that_takes_too_long_is_not_shown() -> None:
 )
 def test_values_at_their_extremes(dtype: str | Packed, payload: str, expected: list[int]) -> None:
     decoder = decode(one(Values(0, dtype, 4)), [Module(taxels(4))], "<i4", [(0x100, bytes.fromhex(payload))])
-    assert decoder.state.values[:-1].tolist() == expected
+    assert decoder.state.values.tolist() == expected
 
 
 def test_dropped_values_go_nowhere() -> None:
     layout = one(Values(0, "u1", 8, to=(0, None, 1, None, 2, None, 3, None)))
     decoder = decode(layout, [Module(taxels(4))], "u1", [(0x100, bytes(range(1, 9)))])
-    assert decoder.state.values[:-1].tolist() == [1, 3, 5, 7]
+    assert decoder.state.values.tolist() == [1, 3, 5, 7]
 
 
 def test_a_module_named_in_the_payload() -> None:
@@ -129,7 +129,7 @@ def test_a_module_named_in_the_payload() -> None:
     modules = [Module(taxels(4, first_uid=10 * key), key=key) for key in (1, 2)]
     frames = [(0x100, bytes((0x20, 5, 6, 7, 8, 0, 0, 0))), (0x100, bytes((0x30, 9, 9, 9, 9, 0, 0, 0)))]
     decoder = decode(layout, modules, "u1", frames)
-    assert decoder.state.values[:-1].tolist() == [0, 0, 0, 0, 5, 6, 7, 8]
+    assert decoder.state.values.tolist() == [0, 0, 0, 0, 5, 6, 7, 8]
     assert decoder.state.bus_counters[0, 0] == 1
 
 
@@ -141,13 +141,13 @@ def test_sentinels_and_flags() -> None:
     ]
     layout = one(Values(0, "<u2", 3), flags=flags)
     decoder = decode(layout, [Module(taxels(3))], "<u2", [(0x100, bytes.fromhex("0100ffff02008000"))])
-    assert decoder.state.status[:-1].tolist() == [0, int(Status.NOT_CONNECTED), int(Status.NO_ACK)]
+    assert decoder.state.status.tolist() == [0, int(Status.NOT_CONNECTED), int(Status.NO_ACK)]
     decoder = decode(layout, [Module(taxels(3))], "<u2", [(0x100, bytes.fromhex("0100010002000010"))])
-    assert decoder.state.status[:-1].tolist() == [int(Status.OUT_OF_RANGE)] * 3
+    assert decoder.state.status.tolist() == [int(Status.OUT_OF_RANGE)] * 3
     nan = one(Values(0, "<f4", 2), flags=[Sentinel(Status.NOT_CONNECTED, float("nan"))])
     payload = np.array([np.nan, 0.5], "<f4").tobytes()
     decoder = decode(nan, [Module(taxels(2))], "<f4", [(0x100, payload)])
-    assert decoder.state.status[:-1].tolist() == [int(Status.NOT_CONNECTED), 0]
+    assert decoder.state.status.tolist() == [int(Status.NOT_CONNECTED), 0]
 
 
 def test_sequence_numbers_tell_losses_and_repeats() -> None:
@@ -159,8 +159,7 @@ def test_sequence_numbers_tell_losses_and_repeats() -> None:
     for identifier, payload in frames:
         decoder.put_back(batch)
         batch.append(0, 1, identifier, payload)
-        for updates in decoder.decode(batch)[0]:
-            decoder.apply(batch, updates)
+        decoder.state.show(decoder.decode(batch)[0])
     counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
     assert (counters["sequence_lost"], counters["sequence_repeated"]) == (2, 1)
 
@@ -181,7 +180,7 @@ def test_expand_is_the_escape() -> None:
 
     frame = (0x100, bytes((3, 7, 2, 9, 1, 4, 1, 5)))
     decoder = decode(one(Expand(run_lengths)), [Module(taxels(5))], "u1", [frame])
-    assert decoder.state.values[:-1].tolist() == [7, 7, 7, 9, 9]  # two more than there are channels are dropped
+    assert decoder.state.values.tolist() == [7, 7, 7, 9, 9]  # two more than there are channels are dropped
 
 
 @pytest.mark.parametrize(

@@ -37,8 +37,7 @@ class Desk:
         decoder.put_back(batch)
         for time_ns, identifier, payload in frames:
             batch.append(0, time_ns, identifier, payload)
-        for updates in decoder.decode(batch)[0]:
-            self.publisher.take(batch, updates)
+        self.publisher.take(decoder.decode(batch)[0])
 
     def burst(self, value: int, triangles: range = range(16), board: int = 7) -> list[Wire]:
         frames = []

@@ -14,8 +14,9 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import Kind, RoboskinDriver, RoboskinOptions
-from skinware_drivers.decoder import BUS_COUNTERS, PATCH_COUNTERS, Decoder
+from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import assemble
+from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 
 Wire = tuple[int, int, bytes]  # time_ns, identifier, payload
 MS = 1_000_000
@@ -36,11 +37,9 @@ class Rig:
         self.decoder.put_back(self.batch)
         for time_ns, identifier, payload in frames:
             self.batch.append(bus, time_ns, identifier, payload)
-        modules: list[int] = []
-        for updates in self.decoder.decode(self.batch)[0]:
-            self.decoder.apply(self.batch, updates)
-            modules += updates.module.tolist()
-        return modules
+        updates = self.decoder.decode(self.batch)[0]
+        self.decoder.state.show(updates)
+        return list(updates.module[updates.whole].tolist())
 
     def values(self, module: int) -> list[int]:
         return list(self.decoder.state.values[module * 12 : module * 12 + 12].tolist())
@@ -241,8 +240,8 @@ def test_pressure_is_255_minus_the_value() -> None:
     rig = Rig()
     rig.feed(halves(0, 240))
     structure = rig.decoder.tables.structure
-    assert structure.physical(rig.decoder.state.values[:-1], "pressure")[0] == 15.0
-    assert structure.physical(rig.decoder.state.values[:-1], "temperature")[0] == 240.0
+    assert structure.physical(rig.decoder.state.values, "pressure")[0] == 15.0
+    assert structure.physical(rig.decoder.state.values, "temperature")[0] == 240.0
 
 
 @pytest.mark.parametrize(
@@ -268,9 +267,7 @@ def test_silent_recalibration_makes_a_board_suspect_until_it_is_set_up() -> None
         rig.decoder.put_back(rig.batch)
         for frame in halves(3, 240, time_ns=cycle * 50 * MS + MS, tail="0001"):
             rig.batch.append(0, *frame)
-        for updates in rig.decoder.decode(rig.batch)[0]:
-            rig.decoder.apply(rig.batch, updates)
-            watch.look(rig.decoder.state, updates)
+        watch.look(rig.decoder.decode(rig.batch)[0])
     assert set(watch.module_status[:16].tolist()) == {int(Status.SUSPECT)}
     assert not watch.module_status[16:].any()
     watch.forget(0)

@@ -1,0 +1,171 @@
+"""Where one frame of the skin ends and the next begins, in a stream of updates from patches without a common clock.
+
+Every patch sends bursts: each of its modules once. A burst is over when one of its modules comes again, or after a
+pause: half a period, or less if the patch's own pauses are shorter and stand out (long bursts). A frame holds at most
+one burst of each patch. When one patch begins its next burst while another is in the middle of its own, that next
+burst is held back until the other's is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.skin_state import SkinState, Updates
+
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+_NEVER = -1
+_BEFORE = 0
+_STANDS_OUT = 2.0  # a pause between bursts, against the mean spacing of a patch's modules
+_SIMILAR = 0.75  # what counts as such a pause again
+
+
+class Bursts:
+    """Fills one frame after the other.
+
+    Args:
+        state: what is shown; its owner calls ``begin_frame`` after each publication.
+        module_patch: (n_modules,) int64.
+        period_ns: nominal time from burst to burst.
+        show: shows updates in ``state``.
+    """
+
+    def __init__(
+        self, state: SkinState, module_patch: Indices, period_ns: int, show: Callable[[Updates], None]
+    ) -> None:
+        self._state = state
+        self._module_patch = module_patch
+        self._n_patches = len(state.patch_time_ns)
+        self._pause_ns = np.full(self._n_patches, period_ns // 2)
+        self._standing_out_ns = _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
+        self._first_module = np.searchsorted(module_patch, np.arange(self._n_patches))
+        self._gap_ns = np.zeros(len(module_patch), np.int64)  # before the last update of each module
+        self._longest_pause_ns = period_ns // 2
+        self._show = show
+        self._held: Updates | None = None
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether updates are held back for the sake of another patch's burst."""
+        return self._held is not None
+
+    def take(self, updates: Updates | None, living: Flags, publish: Callable[[], None]) -> None:
+        """Show updates, and what was held back before them, in as many frames as they belong to.
+
+        Args:
+            updates: what has arrived, in order of time; None: nothing new.
+            living: (n_modules,) bool, modules that can be expected to send.
+            publish: called whenever a frame is over and more belongs to the next one.
+        """
+        parts = [part for part in (self._held, updates) if part is not None]
+        self._held = None
+        while parts:
+            waiting = Updates.join(parts)
+            rest = self._take_in_order(waiting, living, publish)
+            if rest is None or self._held is not None:
+                return
+            parts = [rest]
+
+    def in_the_middle(self, living: Flags, time_ns: int) -> Flags:
+        """(n_patches,) bool: patches whose burst has begun in this frame, is not whole, and not too old to go on."""
+        lacks = np.zeros(self._n_patches, bool)
+        missing = living & ~self._state.touched
+        if not missing.any():
+            return lacks
+        lacks[self._module_patch[missing]] = True
+        begun = np.zeros(self._n_patches, bool)
+        begun[self._module_patch[self._state.updated]] = True
+        return begun & lacks & (time_ns - self._state.patch_time_ns <= self._pause_ns)
+
+    def pause_ends_ns(self, patches: Flags) -> int:
+        """When the last of these patches will have said nothing for long enough to have ended its burst."""
+        return int((self._state.patch_time_ns + self._pause_ns)[patches].max()) + 1
+
+    def _take_in_order(self, updates: Updates, living: Flags, publish: Callable[[], None]) -> Updates | None:
+        """Cut where bursts begin; returns what is left after a burst was drawn forward, None if nothing."""
+        before = self._previous(updates)
+        reach = np.maximum.accumulate(before)
+        begin, threshold = 0, _BEFORE
+        while begin < len(updates):
+            end = int(np.searchsorted(reach, threshold))
+            if end > begin:
+                self._show(updates.take(slice(begin, end)))
+            if end == len(updates):
+                return None
+            open_patches = self.in_the_middle(living, int(updates.oldest_ns[end]))
+            open_patches[self._module_patch[updates.module[end]]] = False
+            if open_patches.any():
+                rest = updates.take(slice(end, None))
+                return self._finish(rest, before[end:] >= threshold, open_patches, living, publish)
+            publish()
+            begin, threshold = end, end + 1
+        return None
+
+    def _finish(
+        self, rest: Updates, begins: Flags, open_patches: Flags, living: Flags, publish: Callable[[], None]
+    ) -> Updates:
+        """Draw forward what belongs to the open bursts. If that ends them, publish; else hold the rest back."""
+        patch = self._module_patch[rest.module]
+        early = np.zeros(len(rest), bool)
+        for number in np.flatnonzero(open_patches).tolist():
+            rows = np.flatnonzero(patch == number)
+            next_burst = np.flatnonzero(begins[rows])
+            if len(next_burst):
+                rows = rows[: next_burst[0]]
+                open_patches[number] = False
+            early[rows] = True
+        self._show(rest.take(early))
+        rest = rest.take(~early)
+        if (open_patches & self.in_the_middle(living, int(rest.newest_ns[-1]))).any():
+            self._held = rest
+        else:
+            publish()
+        return rest
+
+    def _previous(self, updates: Updates) -> Indices:
+        """(n,) for an update that begins a burst: 1 + the last update of the burst before, or 0 if that was shown.
+
+        -1 for all others. So an update begins a new frame if its number lies within the present one.
+        """
+        module, patch = updates.module, self._module_patch[updates.module]
+        previous = _chain(module)
+        orphans = ~updates.whole
+        orphans[previous == _NEVER] = False
+        orphans[orphans] = ~updates.whole[previous[orphans]]  # two halves of one module that found no partners
+        found = np.where(orphans, _NEVER, previous + 1)
+        first = previous == _NEVER
+        shown = np.where(updates.whole, self._state.touched[module], self._state.updated[module])
+        found[first] = np.where(shown[first], _BEFORE, _NEVER)
+        of_patch = _chain(patch)
+        first = of_patch == _NEVER
+        before_ns = np.where(first, self._state.patch_time_ns[patch], updates.newest_ns[of_patch])
+        gap_ns = updates.oldest_ns - before_ns
+        self._learn_pauses(module, patch, gap_ns)
+        pause = gap_ns > self._pause_ns[patch]
+        if pause.any():
+            begun = np.zeros(self._n_patches, bool)
+            begun[self._module_patch[self._state.updated]] = True
+            pause &= ~first | begun[patch]
+            found[pause] = np.maximum(found[pause], of_patch[pause] + 1)
+        return found
+
+    def _learn_pauses(self, module: Indices, patch: Indices, gap_ns: Indices) -> None:
+        gap_ns = np.where(gap_ns < 2 * self._longest_pause_ns, gap_ns, 0)  # more than a period is no pause
+        self._gap_ns[module] = gap_ns
+        longest_ns = np.maximum.reduceat(self._gap_ns, self._first_module)
+        np.maximum.at(longest_ns, patch, gap_ns)
+        own_ns = np.where(longest_ns >= self._standing_out_ns, _SIMILAR * longest_ns, self._longest_pause_ns)
+        self._pause_ns = np.minimum(own_ns, self._longest_pause_ns).astype(np.int64)
+
+
+def _chain(key: Indices) -> Indices:
+    """(n,) the previous element of the same key, -1 for the first of each."""
+    order = np.argsort(key.astype(np.uint16) if len(key) and key.max() < 1 << 16 else key, kind="stable")
+    ordered = key[order]
+    previous = np.full(len(key), _NEVER, np.int64)
+    same = ordered[1:] == ordered[:-1]
+    previous[order[1:][same]] = order[:-1][same]
+    return previous

@@ -1,0 +1,190 @@
+"""One kind of frame, compiled: from payloads to values and flags, for whole batches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.description import SkinTables
+from skinware_drivers.layout import Bits, Expand, Flag, Frame, Packed, Sentinel
+
+Bytes = npt.NDArray[np.uint8]
+Indices = npt.NDArray[np.int64]
+
+
+class FrameKind:
+    """What the frames of one kind say, and whose they are.
+
+    Attributes:
+        frame: the declaration.
+        channels: (width,) int64, channel of each value; -1 = dropped.
+        module_by_byte: (n_patches, keys) module that a payload byte names, None if the identifier does.
+    """
+
+    def __init__(self, frame: Frame, tables: SkinTables) -> None:
+        self.frame = frame
+        n_channels = tables.channel_to_sensor.shape[1]
+        self._n_modules = tables.structure.n_modules
+        self.module_by_byte: Indices | None = None
+        if frame.module is not None and frame.module.byte is not None:
+            self.module_by_byte = np.full((tables.structure.n_patches, 1 << frame.module.width), -1, np.int64)
+            for (patch, key), module in tables.module_key.items():
+                if key < self.module_by_byte.shape[1]:
+                    self.module_by_byte[patch, key] = module
+        if isinstance(frame.values, Expand):
+            self.channels = np.arange(n_channels)
+        else:
+            self.channels = np.array([-1 if c is None else c for c in frame.values.channels], np.int64)
+            self.channels[self.channels >= n_channels] = -1
+
+    def name_modules(self, entry: Indices, payload: Bytes) -> Indices:
+        """(n,) entries in which "some module of this patch" became the module that the payload names."""
+        bits = self.frame.module
+        if self.module_by_byte is None or bits is None or bits.byte is None:
+            return entry
+        key = payload[:, bits.byte] >> bits.shift & ((1 << bits.width) - 1)
+        found = self.module_by_byte[entry - self._n_modules, key]
+        return np.where(found >= 0, found, entry)
+
+    def read(self, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
+        """The values of n frames.
+
+        Args:
+            payload: (n, size) uint8.
+            length: (n,) uint8.
+
+        Returns:
+            (n, width) values in the frame's own dtype; and (n, width) bool, which of them the frame does not have
+            (None: it has all).
+        """
+        layout = self.frame.values
+        if isinstance(layout, Expand):
+            row, channel, value = layout.function(payload, length)
+            inside = (channel >= 0) & (channel < len(self.channels))
+            row, channel = row[inside], channel[inside]
+            raw = np.zeros((len(payload), len(self.channels)), value.dtype)
+            raw[row, channel] = value[inside]
+            missing = np.ones(raw.shape, bool)
+            missing[row, channel] = False
+            return raw, missing
+        data = payload[:, layout.offset : layout.end]
+        if isinstance(layout.dtype, Packed):
+            return _unpack(data, layout.count, layout.dtype), None
+        return np.ascontiguousarray(data).view(layout.dtype), None
+
+    def flag(
+        self, payload: Bytes, length: Bytes, raw: npt.NDArray[Any], status: Bytes, columns: slice, channels: Indices
+    ) -> None:
+        """Set the status bits that n frames ask for.
+
+        Args:
+            payload: (n, size) uint8.
+            length: (n,) uint8.
+            raw: (n, width) what ``read`` returned.
+            status: (n, all) uint8, of all values of the update.
+            columns: where this frame's values are among them.
+            channels: (all,) channel of each of them.
+        """
+        for flag in self.frame.flags:
+            if isinstance(flag, Sentinel):
+                hit = np.isnan(raw) if flag.value != flag.value else raw == flag.value
+                status[:, columns] |= np.where(hit, np.uint8(flag.status), np.uint8(0))
+            else:
+                _flag_bits(flag, payload, length, status, channels)
+
+
+def _flag_bits(flag: Flag, payload: Bytes, length: Bytes, status: Bytes, channels: Indices) -> None:
+    dtype = np.dtype(flag.dtype)
+    end = flag.offset + dtype.itemsize
+    word = np.ascontiguousarray(payload[:, flag.offset : end]).view(dtype)[:, 0]
+    if not word.any():
+        return
+    flagged = np.flatnonzero((word != 0) & (length >= end))  # few, as a rule
+    word = word[flagged].astype(np.uint32)
+    bit = np.uint8(flag.status)
+    if flag.mask:
+        status[flagged[(word & flag.mask) != 0]] |= bit
+    for channel, shift in flag.each:
+        rows = flagged[np.flatnonzero(word >> shift & 1)]
+        if len(rows):
+            status[np.ix_(rows, np.flatnonzero(channels == channel))] |= bit
+
+
+def _unpack(data: Bytes, count: int, packed: Packed) -> Indices:
+    bits = np.unpackbits(np.ascontiguousarray(data), axis=1, bitorder=packed.order)[:, : count * packed.bits]
+    weights = 1 << np.arange(packed.bits, dtype=np.int64)
+    if packed.order == "big":
+        weights = weights[::-1]
+    values: Indices = bits.reshape(len(data), count, packed.bits).astype(np.int64) @ weights
+    if packed.signed:
+        values -= (values >> (packed.bits - 1) & 1) << packed.bits
+    return values
+
+
+class Assembly:
+    """The frames that together make one update of a module, and where their values go.
+
+    Args:
+        kinds: the frames, in the order of the cycle.
+        tables: the skin.
+        width: values of every update, whatever it is made of; at least the sum over ``kinds``.
+    """
+
+    def __init__(self, kinds: list[FrameKind], tables: SkinTables, width: int) -> None:
+        self._kinds = kinds
+        self._sink = tables.structure.n_sensors
+        self._channels = np.full(width, -1, np.int64)
+        self._columns: list[slice] = []
+        end = 0
+        for kind in kinds:
+            columns = slice(end, end + len(kind.channels))
+            self._columns.append(columns)
+            self._channels[columns] = kind.channels
+            end = columns.stop
+        # one column more for what is dropped, one row more for updates that are not shown
+        table = np.full((len(tables.channel_to_sensor) + 1, tables.channel_to_sensor.shape[1] + 1), self._sink)
+        table[:-1, :-1] = tables.channel_to_sensor
+        self._destination = np.ascontiguousarray(table[:, self._channels])
+
+    def read(
+        self,
+        wire: npt.NDArray[Any],
+        rows: Indices,
+        module: Indices,
+        orphans: Indices,
+        values: npt.NDArray[Any],
+        status: Bytes,
+    ) -> Indices:
+        """Read n updates.
+
+        Args:
+            wire: the batch.
+            rows: (n, members) rows of it.
+            module: (n,) module of each.
+            orphans: those of the n that are not whole: they go nowhere and flag nothing.
+            values: (n, width), filled in.
+            status: (n, width) uint8, all zero; flags are set in it.
+
+        Returns:
+            (n, width) int64: the sensor that each value belongs to.
+        """
+        sensors = self._destination[module]
+        for member, (kind, columns) in enumerate(zip(self._kinds, self._columns, strict=True)):
+            taken = wire[rows[:, member]]
+            payload, length = taken["payload"], taken["length"]
+            payload[orphans] = 0
+            raw, missing = kind.read(payload, length)
+            values[:, columns] = raw
+            kind.flag(payload, length, raw, status, columns, self._channels)
+            if missing is not None:
+                sensors[:, columns][missing] = self._sink
+        sensors[orphans] = self._sink
+        status[orphans] = 0
+        return sensors
+
+
+def bits_of(identifier: int, bits: Bits | None) -> int:
+    """A bit field of an identifier, 0 without one."""
+    return 0 if bits is None else identifier >> bits.shift & ((1 << bits.width) - 1)

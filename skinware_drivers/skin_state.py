@@ -1,0 +1,133 @@
+"""What is known of the skin right now, and the updates that change it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.status import Status
+from skinware_drivers.description import SkinTables
+
+BUS_COUNTERS = ("unknown", "bad_length", "bad_content")
+"""Per bus: identifiers that are none of ours, wrong payload lengths, known identifiers with unknown content."""
+PATCH_COUNTERS = ("updates", "orphans", "late", "sequence_lost", "sequence_repeated")
+"""Per patch: module updates decoded; frames without their partners; of those, partners that came too late; and what
+sequence numbers skipped and repeated."""
+
+
+@dataclass(slots=True)
+class Updates:
+    """New values of modules, in order of arrival; they hold no reference to the frames that they came from.
+
+    Attributes:
+        module: (n,) int64.
+        whole: (n,) bool; False: only a part was heard (an orphan), which shows nothing.
+        sensors: (n, width) int64, where the values go; ``n_sensors`` = nowhere.
+        values: (n, width) of the structure's dtype.
+        status: (n, width) uint8, what the wire said of each.
+        oldest_ns: (n,) int64, oldest stamp of the frames of each.
+        newest_ns: (n,) int64, newest stamp of them.
+        flagged: False: ``status`` is all zero.
+    """
+
+    module: npt.NDArray[np.int64]
+    whole: npt.NDArray[np.bool_]
+    sensors: npt.NDArray[np.int64]
+    values: npt.NDArray[Any]
+    status: npt.NDArray[np.uint8]
+    oldest_ns: npt.NDArray[np.int64]
+    newest_ns: npt.NDArray[np.int64]
+    flagged: bool
+
+    def __len__(self) -> int:
+        return len(self.module)
+
+    def take(self, which: slice | npt.NDArray[Any]) -> Updates:
+        """Some of them."""
+        return Updates(
+            self.module[which],
+            self.whole[which],
+            self.sensors[which],
+            self.values[which],
+            self.status[which],
+            self.oldest_ns[which],
+            self.newest_ns[which],
+            self.flagged,
+        )
+
+    @staticmethod
+    def join(parts: Sequence[Updates]) -> Updates:
+        """All of several, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        return Updates(
+            np.concatenate([p.module for p in parts]),
+            np.concatenate([p.whole for p in parts]),
+            np.concatenate([p.sensors for p in parts]),
+            np.concatenate([p.values for p in parts]),
+            np.concatenate([p.status for p in parts]),
+            np.concatenate([p.oldest_ns for p in parts]),
+            np.concatenate([p.newest_ns for p in parts]),
+            any(p.flagged for p in parts),
+        )
+
+
+class SkinState:
+    """Private arrays, copied into the ring at publication.
+
+    Attributes:
+        values: (n_sensors,) of the structure's dtype.
+        status: (n_sensors,) uint8, what the wire said of each sensor.
+        module_time_ns: (n_modules,) int64, oldest stamp among the frames shown for a module; 0 = never.
+        updated: (n_modules,) bool, shown anew since the last publication.
+        touched: (n_modules,) bool, heard since then, if only in part.
+        patch_time_ns: (n_patches,) int64, newest stamp of a complete update; 0 = never.
+        newest_ns: newest stamp of all.
+        bus_counters: (n_buses, len(BUS_COUNTERS)) int64.
+        patch_counters: (n_patches, len(PATCH_COUNTERS)) int64.
+    """
+
+    def __init__(self, tables: SkinTables) -> None:
+        structure = tables.structure
+        # one element more than there is: it takes what belongs nowhere, which is cheaper than to sort it out
+        self._values = np.zeros(structure.n_sensors + 1, structure.dtype)
+        self._status = np.full(structure.n_sensors + 1, int(Status.NEVER_SEEN), np.uint8)
+        self._module_time_ns = np.zeros(structure.n_modules + 1, np.int64)
+        self._updated = np.zeros(structure.n_modules + 1, bool)
+        self._patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
+        self.values = self._values[:-1]
+        self.status = self._status[:-1]
+        self.module_time_ns = self._module_time_ns[:-1]
+        self.updated = self._updated[:-1]
+        self.patch_time_ns = self._patch_time_ns[:-1]
+        self.touched = np.zeros(structure.n_modules, bool)
+        self.newest_ns = 0
+        self.bus_counters = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
+        self.patch_counters = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
+        self._status_is_zero = False
+        self._nobody = structure.n_modules
+        self._patch = np.append(structure.module_patch, structure.n_patches).astype(np.intp)
+
+    def show(self, updates: Updates) -> None:
+        """Show updates. Of several for one module, the last one stays."""
+        if not len(updates):
+            return
+        shown = np.where(updates.whole, updates.module, self._nobody)
+        self._values[updates.sensors] = updates.values
+        if updates.flagged or not self._status_is_zero:
+            self._status[updates.sensors] = updates.status
+            self._status_is_zero = not updates.flagged and not self.status.any()
+        self._module_time_ns[shown] = updates.oldest_ns
+        self._updated[shown] = True
+        self.touched[updates.module] = True
+        self._patch_time_ns[self._patch[shown]] = updates.newest_ns
+        self.newest_ns = max(self.newest_ns, int(updates.newest_ns[-1]))
+
+    def begin_frame(self) -> None:
+        """Forget what was shown since the last publication."""
+        self.updated[:] = False
+        self.touched[:] = False

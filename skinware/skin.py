@@ -297,7 +297,8 @@ def _sleep_on(words: list[tuple[int, int]], until_ns: int) -> None:
     """Sleep until any of the futex words changes or the time comes; may return early."""
     remaining_ns = max(0, until_ns - now_ns())
     if len(words) == 1:
-        _futex.wait(*words[0], remaining_ns)
+        address, expected = words[0]
+        _futex.Word(address).wait(expected, remaining_ns)
     elif not words:
         time.sleep(remaining_ns / NS_PER_S)
     elif not _futex.wait_any(words[: _futex.MAX_WORDS], until_ns):

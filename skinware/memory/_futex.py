@@ -23,7 +23,10 @@ MAX_WORDS = 128
 """The most words one ``wait_any`` can take (FUTEX_WAITV_MAX)."""
 
 _syscall = ctypes.CDLL(None, use_errno=True).syscall
-_syscall.restype = ctypes.c_long
+_sleep = ctypes.CDLL(None).syscall  # without the GIL, and without the errno, which costs as much as the call
+_poke = ctypes.PyDLL(None).syscall  # with the GIL: it never blocks
+for _function in (_syscall, _sleep, _poke):
+    _function.restype = ctypes.c_long
 
 
 class _Timespec(ctypes.Structure):
@@ -43,27 +46,42 @@ _wait = ctypes.c_int(_FUTEX_WAIT)
 _all_waiters = ctypes.c_int(_EVERYBODY)
 
 
-def wake_all(address: int) -> None:
-    """Wake everybody who waits on the word at ``address``: one system call."""
-    if _syscall(_sys_futex, ctypes.c_void_p(address), _wake, _all_waiters, None, None, 0) < 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
+class Word:
+    """A futex word at a fixed address, which must stay mapped. Not for several threads at once.
 
+    After a sleep the processor's caches are cold, and each object that need not be touched then is time saved:
+    the arguments of the system calls are made here, and what could go wrong with them is found here.
 
-def wait(address: int, expected: int, timeout_ns: int) -> None:
-    """Sleep until the word is woken, differs from ``expected``, or the time is up; may return early.
-
-    The caller looks at the memory again in any case, so the reason of the return is not told. The GIL is free
-    meanwhile, and a signal ends the wait, so that its Python handler runs.
+    Raises:
+        OSError: the kernel refuses the address.
     """
-    timeout = _Timespec(timeout_ns // NS_PER_S, timeout_ns % NS_PER_S)
-    result = _syscall(
-        _sys_futex, ctypes.c_void_p(address), _wait, ctypes.c_uint32(expected), ctypes.byref(timeout), None, 0
-    )
-    if result < 0:
-        number = ctypes.get_errno()
-        if number not in (EAGAIN, EINTR, ETIMEDOUT):
-            raise OSError(number, os.strerror(number))
+
+    def __init__(self, address: int) -> None:
+        self._address = ctypes.c_void_p(address)
+        self._expected = ctypes.c_uint32()
+        self._timeout = _Timespec()
+        self._timeout_at = ctypes.byref(self._timeout)
+        self._timeout_ns = 0
+        if _syscall(_sys_futex, self._address, _wait, self._expected, self._timeout_at) < 0:
+            number = ctypes.get_errno()
+            if number not in (EAGAIN, EINTR, ETIMEDOUT):
+                raise OSError(number, os.strerror(number))
+
+    def wake_all(self) -> None:
+        """Wake everybody who waits on the word: one system call."""
+        _poke(_sys_futex, self._address, _wake, _all_waiters)
+
+    def wait(self, expected: int, timeout_ns: int) -> None:
+        """Sleep until the word is woken, differs from ``expected``, or the time is up; may return early.
+
+        The caller looks at the memory again in any case, so the reason of the return is not told. The GIL is free
+        meanwhile, and a signal ends the wait, so that its Python handler runs.
+        """
+        self._expected.value = expected
+        if timeout_ns != self._timeout_ns:
+            self._timeout.seconds, self._timeout.nanoseconds = divmod(timeout_ns, NS_PER_S)
+            self._timeout_ns = timeout_ns
+        _sleep(_sys_futex, self._address, _wait, self._expected, self._timeout_at)
 
 
 def wait_any(words: Sequence[tuple[int, int]], deadline_ns: int) -> bool:

@@ -73,7 +73,7 @@ class Segment:
         control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
         control["state"] |= state
         control["wake_word"] += np.uint32(1)
-        _futex.wake_all(self.address(_layout.WAKE_WORD_OFFSET))
+        _futex.Word(self.address(_layout.WAKE_WORD_OFFSET)).wake_all()
 
 
 def take_name(namespace: Namespace, name: str) -> Descriptor:

@@ -34,7 +34,7 @@ class ReaderRecord(msgspec.Struct):
         frames: frames taken so far.
         lost: frames that were published since its first one and that it did not take.
         rate_hz: frames per second lately.
-        age_ms: how old the newest data was when the last frame was taken.
+        age_ms: how old the newest data of a recent frame was when it was taken.
     """
 
     service: str

@@ -24,6 +24,7 @@ _MISSED_PERIODS = _layout.MISSED_PERIODS_OFFSET // 8
 _WAKE_WORD = _layout.WAKE_WORD_OFFSET // 4
 _STATE = _layout.STATE_OFFSET // 4
 _SEQUENCE, _ACQUIRED, _PUBLISHED, _FLAGS = range(4)  # 8-byte words of a slot's header
+_HEADER_WORDS = _layout.SLOT.itemsize // 8
 
 
 class Frame:
@@ -54,13 +55,13 @@ class Frame:
 
     def __init__(
         self,
-        data: npt.NDArray[np.uint8],
-        words: memoryview,
         ring: RingReader[Any],
+        data: bytearray | memoryview,
         sequence: int,
+        words: memoryview,
     ) -> None:
         self._data = data
-        self._words = words
+        self._words = words if type(data) is memoryview else None
         self._columns = ring.columns
         self.context = ring.context
         self.generation = ring.generation
@@ -83,6 +84,8 @@ class Frame:
     @property
     def valid(self) -> bool:
         """Whether the writer has left the memory alone so far; always True for a copy."""
+        if self._words is None:
+            return True
         fence()
         return bool(self._words[_SEQUENCE] == self.sequence)
 
@@ -92,8 +95,8 @@ class Frame:
         Raises:
             KeyError: no column of that name.
         """
-        column = self._columns[name]
-        return self._data[column.offset : column.offset + column.dtype.itemsize * column.count].view(column.dtype)
+        shape, dtype, offset = self._columns[name]
+        return np.ndarray(shape, dtype, self._data, offset)
 
     def __repr__(self) -> str:
         age_ms = self.age_ns / 1e6
@@ -116,13 +119,16 @@ class RingReader(Generic[F]):
         layout = segment.layout
         self._frame_class = frame_class
         self.context = context
-        self.columns = {column.name: column for column in layout.slot}
+        self.columns = {column.name: ((column.count,), column.dtype, column.offset) for column in layout.slot}
         self.segment = segment
         self.generation = segment.generation
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
-        self._wake_address = segment.address(_layout.WAKE_WORD_OFFSET)
-        self._count, self._first, self._stride = layout.slot_count, layout.slot_offset, layout.slot_stride
+        self.wake_address = segment.address(_layout.WAKE_WORD_OFFSET)
+        self._wake_word = _futex.Word(self.wake_address)
+        self._count = layout.slot_count
+        self._slots = _slots(segment)
+        self._slot_words = _slot_headers(segment)
 
     @property
     def latest(self) -> int:
@@ -139,9 +145,19 @@ class RingReader(Generic[F]):
         """``STATE_*`` bits."""
         return self._half_words[_STATE]
 
-    def wake_word(self) -> tuple[int, int]:
-        """(address, present value) of the futex word; take it before looking at ``latest``."""
-        return self._wake_address, self._half_words[_WAKE_WORD]
+    @property
+    def wake_count(self) -> int:
+        """Present value of the futex word; take it before looking at ``latest`` or ``state``."""
+        return self._half_words[_WAKE_WORD]
+
+    def sleep(self, wake_count: int, latest: int, timeout_ns: int) -> bool:
+        """Sleep until the futex word is another than ``wake_count``, or the time is up; may return early.
+
+        Returns:
+            Whether the newest frame is another than ``latest`` now.
+        """
+        self._wake_word.wait(wake_count, timeout_ns)
+        return self._words[_LATEST] != latest
 
     def copy(self, sequence: int | None = None) -> F | None:
         """A private copy of a frame.
@@ -155,24 +171,29 @@ class RingReader(Generic[F]):
         Raises:
             Overrun: the newest frame was overwritten while it was copied, 64 times in a row.
         """
+        if sequence is not None:
+            return self._copy(sequence)
         for _ in range(_COPY_ATTEMPTS):
-            wanted = self.latest if sequence is None else sequence
-            if wanted == 0:
+            latest = self.latest
+            if latest == 0:
                 return None
-            start = self._first + (wanted % self._count) * self._stride
-            if self._words[start // 8] == wanted:
-                fence()
-                data = self.segment.data[start : start + self._stride].copy()
-                fence()
-                if self._words[start // 8] == wanted:
-                    words = memoryview(data).cast("Q")  # type: ignore[arg-type]
-                    return self._frame_class(data, words, self, wanted)
-            if sequence is not None:
-                return None
+            frame = self._copy(latest)
+            if frame is not None:
+                return frame
         raise Overrun(
             f"{self.segment.path}: the writer was faster {_COPY_ATTEMPTS} times in a row; "
             f"give the service more slots (it has {self._count}) or publish less often"
         )
+
+    def _copy(self, sequence: int) -> F | None:
+        slot = sequence % self._count
+        words = self._slot_words[slot]
+        if words[_SEQUENCE] != sequence:
+            return None
+        fence()
+        frame = self._frame_class(self, bytearray(self._slots[slot]), sequence, words)
+        fence()
+        return frame if words[_SEQUENCE] == sequence else None
 
     @property
     def missed_periods(self) -> int:
@@ -184,10 +205,10 @@ class RingReader(Generic[F]):
         times = []
         latest = self.latest
         for sequence in range(max(1, latest - self._count + 2), latest + 1):
-            word = (self._first + sequence % self._count * self._stride) // 8
-            time_ns = self._words[word + _PUBLISHED]
+            words = self._slot_words[sequence % self._count]
+            time_ns = words[_PUBLISHED]
             fence()
-            if self._words[word] == sequence:
+            if words[_SEQUENCE] == sequence:
                 times.append(time_ns)
         return times
 
@@ -197,9 +218,8 @@ class RingReader(Generic[F]):
             wanted = self.latest
             if wanted == 0:
                 return None
-            start = self._first + (wanted % self._count) * self._stride
-            words = self._words[start // 8 : (start + _layout.SLOT.itemsize) // 8]
-            frame = self._frame_class(self.segment.data[start : start + self._stride], words, self, wanted)
+            slot = wanted % self._count
+            frame = self._frame_class(self, self._slots[slot], wanted, self._slot_words[slot])
             if frame.valid:
                 return frame
         raise Overrun(f"{self.segment.path}: the writer was faster {_COPY_ATTEMPTS} times in a row")
@@ -213,14 +233,12 @@ class RingWriter:
         self.segment = segment
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
-        self._wake_address = segment.address(_layout.WAKE_WORD_OFFSET)
-        self._count, self._first, self._stride = layout.slot_count, layout.slot_offset, layout.slot_stride
+        self._wake_word = _futex.Word(segment.address(_layout.WAKE_WORD_OFFSET))
+        self._count = layout.slot_count
+        self._slot_words = _slot_headers(segment)
         self._columns = [
-            {
-                column.name: segment.view(self._first + i * self._stride + column.offset, column.dtype, column.count)
-                for column in layout.slot
-            }
-            for i in range(self._count)
+            {column.name: np.ndarray((column.count,), column.dtype, slot, column.offset) for column in layout.slot}
+            for slot in _slots(segment)
         ]
         self.sequence = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
@@ -234,7 +252,7 @@ class RingWriter:
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         slot = (self.sequence + 1) % self._count
-        self._words[(self._first + slot * self._stride) // 8] = 0
+        self._slot_words[slot][_SEQUENCE] = 0
         fence()
         return self._columns[slot]
 
@@ -249,14 +267,13 @@ class RingWriter:
             The frame's sequence.
         """
         sequence = self.sequence + 1
-        words = self._words
-        word = (self._first + sequence % self._count * self._stride) // 8
-        words[word + _ACQUIRED] = acquired_ns
-        words[word + _PUBLISHED] = now_ns()
-        words[word + _FLAGS] = flags
+        words = self._slot_words[sequence % self._count]
+        words[_ACQUIRED] = acquired_ns
+        words[_PUBLISHED] = now_ns()
+        words[_FLAGS] = flags
         fence()
-        words[word] = sequence
-        words[_LATEST] = sequence
+        words[_SEQUENCE] = sequence
+        self._words[_LATEST] = sequence
         self.sequence = sequence
         self.wake()
         return sequence
@@ -265,7 +282,7 @@ class RingWriter:
         """Wake everybody who waits for this generation."""
         self._half_words[_WAKE_WORD] = (self._half_words[_WAKE_WORD] + 1) & 0xFFFF_FFFF
         fence()
-        _futex.wake_all(self._wake_address)
+        self._wake_word.wake_all()
 
     def count_missed_periods(self, count: int) -> None:
         """Add to the number of periods that this writer missed, for everybody to see."""
@@ -275,3 +292,15 @@ class RingWriter:
         """Replace the ``STATE_*`` bits and wake everybody."""
         self._half_words[_STATE] = state
         self.wake()
+
+
+def _slots(segment: Segment) -> list[memoryview]:
+    """The bytes of every slot, its header and its columns, in place."""
+    layout = segment.layout
+    starts = range(layout.slot_offset, layout.slot_offset + layout.slot_count * layout.slot_stride, layout.slot_stride)
+    return [memoryview(segment.data)[start : start + layout.slot_stride] for start in starts]  # type: ignore[arg-type]
+
+
+def _slot_headers(segment: Segment) -> list[memoryview]:
+    """The 8-byte words of every slot's header, in place."""
+    return [slot.cast("Q")[:_HEADER_WORDS] for slot in _slots(segment)]

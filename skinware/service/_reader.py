@@ -11,7 +11,7 @@ from typing import Any, Generic, Self, TypeVar
 import numpy.typing as npt
 
 from skinware.errors import Closed, Overrun, ServiceNotFound, ServiceTimeout, StructureChanged
-from skinware.memory import _futex, _layout, _segment
+from skinware.memory import _layout, _segment
 from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import Frame, RingReader
@@ -65,7 +65,8 @@ class ServiceReader(Generic[F]):
         self._announcement = Announcement(self.namespace, name) if announce else None
         self._record = ReaderRecord(name, os.getpid(), os.path.basename(sys.argv[0] or sys.executable), "on demand")
         self._announced_ns = self._announced_frames = 0
-        self._announce(None)
+        self._age_ns: int | None = None
+        self._announce()
 
     @property
     def generation(self) -> int:
@@ -112,14 +113,13 @@ class ServiceReader(Generic[F]):
     @property
     def latest(self) -> Position | None:
         """Position of the newest frame, None before the first; goes over to a new generation if there is one."""
-        if not self._moved and (self._ring.state & _MOVED_ON or not self.alive):
-            self._follow()
+        self._keep_up()
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
 
     def wake_word(self) -> tuple[int, int]:
         """(address, present value) of the futex that every publication wakes; take it before ``latest``."""
-        return self._ring.wake_word()
+        return self._ring.wake_address, self._ring.wake_count
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns of the generation that is being read, read-only."""
@@ -141,10 +141,14 @@ class ServiceReader(Generic[F]):
         """
         known = newer_than.position if isinstance(newer_than, Frame) else newer_than
         deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-        if known is None and self.latest is not None:
-            return self._taken(self._ring.copy())
-        self._wait_for_newer(known, deadline_ns)
-        return self._taken(self._ring.copy())
+        if known is None:
+            alive = self._keep_up()
+            if self._ring.latest:
+                frame = self._taken(self._ring.copy(), alive)
+                self._announce()
+                return frame
+        alive = self._wait_for_newer(known, deadline_ns)
+        return self._taken(self._ring.copy(), alive)
 
     @contextlib.contextmanager
     def view(self) -> Iterator[F]:
@@ -153,9 +157,10 @@ class ServiceReader(Generic[F]):
         Raises:
             ServiceTimeout: nothing was published yet.
         """
-        if self.latest is None:
-            raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
-        yield self._taken(self._ring.view())
+        alive = self._keep_up()
+        frame = self._taken(self._ring.view(), alive)
+        self._announce()
+        yield frame
 
     def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
         """Newest frames, for ever.
@@ -190,10 +195,11 @@ class ServiceReader(Generic[F]):
             ServiceTimeout, StructureChanged, Closed: as ``read``.
         """
         self._record.kind = "in order"
+        timeout_ns = None if timeout_s is None else round(timeout_s * NS_PER_S)
         while True:
-            deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-            self._wait_for_newer(self._last, deadline_ns)
-            yield self._taken(self._next_in_order())
+            deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
+            alive = self._wait_for_newer(self._last, deadline_ns)
+            yield self._taken(self._next_in_order(), alive)
 
     def reattach(self) -> None:
         """Go over to the present generation of the service, whatever its structure.
@@ -242,6 +248,14 @@ class ServiceReader(Generic[F]):
         self._ring = ring
         self._moved = False
 
+    def _keep_up(self) -> bool:
+        """Go over to a new generation if there may be one; whether the writer of the present one lives."""
+        alive = self.alive
+        if (self._ring.state & _MOVED_ON or not alive) and not self._moved:
+            self._follow()
+            alive = self.alive
+        return alive
+
     def _follow(self) -> None:
         """Go over to a newer generation if there is one of the same structure; remember if it has another."""
         inode = _segment.current_inode(self.namespace, self.name)
@@ -259,18 +273,26 @@ class ServiceReader(Generic[F]):
 
     # -- waiting ------------------------------------------------------------------------------------------------
 
-    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None) -> None:
+    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None) -> bool:
+        """Wait for a frame that is newer than ``known``; whether its writer lives.
+
+        One that is slept for was published within the last slice: its writer lived then, which saves the question
+        at the very moment at which a reader is in a hurry.
+        """
         look_around = False
         while True:
             if self._closed:
                 raise Closed(f"the reader of {self.name!r} was closed")
-            address, word = self._ring.wake_word()
-            if (look_around or self._ring.state & _MOVED_ON) and not self._moved:
+            ring = self._ring
+            wake_count = ring.wake_count
+            if (look_around or ring.state & _MOVED_ON) and not self._moved:
                 self._follow()
-                address, word = self._ring.wake_word()
-            latest = self._ring.latest
-            if latest and (self._ring.generation, latest) != known:
-                return
+                ring = self._ring
+                wake_count = ring.wake_count
+            latest = ring.latest
+            if latest and (ring.generation, latest) != known:
+                self._announce()
+                return self.alive
             if self._moved:
                 raise StructureChanged(
                     f"service {self.name!r} came back with another structure; call reattach() and read it anew"
@@ -278,9 +300,10 @@ class ServiceReader(Generic[F]):
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came())
-            self._announce(None)
-            _futex.wait(address, word, min(remaining_ns, WAIT_SLICE_NS))
-            look_around = self._ring.latest == latest
+            self._announce()
+            if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
+                return True
+            look_around = True
 
     def _why_nothing_came(self) -> str:
         if not self.alive:
@@ -295,7 +318,10 @@ class ServiceReader(Generic[F]):
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
             return self._ring.copy()
-        while True:
+        frame = self._ring.copy(last + 1)
+        if frame is not None:
+            return frame
+        while True:  # it lost some
             latest = self._ring.latest
             oldest = max(last + 1, latest - self._ring.slot_count + 2)
             for sequence in range(oldest, latest + 1):
@@ -305,18 +331,20 @@ class ServiceReader(Generic[F]):
             if latest == self._ring.latest:
                 raise Overrun(f"no slot of {self.name!r} could be read; its writer may have died while filling one")
 
-    def _taken(self, frame: F | None) -> F:
+    def _taken(self, frame: F | None, alive: bool) -> F:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
-        if self._last is not None:  # of this generation: _adopt saw to it
-            self.lost += max(0, frame.sequence - self._last[1] - 1)
-        self._last = frame.position
+        last = self._last
+        if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
+            self.lost += frame.sequence - last[1] - 1
+        self._last = frame.generation, frame.sequence
         self.frames_taken += 1
-        frame.stale = not self.alive
-        self._announce(frame)
+        if self._age_ns is None:
+            self._age_ns = frame.age_ns
+        frame.stale = not alive
         return frame
 
-    def _announce(self, frame: Frame | None) -> None:
+    def _announce(self) -> None:
         time_ns = now_ns()
         passed_ns = time_ns - self._announced_ns
         if passed_ns < _ANNOUNCE_EVERY_NS or self._announcement is None:
@@ -324,8 +352,9 @@ class ServiceReader(Generic[F]):
         record = self._record
         if self._announced_ns:
             record.rate_hz = round((self.frames_taken - self._announced_frames) * NS_PER_S / passed_ns, 2)
-        if frame is not None:
-            record.age_ms = round((time_ns - frame.acquired_ns) / 1e6, 3)
+        if self._age_ns is not None:
+            record.age_ms = round(self._age_ns / 1e6, 3)
+            self._age_ns = None
         record.frames, record.lost = self.frames_taken, self.lost
         self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, self.frames_taken

@@ -484,7 +484,7 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     writer._half_words[_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1
     assert writer.commit(5) == 1
-    assert reader.wake_word()[1] == 0
+    assert reader.wake_count == 0
     frame = reader.copy()
     assert frame is not None
     assert (frame.sequence, frame.acquired_ns) == (1, 5)

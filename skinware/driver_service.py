@@ -16,7 +16,7 @@ from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import _segment
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import DEFAULT_SLOTS, ServiceReader, ServiceWriter
+from skinware.service import DEFAULT_SLOTS, Columns, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
 KIND = "driver"
@@ -152,7 +152,7 @@ class DriverWriter:
         """Withdraw the driver. Idempotent."""
         self._service.close()
 
-    def _columns(self) -> dict[str, tuple[npt.DTypeLike, int]]:
+    def _columns(self) -> Columns:
         structure = self.structure
         _, bus_counters, patch_counters = self._names
         return {

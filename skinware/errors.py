@@ -55,6 +55,34 @@ class Closed(ServiceError):
     """The writer or reader was closed, or belongs to the process that this one was forked from."""
 
 
+class Paused(ServiceError):
+    """The writer publishes nothing and takes no requests until it resumes."""
+
+
+class RequestError(ServiceError):
+    """Base of what can happen to a request: it was not carried out, or nobody knows whether it was."""
+
+
+class RequestTimeout(RequestError, TimeoutError):
+    """No answer came in time. An answer that comes later is never taken for that of another request."""
+
+
+class RequestRefused(RequestError):
+    """The service takes no such request: unknown operation, wrong arguments, or no requests at all."""
+
+
+class RequestFailed(RequestError):
+    """The operation was begun and went wrong; the message is the writer's."""
+
+
+class RequestCancelled(RequestError):
+    """The request was cancelled by the one who made it."""
+
+
+class PeerGone(RequestError):
+    """The service's writer is dead, or died or was restarted while the request was under way."""
+
+
 class BusError(SkinwareError):
     """Base of what can go wrong with a bus."""
 

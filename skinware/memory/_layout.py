@@ -7,7 +7,8 @@ offset     what
 =========  ====================================================================================
 0          header (:data:`HEADER`, 512 bytes): written once, before the file becomes visible
 512        control words (:data:`CONTROL`, 64 bytes): what the writer changes while it runs
-576        column table (:data:`COLUMN`, 64 bytes each)
+576        statistics of the writer (:data:`STATISTICS`, 576 bytes), for people
+1152       column table (:data:`COLUMN`, 64 bytes each)
 ...        static columns (the structure), each on a 64-byte boundary
 slots      ``slot_count`` slots of ``slot_stride`` bytes: slot header (:data:`SLOT`), then columns
 =========  ====================================================================================
@@ -86,7 +87,27 @@ STATE_SUPERSEDED = 2
 STATE_CLOSED = 4
 """The writer closed it in good order."""
 
-COLUMN_OFFSET = CONTROL_OFFSET + CONTROL.itemsize
+STATISTICS_OFFSET = CONTROL_OFFSET + CONTROL.itemsize
+HISTOGRAM_BUCKETS = 32
+STATISTICS = np.dtype(
+    [
+        ("timed", "<u8"),
+        ("wall_best_ns", "<u8"),
+        ("wall_worst_ns", "<u8"),
+        ("wall_total_ns", "<u8"),
+        ("cpu_best_ns", "<u8"),
+        ("cpu_worst_ns", "<u8"),
+        ("cpu_total_ns", "<u8"),
+        ("reserved", "<u8"),
+        ("age", "<u8", (HISTOGRAM_BUCKETS,)),
+        ("lateness", "<u8", (HISTOGRAM_BUCKETS,)),
+    ]
+)
+"""Time from ``begin`` to ``commit``; how old the data was when published; how late periods began. Bucket k of a
+histogram counts values of 2**(k-1) to 2**k - 1 ns, the last one all above. Not covered by the slot protocol: a reader
+may see some of these words a frame ahead of others."""
+
+COLUMN_OFFSET = STATISTICS_OFFSET + STATISTICS.itemsize
 COLUMN = _packed(
     64,
     ("name", "S24", 0),
@@ -192,10 +213,10 @@ def plan(
 
 def _checked(column: Column) -> Column:
     name, code = column.name.encode(), column.dtype.str.encode()
-    if not 0 < len(name) <= 24 or len(code) > 8 or column.dtype.kind not in "uifS" or code[:1] == b">":
+    if not 0 < len(name) <= 24 or len(code) > 8 or column.dtype.kind not in "uifSV" or code[:1] == b">":
         raise ConfigurationError(
             f"column {column.name!r} of {column.dtype}: give a name of 1 to 24 bytes and little-endian"
-            " integers, floats or fixed-length bytes"
+            " integers, floats, fixed-length bytes or structures of them"
         )
     return column
 

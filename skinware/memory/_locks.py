@@ -30,18 +30,38 @@ def is_locked(fd: int) -> bool:
     return lock_type == fcntl.F_WRLCK
 
 
-class Descriptor:
-    """An open file descriptor that a forked child gives up, so that the child cannot keep a lock alive.
+class ForkGuard:
+    """Base of what a forked child must give up, lest it keeps alive what died with its parent.
 
-    A lock belongs to the open file description, which fork() shares: without this, the child of a killed
-    driver would make the driver look alive for as long as the child lives.
+    Locks and connections belong to the open file description, which fork() shares: without this, the child of a
+    killed driver would make the driver look alive for as long as the child lives.
     """
 
-    _all: ClassVar[weakref.WeakSet[Descriptor]] = weakref.WeakSet()
+    _all: ClassVar[weakref.WeakSet[ForkGuard]] = weakref.WeakSet()
+
+    def __init__(self) -> None:
+        ForkGuard._all.add(self)
+
+    def abandon(self) -> None:
+        """Close what this process inherited; nothing that others can see may change. Run by fork() in the child."""
+        raise NotImplementedError
+
+    @classmethod
+    def abandon_all(cls) -> None:
+        """Run by fork() in the child."""
+        for guarded in list(cls._all):
+            guarded.abandon()
+
+
+os.register_at_fork(after_in_child=ForkGuard.abandon_all)
+
+
+class Descriptor(ForkGuard):
+    """An open file descriptor that a forked child gives up."""
 
     def __init__(self, fd: int) -> None:
+        super().__init__()
         self._fd = fd
-        Descriptor._all.add(self)
 
     @property
     def fd(self) -> int:
@@ -54,14 +74,9 @@ class Descriptor:
         if fd >= 0:
             os.close(fd)
 
-    def __del__(self) -> None:
+    def abandon(self) -> None:
+        """See :class:`ForkGuard`."""
         self.close()
 
-    @classmethod
-    def close_all_in_child(cls) -> None:
-        """Run by fork() in the child."""
-        for descriptor in list(cls._all):
-            descriptor.close()
-
-
-os.register_at_fork(after_in_child=Descriptor.close_all_in_child)
+    def __del__(self) -> None:
+        self.close()

@@ -21,6 +21,7 @@ from skinware.memory import _futex, _layout
 from skinware.memory._layout import Layout
 from skinware.memory._locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
+from skinware.memory.schema import Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_BYTES = _layout.COLUMN_OFFSET + _layout.COLUMN.itemsize * _layout.MAX_COLUMNS
@@ -37,6 +38,7 @@ class Segment:
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
         inode: (device, inode), which tells generations of one name apart.
+        schema: what the columns of the slots look like to users.
     """
 
     path: str
@@ -45,6 +47,7 @@ class Segment:
     data: npt.NDArray[np.uint8]
     descriptor: Descriptor
     inode: tuple[int, int]
+    schema: Schema
 
     @property
     def generation(self) -> int:
@@ -54,6 +57,11 @@ class Segment:
     def address(self, offset: int) -> int:
         """Memory address of a byte of the file."""
         return self.data.ctypes.data + offset
+
+    def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
+        """(shape, dtype, offset in the slot) of every column of a slot, by name."""
+        columns = self.schema.columns
+        return {c.name: (columns[c.name].shape, columns[c.name].dtype, c.offset) for c in self.layout.slot}
 
     def static_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Views of the static columns, by name."""
@@ -101,17 +109,21 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
 def create(
     namespace: Namespace,
     name: str,
-    layout: Layout,
+    schema: Schema,
     static: Mapping[str, npt.NDArray[Any]],
     *,
+    slots: int,
     kind: str,
     period_ns: int,
 ) -> Segment:
     """Make a new generation and put it in the place of the old one. The caller owns the name.
 
     Raises:
+        ConfigurationError: slots or columns that the format cannot hold.
         NamespaceError: no room in shared memory, or no rights.
     """
+    static = {**static, **schema.for_file()}
+    layout = _layout.plan(static, schema.for_layout(), slots)
     _remove_leftovers(namespace, name)
     final = namespace.ring_path(name)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
@@ -142,7 +154,7 @@ def create(
     if previous is not None:
         previous.mark(_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
     info = os.fstat(fd)
-    return Segment(str(final), header[0], layout, data, descriptor, (info.st_dev, info.st_ino))
+    return Segment(str(final), header[0], layout, data, descriptor, (info.st_dev, info.st_ino), schema)
 
 
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
@@ -166,8 +178,8 @@ def _previous(namespace: Namespace, name: str) -> Segment | None:
 
 
 def _remove_leftovers(namespace: Namespace, name: str) -> None:
-    """Remove the half-made generations of a writer that was killed; the caller owns the name."""
-    pattern = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{8}}\.tmp")
+    """Remove what a writer that was killed left half made; the caller owns the name."""
+    pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)")
     for entry in os.listdir(namespace.path):
         if pattern.fullmatch(entry):
             os.unlink(namespace.path / entry)
@@ -201,10 +213,13 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
         header, layout = _layout.parse(os.pread(fd, _HEAD_BYTES, 0), str(path), info.st_size)
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
         data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
+        inode = info.st_dev, info.st_ino
+        segment = Segment(str(path), header, layout, data, descriptor, inode, Schema())
+        segment.schema = from_file(layout, segment.static_columns(), str(path))
     except BaseException:
         descriptor.close()
         raise
-    return Segment(str(path), header, layout, data, descriptor, (info.st_dev, info.st_ino))
+    return segment
 
 
 def current_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:

@@ -1,6 +1,6 @@
 """Readers make themselves known: a locked file each, which only its reader writes and nobody maps.
 
-A file is the CRC-32 of what follows (8 hex digits), a space, one JSON object, spaces up to 1024 bytes. A file
+A file is the CRC-32 of what follows (8 hex digits), a space, one JSON object, spaces up to 2048 bytes. A file
 that nobody holds the lock of belongs to a dead reader and is swept away.
 """
 
@@ -17,8 +17,9 @@ import msgspec
 
 from skinware.memory._locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
+from skinware.memory.statistics import Histogram, Spread
 
-_SIZE = 1024
+_SIZE = 2048
 _HALF_MADE_S = 60.0
 _READ_ATTEMPTS = 5
 
@@ -33,8 +34,14 @@ class ReaderRecord(msgspec.Struct):
         kind: how it reads: ``asap``, ``in order``, ``periodic 30 Hz``, ``on demand``.
         frames: frames taken so far.
         lost: frames that were published since its first one and that it did not take.
+        overruns: how often the writer was too fast for a copy.
+        missed_periods: periods that passed unused (periodic readers).
         rate_hz: frames per second lately.
         age_ms: how old the newest data of a recent frame was when it was taken.
+        wall: what its loop does with a frame, from having it to coming back.
+        cpu: from one wait to the next, on a processor.
+        age: how old the newest data was when a frame was taken.
+        lateness: how late its periods began (periodic readers).
     """
 
     service: str
@@ -43,8 +50,14 @@ class ReaderRecord(msgspec.Struct):
     kind: str
     frames: int = 0
     lost: int = 0
+    overruns: int = 0
+    missed_periods: int = 0
     rate_hz: float = 0.0
     age_ms: float = 0.0
+    wall: Spread = msgspec.field(default_factory=Spread)
+    cpu: Spread = msgspec.field(default_factory=Spread)
+    age: Histogram = msgspec.field(default_factory=Histogram)
+    lateness: Histogram = msgspec.field(default_factory=Histogram)
 
 
 class Announcement:

@@ -127,6 +127,10 @@ class Namespace:
         """The file whose lock is the ownership of a service's name."""
         return self.path / f"{service}.lock"
 
+    def socket_path(self, service: str) -> Path:
+        """Where a service takes requests."""
+        return self.path / f"{service}.sock"
+
     def reader_files(self) -> Iterator[Path]:
         """The announcements of readers."""
         try:

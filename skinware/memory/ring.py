@@ -7,6 +7,7 @@ fence; copy the slot; fence; load it again: equal means that the copy is whole.
 from __future__ import annotations
 
 import mmap
+import time
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from skinware.errors import Closed, Overrun
 from skinware.memory import _futex, _layout
 from skinware.memory._fences import fence
 from skinware.memory._segment import Segment
+from skinware.memory.statistics import bucket_of
 from skinware.realtime import now_ns
 
 _COPY_ATTEMPTS = 64
@@ -25,6 +27,9 @@ _WAKE_WORD = _layout.WAKE_WORD_OFFSET // 4
 _STATE = _layout.STATE_OFFSET // 4
 _SEQUENCE, _ACQUIRED, _PUBLISHED, _FLAGS = range(4)  # 8-byte words of a slot's header
 _HEADER_WORDS = _layout.SLOT.itemsize // 8
+_STATISTICS = slice(_layout.STATISTICS_OFFSET // 8, _layout.COLUMN_OFFSET // 8)
+_TIMED, _WALL, _CPU, _AGE = 0, 1, 4, 8  # words of the statistics: count, two times (best, worst, total), histograms
+_LATENESS = _AGE + _layout.HISTOGRAM_BUCKETS
 
 
 class Frame:
@@ -119,7 +124,7 @@ class RingReader(Generic[F]):
         layout = segment.layout
         self._frame_class = frame_class
         self.context = context
-        self.columns = {column.name: ((column.count,), column.dtype, column.offset) for column in layout.slot}
+        self.columns = segment.slot_formats()
         self.segment = segment
         self.generation = segment.generation
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
@@ -237,23 +242,32 @@ class RingWriter:
         self._count = layout.slot_count
         self._slot_words = _slot_headers(segment)
         self._columns = [
-            {column.name: np.ndarray((column.count,), column.dtype, slot, column.offset) for column in layout.slot}
+            {name: np.ndarray(*where[:2], slot, where[2]) for name, where in segment.slot_formats().items()}
             for slot in _slots(segment)
         ]
+        self._contents = [slot[_layout.SLOT.itemsize :] for slot in _slots(segment)]
+        self._statistics = self._words[_STATISTICS]
+        self._begun_ns = self._begun_cpu_ns = 0
         self.sequence = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
             segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
 
-    def begin(self) -> dict[str, npt.NDArray[Any]]:
+    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
         """The columns of the next slot, to be filled; they hold an old frame.
 
         Until ``commit``, readers of that old frame are told that it is gone.
+
+        Args:
+            from_last: copy the newest frame into it first, for writers that change parts only.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         slot = (self.sequence + 1) % self._count
+        self._begun_ns, self._begun_cpu_ns = now_ns(), time.thread_time_ns()
         self._slot_words[slot][_SEQUENCE] = 0
         fence()
+        if from_last and self.sequence:
+            self._contents[slot][:] = self._contents[self.sequence % self._count]
         return self._columns[slot]
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
@@ -268,14 +282,16 @@ class RingWriter:
         """
         sequence = self.sequence + 1
         words = self._slot_words[sequence % self._count]
+        published_ns = now_ns()
         words[_ACQUIRED] = acquired_ns
-        words[_PUBLISHED] = now_ns()
+        words[_PUBLISHED] = published_ns
         words[_FLAGS] = flags
         fence()
         words[_SEQUENCE] = sequence
         self._words[_LATEST] = sequence
         self.sequence = sequence
         self.wake()
+        self._note(published_ns, acquired_ns)
         return sequence
 
     def wake(self) -> None:
@@ -287,6 +303,23 @@ class RingWriter:
     def count_missed_periods(self, count: int) -> None:
         """Add to the number of periods that this writer missed, for everybody to see."""
         self._words[_MISSED_PERIODS] += count
+
+    def count_lateness(self, late_ns: int) -> None:
+        """Tell how late a period began."""
+        self._statistics[_LATENESS + bucket_of(late_ns)] += 1
+
+    def _note(self, published_ns: int, acquired_ns: int) -> None:
+        """Statistics of one publication, after the readers have been woken."""
+        words = self._statistics
+        words[_AGE + bucket_of(published_ns - acquired_ns)] += 1
+        words[_TIMED] = timed = words[_TIMED] + 1
+        cpu_ns = max(0, time.thread_time_ns() - self._begun_cpu_ns)  # another thread's, if that one commits
+        for first, value_ns in ((_WALL, published_ns - self._begun_ns), (_CPU, cpu_ns)):
+            if timed == 1 or value_ns < words[first]:
+                words[first] = value_ns
+            if value_ns > words[first + 1]:
+                words[first + 1] = value_ns
+            words[first + 2] += value_ns
 
     def set_state(self, state: int) -> None:
         """Replace the ``STATE_*`` bits and wake everybody."""

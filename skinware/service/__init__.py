@@ -1,6 +1,20 @@
-"""Named services: a writer that owns a name, readers that find it, lose it and find it again."""
+"""Named services: a writer that owns a name, readers that find it, lose it and find it again; requests and answers."""
 
+from skinware.memory.schema import Column, Schema
+from skinware.service._client import PendingRequest
 from skinware.service._reader import Position, ServiceReader
-from skinware.service._writer import DEFAULT_SLOTS, ServiceWriter
+from skinware.service._server import Request, RequestServer
+from skinware.service._writer import DEFAULT_SLOTS, Columns, ServiceWriter
 
-__all__ = ["DEFAULT_SLOTS", "Position", "ServiceReader", "ServiceWriter"]
+__all__ = [
+    "DEFAULT_SLOTS",
+    "Column",
+    "Columns",
+    "PendingRequest",
+    "Position",
+    "Request",
+    "RequestServer",
+    "Schema",
+    "ServiceReader",
+    "ServiceWriter",
+]

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 from collections.abc import Iterator
 from typing import Any, Generic, Self, TypeVar
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, Overrun, ServiceNotFound, ServiceTimeout, StructureChanged
+from skinware.errors import Closed, Overrun, PeerGone, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory import _layout, _segment
-from skinware.memory.announcement import Announcement, ReaderRecord
+from skinware.memory.announcement import ReaderRecord
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import Frame, RingReader
+from skinware.memory.schema import Schema
+from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
+from skinware.service._accounts import Accounts
+from skinware.service._client import PendingRequest, RequestClient
+from skinware.service._messages import ACQUIRE, OPERATIONS
 
-_ANNOUNCE_EVERY_NS = NS_PER_S // 4
 _MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
 
 Position = tuple[int, int]
@@ -56,17 +58,36 @@ class ServiceReader(Generic[F]):
     ) -> None:
         self.name = check_name(name, "service")
         self.namespace = namespace or Namespace()
-        self.frames_taken = 0
-        self.lost = 0
+        self._accounts = Accounts(self.namespace, name, announce)
+        self._client = RequestClient(self.namespace, name)
         self._last: Position | None = None
         self._closed = False
         self._moved = False
-        self._ring: RingReader[F] = self._attach_within(timeout_s)
-        self._announcement = Announcement(self.namespace, name) if announce else None
-        self._record = ReaderRecord(name, os.getpid(), os.path.basename(sys.argv[0] or sys.executable), "on demand")
-        self._announced_ns = self._announced_frames = 0
-        self._age_ns: int | None = None
-        self._announce()
+        try:
+            self._ring: RingReader[F] = self._attach_within(timeout_s)
+        except BaseException:
+            self._accounts.close()
+            raise
+
+    @property
+    def lost(self) -> int:
+        """Frames that were published since the first one that was taken, and that were not taken."""
+        return self._accounts.record.lost
+
+    @property
+    def statistics(self) -> ReaderRecord:
+        """What this reader has counted so far: frames, losses, times; what ``skin-info`` shows of it."""
+        return self._accounts.record
+
+    @property
+    def writer_statistics(self) -> WriterStatistics:
+        """What the writer of the generation that is being read tells of itself."""
+        return read_statistics(self._ring.segment.data)
+
+    @property
+    def schema(self) -> Schema:
+        """dtype, shape, unit and description of every column, and the service's own description."""
+        return self._ring.segment.schema
 
     @property
     def generation(self) -> int:
@@ -145,7 +166,7 @@ class ServiceReader(Generic[F]):
             alive = self._keep_up()
             if self._ring.latest:
                 frame = self._taken(self._ring.copy(), alive)
-                self._announce()
+                self._accounts.settle()
                 return frame
         alive = self._wait_for_newer(known, deadline_ns)
         return self._taken(self._ring.copy(), alive)
@@ -159,7 +180,7 @@ class ServiceReader(Generic[F]):
         """
         alive = self._keep_up()
         frame = self._taken(self._ring.view(), alive)
-        self._announce()
+        self._accounts.settle()
         yield frame
 
     def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
@@ -174,12 +195,14 @@ class ServiceReader(Generic[F]):
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         if rate_hz is None:
-            self._record.kind = "asap"
+            self._accounts.begin_loop("asap")
             while True:
                 yield self.read(newer_than=self._last, timeout_s=timeout_s)
-        self._record.kind = f"periodic {rate_hz:g} Hz"
+        self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
+            self._accounts.record.lateness.add(now_ns() - timer.deadline_ns + timer.period_ns)
+            self._accounts.record.missed_periods = timer.missed
             yield self.read(timeout_s=timeout_s)
 
     def __iter__(self) -> Iterator[F]:
@@ -194,12 +217,66 @@ class ServiceReader(Generic[F]):
         Raises:
             ServiceTimeout, StructureChanged, Closed: as ``read``.
         """
-        self._record.kind = "in order"
+        self._accounts.begin_loop("in order")
         timeout_ns = None if timeout_s is None else round(timeout_s * NS_PER_S)
         while True:
             deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
             alive = self._wait_for_newer(self._last, deadline_ns)
             yield self._taken(self._next_in_order(), alive)
+
+    def request(self, *, timeout_s: float = 5.0) -> F:
+        """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
+
+        Raises:
+            RequestTimeout: no answer in time.
+            RequestRefused: the service takes no requests.
+            Paused: it is paused.
+            PeerGone: its writer is dead, or died or was restarted meanwhile.
+            StructureChanged, Overrun, Closed: as ``read``.
+        """
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        answer = self.ask(ACQUIRE).result(timeout_s)
+        left_s = max(0.0, (deadline_ns - now_ns()) / NS_PER_S)
+        return self.read(newer_than=(answer.generation, answer.sequence - 1), timeout_s=left_s)
+
+    def call(self, operation: str, /, *, timeout_s: float = 5.0, **arguments: Any) -> Any:
+        """Have the writer do something that it declares (see ``operations``), and wait for the result.
+
+        Args:
+            operation: which.
+            timeout_s: longest wait.
+            arguments: of the operation, by name; anything that JSON can hold.
+
+        Raises:
+            RequestTimeout: no answer in time; the request is cancelled, but may have been carried out.
+            RequestRefused: unknown operation, or the service takes no requests.
+            RequestFailed: it went wrong; the message is the writer's.
+            Paused: the service is paused.
+            PeerGone: its writer is dead, or died or was restarted meanwhile.
+            Closed: this reader was closed.
+        """
+        return self.ask(operation, **arguments).result(timeout_s).result
+
+    def ask(self, operation: str, /, **arguments: Any) -> PendingRequest:
+        """Like ``call``, without waiting: the answer is picked up, or the request cancelled, later.
+
+        Raises:
+            RequestRefused, PeerGone, Closed: as ``call``.
+        """
+        if self._closed:
+            raise Closed(f"the reader of {self.name!r} was closed")
+        self._keep_up()
+        if not self.alive:
+            raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
+        return self._client.send(operation, arguments)
+
+    def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
+        """What ``call`` can ask for: descriptions by name.
+
+        Raises:
+            RequestTimeout, RequestRefused, PeerGone, Closed: as ``call``.
+        """
+        return dict(self.call(OPERATIONS, timeout_s=timeout_s))
 
     def reattach(self) -> None:
         """Go over to the present generation of the service, whatever its structure.
@@ -213,8 +290,8 @@ class ServiceReader(Generic[F]):
     def close(self) -> None:
         """Stop reading and take the announcement back. Frames that were handed out stay readable. Idempotent."""
         self._closed = True
-        if self._announcement is not None:
-            self._announcement.close()
+        self._accounts.close()
+        self._client.close()
         self._ring.segment.descriptor.close()
 
     # -- attaching ----------------------------------------------------------------------------------------------
@@ -242,7 +319,7 @@ class ServiceReader(Generic[F]):
 
     def _adopt(self, ring: RingReader[F]) -> None:
         if self._last is not None and self._last[0] == self._ring.generation:
-            self.lost += self._ring.latest - self._last[1]
+            self._accounts.record.lost += self._ring.latest - self._last[1]
             self._last = (ring.generation, 0)
         self._ring.segment.descriptor.close()
         self._ring = ring
@@ -291,7 +368,7 @@ class ServiceReader(Generic[F]):
                 wake_count = ring.wake_count
             latest = ring.latest
             if latest and (ring.generation, latest) != known:
-                self._announce()
+                self._accounts.settle()
                 return self.alive
             if self._moved:
                 raise StructureChanged(
@@ -300,7 +377,7 @@ class ServiceReader(Generic[F]):
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came())
-            self._announce()
+            self._accounts.settle()
             if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
                 return True
             look_around = True
@@ -329,35 +406,20 @@ class ServiceReader(Generic[F]):
                 if frame is not None:
                     return frame
             if latest == self._ring.latest:
+                self._accounts.record.overruns += 1
                 raise Overrun(f"no slot of {self.name!r} could be read; its writer may have died while filling one")
 
     def _taken(self, frame: F | None, alive: bool) -> F:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
         last = self._last
+        lost = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
-            self.lost += frame.sequence - last[1] - 1
+            lost = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
-        self.frames_taken += 1
-        if self._age_ns is None:
-            self._age_ns = frame.age_ns
         frame.stale = not alive
+        self._accounts.taken(frame, lost)
         return frame
-
-    def _announce(self) -> None:
-        time_ns = now_ns()
-        passed_ns = time_ns - self._announced_ns
-        if passed_ns < _ANNOUNCE_EVERY_NS or self._announcement is None:
-            return
-        record = self._record
-        if self._announced_ns:
-            record.rate_hz = round((self.frames_taken - self._announced_frames) * NS_PER_S / passed_ns, 2)
-        if self._age_ns is not None:
-            record.age_ms = round(self._age_ns / 1e6, 3)
-            self._age_ns = None
-        record.frames, record.lost = self.frames_taken, self.lost
-        self._announcement.write(record)
-        self._announced_ns, self._announced_frames = time_ns, self.frames_taken
 
     def __enter__(self) -> Self:
         return self

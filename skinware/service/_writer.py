@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Self
 
 import numpy.typing as npt
 
+from skinware.errors import Closed, Paused
 from skinware.memory import _layout, _segment
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import RingWriter
-from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware.memory.schema import Column, Schema
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
+from skinware.service._messages import ACQUIRE
+from skinware.service._server import Request, RequestServer
 
 DEFAULT_SLOTS = _layout.DEFAULT_SLOTS
 _FILE_CHECK_NS = NS_PER_S
+
+Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
+"""Of every array of a frame, by name: dtype and length, or dtype and shape, or all that is known of it."""
 
 
 class ServiceWriter:
@@ -23,13 +31,17 @@ class ServiceWriter:
 
     Args:
         name: unique in the namespace, 1 to 47 letters, digits, ``_`` or ``-``.
-        columns: (dtype, length) of every array of a frame.
+        columns: of every array of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
+            unit and a description. A dtype may be a structure.
         static: arrays that are written once and that readers find beside the ring.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         kind: says what the columns mean (``data``, ``driver``).
         slots: frames that the ring holds, 2 to 64.
         rate_hz: nominal rate, told to readers; None for no fixed rate.
         group: group whose members may read, if the namespace is made now.
+        description: of the service, for people.
+        operations: what programs may ask for beside a frame: name to function, called in the writer's own loop
+            (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
 
     Raises:
         NameInUse: a living writer has this name.
@@ -40,7 +52,7 @@ class ServiceWriter:
     def __init__(
         self,
         name: str,
-        columns: Mapping[str, tuple[npt.DTypeLike, int]],
+        columns: Columns,
         static: Mapping[str, npt.NDArray[Any]] | None = None,
         *,
         namespace: Namespace | None = None,
@@ -48,15 +60,20 @@ class ServiceWriter:
         slots: int = DEFAULT_SLOTS,
         rate_hz: float | None = None,
         group: str | None = None,
+        description: str = "",
+        operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
         self.name = check_name(name, "service")
         self.namespace = namespace or Namespace()
         self.missed_periods = 0
+        self._paused = False
         self._kind = kind
         self._slots = slots
         self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
-        self._columns = dict(columns)
+        self._schema = Schema.of(columns, description)
         self._static = dict(static or {})
+        self._operations = dict(operations or {})
+        self._server: RequestServer | None = None
         self.namespace.create(group)
         self._name_lock = _segment.take_name(self.namespace, name)
         try:
@@ -76,15 +93,35 @@ class ServiceWriter:
         """Sequence of the newest frame, 0 before the first."""
         return self._ring.sequence
 
-    def begin(self) -> dict[str, npt.NDArray[Any]]:
+    @property
+    def paused(self) -> bool:
+        """Whether ``pause`` was called last."""
+        return self._paused
+
+    def pause(self) -> None:
+        """Publish nothing until ``resume``; readers and requesters are told. From any thread."""
+        self._set_paused(True)
+
+    def resume(self) -> None:
+        """Go on after ``pause``. From any thread."""
+        self._set_paused(False)
+
+    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
         """Arrays of the next frame, to be filled in place; then ``commit``.
+
+        Args:
+            from_last: begin with the contents of the newest frame, to change parts of it only; otherwise the arrays
+                hold something old.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
+            Paused: it is paused.
         """
         if now_ns() >= self._next_file_check_ns:
             self._keep_file()
-        return self._ring.begin()
+        if self._paused:
+            raise Paused(f"service {self.name!r} is paused; call resume() first")
+        return self._ring.begin(from_last=from_last)
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish the frame: one system call wakes every reader.
@@ -98,35 +135,90 @@ class ServiceWriter:
         """
         return self._ring.commit(acquired_ns, flags)
 
-    def periodic(self, rate_hz: float) -> Iterator[dict[str, npt.NDArray[Any]]]:
+    def periodic(self, rate_hz: float, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
         """Yield the arrays of one frame per period, at absolute deadlines; publish when the loop comes back.
 
-        A loop body that takes too long misses periods (``missed_periods``); they are never made up for.
+        A loop body that takes too long misses periods (``missed_periods``); they are never made up for. While paused
+        nothing is yielded. Requests are carried out between two periods.
+
+        Args:
+            rate_hz: above 0.
+            from_last: as for ``begin``.
         """
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self.closed):
             if timer.missed > self.missed_periods:
                 self._ring.count_missed_periods(timer.missed - self.missed_periods)
                 self.missed_periods = timer.missed
+            waiting = self._carry_out(self.requests())
+            if self._paused:
+                continue
             acquired_ns = now_ns()
-            yield self.begin()
+            self._ring.count_lateness(acquired_ns - (timer.deadline_ns - timer.period_ns))
+            yield self.begin(from_last=from_last)
             self.commit(acquired_ns)
+            self._answer(waiting)
 
-    def restructure(
-        self, columns: Mapping[str, tuple[npt.DTypeLike, int]], static: Mapping[str, npt.NDArray[Any]]
-    ) -> None:
+    def on_request(self, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
+        """Yield the arrays of one frame whenever a program asks for one; publish when the loop comes back.
+
+        Several requests that wait at the same time are answered with the same frame.
+
+        Args:
+            from_last: as for ``begin``.
+        """
+        while not self.closed:
+            waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
+            if waiting and not self._paused:
+                acquired_ns = now_ns()
+                yield self.begin(from_last=from_last)
+                self.commit(acquired_ns)
+                self._answer(waiting)
+
+    def requests(self, timeout_s: float = 0.0) -> list[Request]:
+        """What programs ask for, for writers with a loop of their own; each wants its ``reply`` or ``fail``.
+
+        ``acquire`` asks for a frame whose acquisition begins now or later: publish it, then reply with
+        ``position=writer.position``. The first call makes the socket (:meth:`request_server`).
+
+        Args:
+            timeout_s: longest wait for one.
+        """
+        return self.request_server().take(timeout_s)
+
+    def request_server(self) -> RequestServer:
+        """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
+
+        Raises:
+            Closed: this writer was closed.
+            NamespaceError: the socket cannot be made.
+        """
+        if self.closed:
+            raise Closed(f"the writer of {self.name!r} was closed")
+        if self._server is None:
+            described = {name: _first_line(function) for name, function in self._operations.items()}
+            self._server = RequestServer(self.namespace, self.name, described)
+            self._server.paused = self._paused
+        return self._server
+
+    @property
+    def position(self) -> tuple[int, int]:
+        """(generation, sequence) of the newest frame."""
+        return self.generation, self.sequence
+
+    def restructure(self, columns: Columns, static: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
         """Go on under the same name with other columns, as a new generation; readers are told.
 
         Raises:
             ConfigurationError: columns that the format cannot hold; the old generation then goes on.
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        before = self._columns, self._static
-        self._columns, self._static = dict(columns), dict(static)
+        before = self._schema, self._static
         try:
+            self._schema, self._static = Schema.of(columns, self._schema.description), dict(static or {})
             ring = self._new_generation()
         except BaseException:
-            self._columns, self._static = before
+            self._schema, self._static = before
             raise
         self._ring.segment.descriptor.close()
         self._ring = ring
@@ -143,17 +235,55 @@ class ServiceWriter:
         path = self.namespace.ring_path(self.name)
         if _segment.current_inode(self.namespace, self.name) == self._ring.segment.inode:
             path.unlink()
+        if self._server is not None:
+            self._server.close()
         self._ring.set_state(_layout.STATE_CLOSED)
         self._ring.segment.descriptor.close()
         self._name_lock.close()
 
     def _new_generation(self) -> RingWriter:
-        layout = _layout.plan(self._static, self._columns, self._slots)
         segment = _segment.create(
-            self.namespace, self.name, layout, self._static, kind=self._kind, period_ns=self._period_ns
+            self.namespace,
+            self.name,
+            self._schema,
+            self._static,
+            slots=self._slots,
+            kind=self._kind,
+            period_ns=self._period_ns,
         )
         self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
-        return RingWriter(segment)
+        ring = RingWriter(segment)
+        if self._paused:
+            ring.set_state(_layout.STATE_PAUSED)
+        return ring
+
+    def _set_paused(self, paused: bool) -> None:
+        self._paused = paused
+        self._ring.set_state(_layout.STATE_PAUSED if paused else 0)
+        if self._server is not None:
+            self._server.paused = paused
+
+    def _carry_out(self, requests: list[Request]) -> list[Request]:
+        """Do what is asked for; returns those that want a frame."""
+        waiting = []
+        for request in requests:
+            if request.operation == ACQUIRE:
+                waiting.append(request)
+                continue
+            try:
+                result = self._operations[request.operation](**request.arguments)
+            except Exception as error:  # noqa: BLE001
+                request.fail(f"{request.operation}: {error}")
+            else:
+                request.reply(result, self.position)
+        if self._paused:
+            for request in waiting:
+                request.fail("the service is paused", "paused")
+        return waiting
+
+    def _answer(self, waiting: list[Request]) -> None:
+        for request in waiting:
+            request.reply(position=self.position)
 
     def _keep_file(self) -> None:
         """Notice, once a second, that somebody removed our file, and make it again."""
@@ -165,6 +295,10 @@ class ServiceWriter:
             self._ring.set_state(_layout.STATE_SUPERSEDED)
             self._ring.segment.descriptor.close()
             self._ring = ring
+            if self._server is not None:
+                self._server.close()
+                self._server = None
+                self.request_server()
 
     def __enter__(self) -> Self:
         return self
@@ -174,3 +308,7 @@ class ServiceWriter:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r} in {self.namespace.name!r}, sequence {self.sequence}>"
+
+
+def _first_line(function: Callable[..., object]) -> str:
+    return (inspect.getdoc(function) or "").partition("\n")[0]

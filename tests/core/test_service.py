@@ -26,6 +26,7 @@ from skinware.memory import _fences, _layout, _segment
 from skinware.memory import ring as ring_module
 from skinware.memory.announcement import living_readers
 from skinware.memory.ring import RingReader, RingWriter
+from skinware.memory.schema import Schema
 from tests.conftest import wait_until
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -145,7 +146,7 @@ def test_losses_are_counted_exactly() -> None:
         for value in range(2, 12):
             publish(writer, value)
         frame = reader.read()
-        assert (frame.sequence, reader.frames_taken, reader.lost) == (11, 2, 9)
+        assert (frame.sequence, reader.statistics.frames, reader.lost) == (11, 2, 9)
         assert reader.read().sequence == 11
         assert reader.lost == 9
 
@@ -411,7 +412,7 @@ def ring_file(namespace: Namespace) -> bytes:
         (lambda d: d[:8] + b"\x09\0\0\0" + d[12:], "layout version 9"),
         (lambda d: d[:44] + b"\xff\xff\0\0" + d[48:], "make no ring"),
         (lambda d: d[:40] + b"\xff\xff\0\0" + d[44:], "columns do not fit"),
-        (lambda d: d[: 576 + 32] + b"\xff" * 8 + d[576 + 40 :], "column"),
+        (lambda d: d[: 1152 + 32] + b"\xff" * 8 + d[1152 + 40 :], "column"),
     ],
 )
 def test_damaged_files_are_refused(namespace: Namespace, damage: Callable[[bytes], bytes], words: str) -> None:
@@ -477,8 +478,7 @@ def test_a_folder_that_cannot_be_trusted_is_refused(namespace: Namespace) -> Non
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.create()
     lock = _segment.take_name(namespace, "x")
-    layout = _layout.plan({}, SMALL, 2)
-    segment = _segment.create(namespace, "x", layout, {}, kind="data", period_ns=0)
+    segment = _segment.create(namespace, "x", Schema.of(SMALL, ""), {}, slots=2, kind="data", period_ns=0)
     writer = RingWriter(segment)
     reader = RingReader(_segment.attach(namespace, "x"), Frame)
     writer._half_words[_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF

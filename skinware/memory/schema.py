@@ -1,0 +1,153 @@
+"""What the columns of a service look like to its users: dtypes with fields, shapes, units; told by the service itself.
+
+The file's column table knows plain numbers and bytes only. What goes beyond it stands in a static column ``schema``,
+as JSON: ``{"description": TEXT, "columns": {NAME: {"dtype": D, "shape": [...], "unit": TEXT, "description": TEXT}}}``,
+with D a dtype code (``"<f8"``) or a list of ``[name, D]`` or ``[name, D, shape]`` for a structure, as numpy's ``.npy``
+format has it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadServiceFile, ConfigurationError
+from skinware.memory._layout import Layout
+
+STATIC_NAME = "schema"
+_MAX_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Column:
+    """One named array of a frame.
+
+    Attributes:
+        dtype: numbers, fixed-length bytes, or a structure of them.
+        shape: of the array in every frame.
+        unit: of the numbers, for people.
+        description: for people.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """All columns of a service's frames.
+
+    Attributes:
+        columns: by name.
+        description: of the service, for people.
+    """
+
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    description: str = ""
+
+    @staticmethod
+    def of(columns: Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]], description: str) -> Schema:
+        """A schema from what a person wrote.
+
+        Raises:
+            ConfigurationError: a dtype or shape that cannot be shared.
+        """
+        made: dict[str, Column] = {}
+        for name, given in columns.items():
+            column = given if isinstance(given, Column) else _column(*given)
+            if column.dtype.hasobject or column.dtype.itemsize == 0 or any(n < 0 for n in column.shape):
+                raise ConfigurationError(
+                    f"column {name!r} of {column.dtype} and shape {column.shape}: give numbers, fixed-length bytes or"
+                    " structures of them (Python objects cannot be shared), and a shape of numbers from 0 on"
+                )
+            made[name] = column
+        return Schema(made, description)
+
+    def for_layout(self) -> dict[str, tuple[npt.DTypeLike, int]]:
+        """(dtype, count) of every column, as the column table has it."""
+        return {name: (_table_dtype(c.dtype), math.prod(c.shape)) for name, c in self.columns.items()}
+
+    def for_file(self) -> dict[str, npt.NDArray[Any]]:
+        """The static column that says what the column table cannot; none if it can say everything."""
+        if not self.description and all(
+            c.dtype == _table_dtype(c.dtype) and len(c.shape) == 1 and not c.unit and not c.description
+            for c in self.columns.values()
+        ):
+            return {}
+        columns = {
+            name: {"dtype": _descr(c.dtype), "shape": c.shape, "unit": c.unit, "description": c.description}
+            for name, c in self.columns.items()
+        }
+        text = msgspec.json.encode({"description": self.description, "columns": columns})
+        if len(text) > _MAX_BYTES:
+            raise ConfigurationError(f"the schema takes {len(text)} bytes; at most {_MAX_BYTES}: shorten its texts")
+        return {STATIC_NAME: np.frombuffer(text, np.uint8)}
+
+
+class _ColumnText(msgspec.Struct):
+    dtype: Any
+    shape: tuple[int, ...]
+    unit: str = ""
+    description: str = ""
+
+
+class _SchemaText(msgspec.Struct):
+    columns: dict[str, _ColumnText]
+    description: str = ""
+
+
+def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
+    """The schema of an attached file.
+
+    Raises:
+        BadServiceFile: its schema contradicts its column table, or cannot be read.
+    """
+    columns = {c.name: Column(c.dtype, (c.count,)) for c in layout.slot}
+    if STATIC_NAME not in static:
+        return Schema(columns)
+    try:
+        text = msgspec.json.decode(static[STATIC_NAME].tobytes(), type=_SchemaText)
+        told = {
+            name: Column(np.lib.format.descr_to_dtype(_tuples(c.dtype)), c.shape, c.unit, c.description)
+            for name, c in text.columns.items()
+        }
+    except (msgspec.DecodeError, ValueError, TypeError, RecursionError) as error:
+        raise BadServiceFile(f"{path}: its schema cannot be read ({error}); not attached") from None
+    for name, column in told.items():
+        plain = columns.get(name)
+        if (
+            plain is None
+            or column.dtype.hasobject
+            or any(n < 0 for n in column.shape)
+            or column.dtype.itemsize * math.prod(column.shape) != plain.dtype.itemsize * math.prod(plain.shape)
+        ):
+            raise BadServiceFile(f"{path}: its schema contradicts its column table at {name!r}; not attached")
+    return Schema({**columns, **told}, text.description)
+
+
+def _column(dtype: npt.DTypeLike, shape: int | tuple[int, ...]) -> Column:
+    return Column(np.dtype(dtype), (shape,) if isinstance(shape, int) else tuple(shape))
+
+
+def _table_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The dtype itself where the column table knows it; otherwise as many bytes."""
+    return dtype if dtype.names is None and dtype.subdtype is None else np.dtype(f"V{dtype.itemsize}")
+
+
+def _descr(dtype: np.dtype[Any]) -> Any:
+    return np.lib.format.dtype_to_descr(dtype)
+
+
+def _tuples(descr: Any) -> Any:
+    """What JSON made lists of becomes tuples again, as numpy wants it."""
+    if isinstance(descr, list):
+        return [(f[0], _tuples(f[1]), *(tuple(shape) for shape in f[2:])) for f in descr]
+    return descr

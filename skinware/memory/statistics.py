@@ -1,0 +1,112 @@
+"""Figures that everybody may see: how long things took, as extremes, means and histograms."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.memory import _layout
+
+BUCKETS = _layout.HISTOGRAM_BUCKETS
+
+
+def bucket_of(value_ns: int) -> int:
+    """The bucket of a histogram that a time falls into."""
+    return min(value_ns.bit_length(), BUCKETS - 1) if value_ns > 0 else 0
+
+
+class Spread(msgspec.Struct):
+    """How long something took.
+
+    Attributes:
+        count: how often it was timed.
+        best_ns, worst_ns: extremes; 0 as long as ``count`` is.
+        total_ns: sum.
+    """
+
+    count: int = 0
+    best_ns: int = 0
+    worst_ns: int = 0
+    total_ns: int = 0
+
+    @property
+    def mean_ns(self) -> float:
+        """Mean, 0 as long as ``count`` is."""
+        return self.total_ns / self.count if self.count else 0.0
+
+    def add(self, value_ns: int) -> None:
+        """Count one."""
+        if value_ns > self.worst_ns:
+            self.worst_ns = value_ns
+        if value_ns < self.best_ns or not self.count:
+            self.best_ns = value_ns
+        self.count += 1
+        self.total_ns += value_ns
+
+
+class Histogram(msgspec.Struct):
+    """Times in buckets that double: bucket k counts 2**(k-1) to 2**k - 1 ns, the last one all above.
+
+    Attributes:
+        counts: one per bucket.
+    """
+
+    counts: list[int] = msgspec.field(default_factory=lambda: [0] * BUCKETS)
+
+    @property
+    def total(self) -> int:
+        """How many were counted."""
+        return sum(self.counts)
+
+    def add(self, value_ns: int) -> None:
+        """Count one."""
+        self.counts[bucket_of(value_ns)] += 1
+
+    def quantile_ns(self, fraction: float) -> int | None:
+        """A bound that this fraction of the times does not exceed (up to twice the true one); None without any."""
+        wanted, seen = fraction * self.total, 0
+        for bucket, count in enumerate(self.counts):
+            seen += count
+            if count and seen >= wanted:
+                return (1 << bucket) - 1
+        return None
+
+
+class WriterStatistics(msgspec.Struct):
+    """What a writer tells of one generation of its service.
+
+    Attributes:
+        published: frames.
+        missed_periods: periods that passed unused.
+        wall: from ``begin`` to ``commit``.
+        cpu: of it, on a processor.
+        age: how old the newest data of a frame was when it was published.
+        lateness: how late its periods began (periodic writers).
+    """
+
+    published: int
+    missed_periods: int
+    wall: Spread
+    cpu: Spread
+    age: Histogram
+    lateness: Histogram
+
+
+def read_statistics(data: npt.NDArray[np.uint8]) -> WriterStatistics:
+    """The statistics in a mapped service file."""
+    words = data[_layout.STATISTICS_OFFSET :][: _layout.STATISTICS.itemsize].view(_layout.STATISTICS)[0].copy()
+    control = data[_layout.CONTROL_OFFSET :][: _layout.CONTROL.itemsize].view(_layout.CONTROL)[0]
+    timed = int(words["timed"])
+
+    def spread(what: str) -> Spread:
+        return Spread(timed, *(int(words[f"{what}_{which}_ns"]) for which in ("best", "worst", "total")))
+
+    return WriterStatistics(
+        int(control["latest"]),
+        int(control["missed_periods"]),
+        spread("wall"),
+        spread("cpu"),
+        Histogram(words["age"].tolist()),
+        Histogram(words["lateness"].tolist()),
+    )

@@ -1,0 +1,211 @@
+"""The other end of requests: ask a service for something, and never take an old answer for a new one."""
+
+from __future__ import annotations
+
+import itertools
+import select
+import socket
+from typing import Any
+
+import msgspec
+
+from skinware.errors import (
+    Paused,
+    PeerGone,
+    RequestCancelled,
+    RequestError,
+    RequestFailed,
+    RequestRefused,
+    RequestTimeout,
+)
+from skinware.memory._locks import ForkGuard
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
+from skinware.service._messages import CANCEL, MAX_PACKET, Answer, Ask
+from skinware.service._server import short_path
+
+_ERRORS: dict[str, type[Exception]] = {
+    "refused": RequestRefused,
+    "failed": RequestFailed,
+    "paused": Paused,
+    "cancelled": RequestCancelled,
+}
+
+
+class PendingRequest:
+    """A request that was sent. Not for several threads at once.
+
+    Attributes:
+        operation: what was asked for.
+    """
+
+    def __init__(self, client: RequestClient, connection: socket.socket, number: int, operation: str) -> None:
+        self.operation = operation
+        self._client = client
+        self._connection = connection
+        self._id = number
+        self._answer: Answer | RequestError | None = None
+
+    def done(self) -> bool:
+        """Whether ``result`` comes at once."""
+        self._client.listen(0.0)
+        return self._answer is not None
+
+    def result(self, timeout_s: float) -> Answer:
+        """Wait for the answer.
+
+        Raises:
+            RequestTimeout: none came in time; the request is then cancelled.
+            Paused, RequestRefused, RequestFailed, RequestCancelled: what the service answered.
+            PeerGone: the service died, was closed or restarted meanwhile.
+        """
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        while not self.done():
+            remaining_ns = deadline_ns - now_ns()
+            self._client.listen(max(0, min(remaining_ns, WAIT_SLICE_NS)) / NS_PER_S)
+            if remaining_ns <= 0 and not self.done():
+                self.cancel()
+                raise RequestTimeout(
+                    f"{self._client.name}: no answer to {self.operation!r} within {timeout_s:g} s; its writer lives"
+                    " but does not take requests now (busy, hung or stopped)"
+                )
+        answer = self._answer
+        if answer is None or isinstance(answer, RequestError):
+            raise answer or RequestError("no answer")
+        if answer.error is not None:
+            raise _ERRORS.get(answer.why, RequestFailed)(f"{self._client.name}: {answer.error}")
+        return answer
+
+    def cancel(self) -> None:
+        """Take it back; what was begun may still be carried out. Nothing happens if it was answered."""
+        if self._answer is None:
+            self._answer = RequestCancelled(f"{self._client.name}: {self.operation!r} was cancelled")
+            self._client.forget(self._connection, self._id)
+
+    def deliver(self, answer: Answer | RequestError) -> None:
+        """Called by the client."""
+        if self._answer is None:
+            self._answer = answer
+
+
+class RequestClient(ForkGuard):
+    """A connection to one service, made when it is first needed and again after the service's return.
+
+    Args:
+        namespace: where the service is.
+        name: of the service.
+    """
+
+    def __init__(self, namespace: Namespace, name: str) -> None:
+        super().__init__()
+        self.name = name
+        self._namespace = namespace
+        self._connection: socket.socket | None = None
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, PendingRequest] = {}
+
+    def send(self, operation: str, arguments: dict[str, Any]) -> PendingRequest:
+        """Ask for something.
+
+        Raises:
+            RequestRefused: the service takes no requests, or the arguments cannot be sent.
+            PeerGone: its writer is dead.
+        """
+        ask = Ask(next(self._numbers), operation, arguments)
+        try:
+            packet = msgspec.json.encode(ask)
+        except TypeError as error:
+            raise RequestRefused(f"{self.name}: the arguments of {operation!r} cannot be sent: {error}") from None
+        if len(packet) > MAX_PACKET:
+            raise RequestRefused(f"{self.name}: a request of {len(packet)} bytes; at most {MAX_PACKET}")
+        self.listen(0.0)  # notices a hang-up
+        connection = self._connection or self._connect()
+        try:
+            connection.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except BlockingIOError:
+            raise RequestTimeout(f"{self.name}: its writer has not taken the requests before this one") from None
+        except OSError:
+            self._lose()
+            raise PeerGone(f"{self.name}: its writer died or was closed") from None
+        pending = PendingRequest(self, connection, ask.id, operation)
+        self._pending[ask.id] = pending
+        return pending
+
+    def listen(self, timeout_s: float) -> None:
+        """Take the answers that have come, waiting for the first."""
+        connection = self._connection
+        if connection is None:
+            return
+        poll = select.poll()
+        poll.register(connection, select.POLLIN)
+        while poll.poll(timeout_s * 1000):
+            timeout_s = 0.0
+            try:
+                packet = connection.recv(MAX_PACKET)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            try:
+                answer = msgspec.json.decode(packet, type=Answer) if packet else None
+            except msgspec.DecodeError:
+                answer = None
+            if answer is None:
+                self._lose()
+                return
+            pending = self._pending.pop(answer.id, None)  # None: cancelled, or too late
+            if pending is not None:
+                pending.deliver(answer)
+
+    def forget(self, connection: socket.socket, number: int) -> None:
+        """Take a request back."""
+        if self._pending.pop(number, None) is None or connection is not self._connection:
+            return
+        try:
+            packet = msgspec.json.encode(Ask(number, CANCEL))
+            connection.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except BlockingIOError:
+            pass  # its answer will find nobody
+        except OSError:
+            self._lose()
+
+    def close(self) -> None:
+        """Hang up. Idempotent."""
+        self._lose()
+
+    def abandon(self) -> None:
+        """See :class:`skinware.memory._locks.ForkGuard`."""
+        self._lose()
+
+    def _connect(self) -> socket.socket:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+        connection.setblocking(False)
+        try:
+            with short_path(self._namespace.socket_path(self.name)) as path:
+                connection.connect(path)
+        except FileNotFoundError:
+            connection.close()
+            raise RequestRefused(f"service {self.name!r} takes no requests") from None
+        except ConnectionRefusedError:
+            connection.close()
+            raise PeerGone(f"the writer of {self.name!r} is dead") from None
+        except BlockingIOError:
+            connection.close()
+            raise RequestTimeout(f"{self.name}: too many programs wait to be heard by its writer") from None
+        except PermissionError:
+            connection.close()
+            raise RequestRefused(
+                f"you may not send requests to {self.name!r}: only its owner and the namespace's group may"
+            ) from None
+        self._connection = connection
+        return connection
+
+    def _lose(self) -> None:
+        connection, self._connection = self._connection, None
+        pending, self._pending = self._pending, {}
+        if connection is not None:
+            connection.close()
+        for request in pending.values():
+            request.deliver(
+                PeerGone(f"{self.name}: its writer died or was restarted; {request.operation!r} may not have been done")
+            )

@@ -1,0 +1,48 @@
+"""What goes over a service's request socket: one JSON object per packet."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+MAX_PACKET = 1 << 16
+ACQUIRE = "acquire"
+"""Operation of every service: publish a frame whose acquisition begins after the request was received."""
+OPERATIONS = "operations"
+"""Operation of every service: the operations that it declares, by name, with a description each."""
+CANCEL = "cancel"
+"""Not an operation: takes the request of the same id back."""
+
+
+class Ask(msgspec.Struct):
+    """From a program to a service.
+
+    Attributes:
+        id: unique on this connection.
+        operation: what to do.
+        arguments: by name.
+    """
+
+    id: int
+    operation: str
+    arguments: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class Answer(msgspec.Struct):
+    """From a service to a program.
+
+    Attributes:
+        id: of the request.
+        generation, sequence: a frame that was published after the request was carried out; 0: none was.
+        result: what the operation returned.
+        error: what went wrong, None if nothing did.
+        why: kind of error.
+    """
+
+    id: int
+    generation: int = 0
+    sequence: int = 0
+    result: Any = None
+    error: str | None = None
+    why: Literal["", "refused", "failed", "paused", "cancelled"] = ""

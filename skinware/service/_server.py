@@ -1,0 +1,218 @@
+"""The writer's end of requests: a socket beside the ring that never waits for a peer."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from skinware.errors import NamespaceError
+from skinware.memory._locks import ForkGuard
+from skinware.memory.namespace import Namespace
+from skinware.service._messages import ACQUIRE, CANCEL, MAX_PACKET, OPERATIONS, Answer, Ask
+
+_MAX_PEERS = 64
+_PACKETS_PER_TURN = 256
+
+
+class Request:
+    """One request that waits for its answer: ``reply`` or ``fail``, once.
+
+    Attributes:
+        operation: what is asked for.
+        arguments: by name.
+        cancelled: nobody waits for the answer any more.
+    """
+
+    def __init__(self, server: RequestServer, peer: socket.socket, ask: Ask) -> None:
+        self.operation = ask.operation
+        self.arguments = ask.arguments
+        self.cancelled = False
+        self._server = server
+        self._peer = peer
+        self._id = ask.id
+
+    def reply(self, result: Any = None, position: tuple[int, int] = (0, 0)) -> None:
+        """Answer it.
+
+        Args:
+            result: anything that JSON can hold.
+            position: (generation, sequence) of the frame that goes with it.
+        """
+        try:
+            self._send(Answer(self._id, *position, result=result))
+        except TypeError as error:
+            self.fail(f"its result cannot be sent: {error}")
+
+    def fail(self, error: str, why: str = "failed") -> None:
+        """Answer that it went wrong (``failed``), or is not done at all (``refused``, ``paused``)."""
+        self._send(Answer(self._id, error=error, why=why))  # type: ignore[arg-type]
+
+    def _send(self, answer: Answer) -> None:
+        self._server.answer(self._peer, self._id, None if self.cancelled else answer)
+
+
+class RequestServer(ForkGuard):
+    """Takes requests for one service. Nothing here blocks; a peer that does not read its answers is dropped.
+
+    Args:
+        namespace: where the service is.
+        name: of the service; the caller owns it.
+        operations: descriptions of the operations that the service declares.
+
+    Raises:
+        NamespaceError: the socket cannot be made.
+    """
+
+    def __init__(self, namespace: Namespace, name: str, operations: Mapping[str, str]) -> None:
+        super().__init__()
+        self.operations = dict(operations)
+        self.paused = False
+        self._path = namespace.socket_path(name)
+        self._peers: dict[int, socket.socket] = {}
+        self._open: dict[tuple[int, int], Request] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
+        self._epoll = select.epoll()
+        temporary = namespace.path / f".{name}.sock"
+        try:
+            with short_path(temporary) as path:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(path)
+                self._listener.bind(path)
+                os.chmod(path, 0o660)
+                self._listener.listen(_MAX_PEERS)
+            self._listener.setblocking(False)
+            self._epoll.register(self._listener, select.EPOLLIN)
+            os.rename(temporary, self._path)
+        except OSError as error:
+            self.abandon()
+            raise NamespaceError(f"cannot make the request socket {self._path}: {error.strerror}") from None
+
+    def fileno(self) -> int:
+        """Readable when ``take`` has something to do; -1 once closed."""
+        return -1 if self._epoll.closed else self._epoll.fileno()
+
+    def take(self, timeout_s: float = 0.0) -> list[Request]:
+        """The requests that have arrived.
+
+        Args:
+            timeout_s: longest wait for one.
+        """
+        found: list[Request] = []
+        if self._epoll.closed:
+            return found
+        for fd, _ in self._epoll.poll(timeout_s):
+            if fd == self._listener.fileno():
+                self._accept()
+            elif fd in self._peers:
+                found += self._hear(self._peers[fd])
+        return [request for request in found if not request.cancelled]
+
+    def answer(self, peer: socket.socket, number: int, answer: Answer | None) -> None:
+        """Send an answer, once; None: nobody waits for it."""
+        if self._open.pop((peer.fileno(), number), None) is None or answer is None:
+            return
+        packet = msgspec.json.encode(answer)
+        if len(packet) > MAX_PACKET:
+            text = f"the answer takes {len(packet)} bytes; at most {MAX_PACKET}"
+            packet = msgspec.json.encode(Answer(number, error=text, why="failed"))
+        try:
+            peer.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except OSError:
+            self._drop(peer)
+
+    def close(self) -> None:
+        """Take no more requests; those that wait are told by the hang-up. Idempotent."""
+        if not self._epoll.closed:
+            with contextlib.suppress(FileNotFoundError):
+                self._path.unlink()
+        self.abandon()
+
+    def abandon(self) -> None:
+        """See :class:`skinware.memory._locks.ForkGuard`."""
+        for peer in self._peers.values():
+            peer.close()
+        self._peers, self._open = {}, {}
+        self._listener.close()
+        self._epoll.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                peer, _ = self._listener.accept()
+            except OSError:
+                return
+            if len(self._peers) >= _MAX_PEERS:
+                peer.close()
+                continue
+            peer.setblocking(False)
+            self._peers[peer.fileno()] = peer
+            self._epoll.register(peer, select.EPOLLIN)
+
+    def _hear(self, peer: socket.socket) -> list[Request]:
+        found: list[Request] = []
+        for _ in range(_PACKETS_PER_TURN):  # one peer that never stops asking must not hold up the others
+            try:
+                packet = peer.recv(MAX_PACKET)
+            except BlockingIOError:
+                return found
+            except OSError:
+                packet = b""
+            try:
+                ask = msgspec.json.decode(packet, type=Ask) if packet else None
+            except msgspec.DecodeError:
+                ask = None
+            if ask is None:  # it hung up, or speaks nonsense
+                self._drop(peer)
+                return found
+            request = self._received(peer, ask)
+            if request is not None:
+                found.append(request)
+        return found
+
+    def _received(self, peer: socket.socket, ask: Ask) -> Request | None:
+        key = peer.fileno(), ask.id
+        if ask.operation == CANCEL:
+            if key in self._open:
+                self._open[key].cancelled = True
+                self.answer(peer, ask.id, Answer(ask.id, error="cancelled", why="cancelled"))
+            return None
+        request = self._open[key] = Request(self, peer, ask)
+        if ask.operation == OPERATIONS:
+            request.reply(self.operations)
+        elif self.paused:
+            request.fail("the service is paused", "paused")
+        elif ask.operation != ACQUIRE and ask.operation not in self.operations:
+            there_are = ", ".join(self.operations) or "none"
+            request.fail(f"no operation {ask.operation!r}; there are: {there_are}", "refused")
+        else:
+            return request
+        return None
+
+    def _drop(self, peer: socket.socket) -> None:
+        fd = peer.fileno()
+        if self._peers.pop(fd, None) is None:
+            return
+        for key in [key for key in self._open if key[0] == fd]:
+            self._open.pop(key).cancelled = True
+        self._epoll.unregister(fd)
+        peer.close()
+
+
+class short_path:  # noqa: N801
+    """A name for a path that fits into a socket address, whose 107 bytes are soon full: by way of its open folder."""
+
+    def __init__(self, path: os.PathLike[str]) -> None:
+        folder, self._name = os.path.split(os.fspath(path))
+        self._fd = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+
+    def __enter__(self) -> str:
+        return f"/proc/self/fd/{self._fd}/{self._name}"
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._fd)

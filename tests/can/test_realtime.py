@@ -101,10 +101,10 @@ def one_cpu_group() -> Iterator[Path]:
 
 
 @needs_lab
-@pytest.mark.parametrize("cpus", ["1", "0-1"])  # the kernel refuses the first, and silently gives the second CPU 0
-def test_cpus_outside_the_control_group_are_refused(one_cpu_group: Path, cpus: str) -> None:
+def test_cpus_outside_the_control_group_are_refused(one_cpu_group: Path) -> None:
+    """The kernel itself refuses only those who ask for none of the group's CPUs; the others get fewer in silence."""
     into_group = ["sh", "-c", f'echo $$ > {one_cpu_group}/cgroup.procs && exec "$@"', "sh"]
-    told, (warning,) = result_of([*into_group, *command("fifo:50", cpus=cpus)])
+    told, (warning,) = result_of([*into_group, *command("fifo:50", cpus="0-1")])
     assert "outside the CPU set of this process's container or service, which may use 0;" in warning
     assert told["refused"] == [warning]
     assert told["cpus"] == [0]

@@ -23,6 +23,10 @@ class PlatformError(SkinwareError):
     """This machine lacks something the core cannot do without (memory fences, /dev/shm)."""
 
 
+class RealtimeRefused(SkinwareError):
+    """A real-time profile was not granted in full; one line for each thing says why, and how to get it."""
+
+
 class ServiceError(SkinwareError):
     """Base of what can happen between the writer and the readers of a service."""
 

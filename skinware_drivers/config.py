@@ -4,6 +4,8 @@
 
     driver = "roboskin"
     name = "torso"
+    realtime = "fifo:50"
+    cpus = [1]
 
     [options]               # of every bus
     period_ms = 50
@@ -24,6 +26,7 @@ import msgspec
 import msgspec.structs
 
 from skinware.errors import ConfigurationError
+from skinware.realtime import Profile
 from skinware_drivers.options import nearest_name
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -37,13 +40,24 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole file."""
+    """A whole file.
+
+    Attributes:
+        realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
+        cpus: CPUs to stay on; empty for any.
+    """
 
     driver: str = ""
     name: str = ""
     listen_only: bool = False
+    realtime: str | None = None
+    cpus: tuple[int, ...] = ()
     options: dict[str, Any] = {}
     bus: tuple[BusConfig, ...] = ()
+
+    def __post_init__(self) -> None:
+        # refused here, the message names the file
+        Profile.from_text("normal" if self.realtime is None else self.realtime, cpus=self.cpus)
 
 
 def read_config(path: Path) -> DriverConfig:

@@ -17,6 +17,9 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.config import DriverConfig
     from skinware_drivers.runner import Runner
@@ -52,6 +55,8 @@ class DriverCommand(click.Command):
 @click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
 @click.option("--slots", type=int, default=8, show_default=True, help="Frames that slow users may lag behind, 2-64.")
 @click.option("--group", metavar="GROUP", help="Group whose members may read, if the namespace is new.")
+@click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
+@click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
 @namespace_option
 @json_option
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
@@ -63,6 +68,8 @@ def command(
     listen_only: bool,
     slots: int,
     group: str | None,
+    realtime: str | None,
+    cpus: str | None,
     namespace: str | None,
     as_json: bool,
     verbose: bool,
@@ -75,6 +82,7 @@ def command(
     skin-driver --bus virtual                  emulated ones, no hardware needed
     skin-driver --bus can0 --boards 7,8,9,10   only these boards
     skin-driver --bus can0 --listen-only       send nothing
+    skin-driver --bus can0 --realtime fifo:50  real-time scheduling, where this user may have it
 
     SIGHUP makes a listener take in what it has heard since it started.
     """
@@ -87,6 +95,7 @@ def command(
         level=logging.INFO if verbose else logging.WARNING, format="skin-driver: %(message)s", stream=sys.stderr
     )
     settings = _read(str(config)) if config else DriverConfig()
+    profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
     driver_type = driver_name or settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
     listen_only = listen_only or settings.listen_only
@@ -109,6 +118,8 @@ def command(
         group=group,
         on_ready=lambda: _tell_ready(runner, as_json),
     )
+    if profile is not None:
+        profile.apply()
     asyncio.run(_run(runner, as_json))
 
 
@@ -155,6 +166,16 @@ def _tell_ready(runner: Runner, as_json: bool) -> None:
             f"{runner.name}: {counts['patches']} patches, {counts['modules']} modules, {counts['sensors']} sensors"
             f" on {', '.join(buses)}; publishing (skin-top shows them, Ctrl-C ends)"
         )
+
+
+def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:
+    """The real-time profile that was asked for; CPUs alone ask for the normal one."""
+    from skinware.realtime import Profile, cpus_from_text
+
+    chosen = configured_cpus if cpus is None else cpus_from_text(cpus)
+    if realtime is None and not chosen:
+        return None
+    return Profile.from_text("normal" if realtime is None else realtime, cpus=chosen)
 
 
 def _options(driver: type[AnyAdapter], settings: DriverConfig, bus_name: str, given: dict[str, str]) -> Any:

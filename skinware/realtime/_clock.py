@@ -1,4 +1,4 @@
-"""Time and periods: CLOCK_MONOTONIC in int64 ns, and loops that keep absolute deadlines."""
+"""CLOCK_MONOTONIC in int64 ns, and loops that keep absolute deadlines."""
 
 from __future__ import annotations
 

@@ -12,19 +12,21 @@ Read a skin without knowing its hardware::
 from skinware.driver_service import DriverFrame, DriverReader, DriverWriter
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import ServiceReader, ServiceWriter
+from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin, SkinLayout, Snapshot
 from skinware.status import BusState, PatchState, Status
 from skinware.structure import Structure
 
 __all__ = [
     "BusState",
+    "Column",
     "DriverFrame",
     "DriverReader",
     "DriverWriter",
     "Frame",
     "Namespace",
     "PatchState",
+    "Schema",
     "ServiceReader",
     "ServiceWriter",
     "Skin",

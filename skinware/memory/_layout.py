@@ -103,9 +103,9 @@ STATISTICS = np.dtype(
         ("lateness", "<u8", (HISTOGRAM_BUCKETS,)),
     ]
 )
-"""Time from ``begin`` to ``commit``; how old the data was when published; how late periods began. Bucket k of a
-histogram counts values of 2**(k-1) to 2**k - 1 ns, the last one all above. Not covered by the slot protocol: a reader
-may see some of these words a frame ahead of others."""
+"""Wall: time from ``begin`` to ``commit``; CPU: from publication to publication; how old the data was when published;
+how late periods began. Bucket k of a histogram counts values of 2**(k-1) to 2**k - 1 ns, the last one all above. Not
+covered by the slot protocol: a reader may see some of these words a frame ahead of others."""
 
 COLUMN_OFFSET = STATISTICS_OFFSET + STATISTICS.itemsize
 COLUMN = _packed(

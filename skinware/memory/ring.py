@@ -247,7 +247,7 @@ class RingWriter:
         ]
         self._contents = [slot[_layout.SLOT.itemsize :] for slot in _slots(segment)]
         self._statistics = self._words[_STATISTICS]
-        self._begun_ns = self._begun_cpu_ns = 0
+        self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
         self.sequence = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
             segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
@@ -263,7 +263,7 @@ class RingWriter:
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         slot = (self.sequence + 1) % self._count
-        self._begun_ns, self._begun_cpu_ns = now_ns(), time.thread_time_ns()
+        self._begun_ns = now_ns()
         self._slot_words[slot][_SEQUENCE] = 0
         fence()
         if from_last and self.sequence:
@@ -313,9 +313,11 @@ class RingWriter:
         words = self._statistics
         words[_AGE + bucket_of(published_ns - acquired_ns)] += 1
         words[_TIMED] = timed = words[_TIMED] + 1
-        cpu_ns = max(0, time.thread_time_ns() - self._begun_cpu_ns)  # another thread's, if that one commits
-        for first, value_ns in ((_WALL, published_ns - self._begun_ns), (_CPU, cpu_ns)):
-            if timed == 1 or value_ns < words[first]:
+        cpu_ns = time.thread_time_ns()
+        passed_ns = max(0, cpu_ns - self._cpu_ns)  # below 0 if another thread publishes now
+        self._cpu_ns = cpu_ns
+        for first, value_ns in ((_WALL, published_ns - self._begun_ns), (_CPU, passed_ns)):
+            if value_ns < words[first] or timed == 1:
                 words[first] = value_ns
             if value_ns > words[first + 1]:
                 words[first + 1] = value_ns

@@ -119,7 +119,7 @@ def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str)
             name: Column(np.lib.format.descr_to_dtype(_tuples(c.dtype)), c.shape, c.unit, c.description)
             for name, c in text.columns.items()
         }
-    except (msgspec.DecodeError, ValueError, TypeError, RecursionError) as error:
+    except Exception as error:  # noqa: BLE001, whatever numpy makes of nonsense
         raise BadServiceFile(f"{path}: its schema cannot be read ({error}); not attached") from None
     for name, column in told.items():
         plain = columns.get(name)
@@ -149,5 +149,9 @@ def _descr(dtype: np.dtype[Any]) -> Any:
 def _tuples(descr: Any) -> Any:
     """What JSON made lists of becomes tuples again, as numpy wants it."""
     if isinstance(descr, list):
-        return [(f[0], _tuples(f[1]), *(tuple(shape) for shape in f[2:])) for f in descr]
+        return [(_name(f[0]), _tuples(f[1]), *(tuple(shape) for shape in f[2:])) for f in descr]
     return descr
+
+
+def _name(name: Any) -> Any:
+    return tuple(name) if isinstance(name, list) else name  # with a title

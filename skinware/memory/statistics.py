@@ -80,7 +80,7 @@ class WriterStatistics(msgspec.Struct):
         published: frames.
         missed_periods: periods that passed unused.
         wall: from ``begin`` to ``commit``.
-        cpu: of it, on a processor.
+        cpu: from one publication to the next, on a processor.
         age: how old the newest data of a frame was when it was published.
         lateness: how late its periods began (periodic writers).
     """

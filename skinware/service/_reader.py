@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, Self, TypeVar
 
 import numpy.typing as npt
@@ -58,16 +58,12 @@ class ServiceReader(Generic[F]):
     ) -> None:
         self.name = check_name(name, "service")
         self.namespace = namespace or Namespace()
-        self._accounts = Accounts(self.namespace, name, announce)
         self._client = RequestClient(self.namespace, name)
         self._last: Position | None = None
         self._closed = False
         self._moved = False
-        try:
-            self._ring: RingReader[F] = self._attach_within(timeout_s)
-        except BaseException:
-            self._accounts.close()
-            raise
+        self._ring: RingReader[F] = self._attach_within(timeout_s)
+        self._accounts = Accounts(self.namespace, name, announce)
 
     @property
     def lost(self) -> int:
@@ -165,11 +161,11 @@ class ServiceReader(Generic[F]):
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
-                frame = self._taken(self._ring.copy(), alive)
+                frame = self._taken(self._whole(self._ring.copy), alive)
                 self._accounts.settle()
                 return frame
         alive = self._wait_for_newer(known, deadline_ns)
-        return self._taken(self._ring.copy(), alive)
+        return self._taken(self._whole(self._ring.copy), alive)
 
     @contextlib.contextmanager
     def view(self) -> Iterator[F]:
@@ -179,7 +175,7 @@ class ServiceReader(Generic[F]):
             ServiceTimeout: nothing was published yet.
         """
         alive = self._keep_up()
-        frame = self._taken(self._ring.view(), alive)
+        frame = self._taken(self._whole(self._ring.view), alive)
         self._accounts.settle()
         yield frame
 
@@ -394,7 +390,7 @@ class ServiceReader(Generic[F]):
     def _next_in_order(self) -> F | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
-            return self._ring.copy()
+            return self._whole(self._ring.copy)
         frame = self._ring.copy(last + 1)
         if frame is not None:
             return frame
@@ -408,6 +404,13 @@ class ServiceReader(Generic[F]):
             if latest == self._ring.latest:
                 self._accounts.record.overruns += 1
                 raise Overrun(f"no slot of {self.name!r} could be read; its writer may have died while filling one")
+
+    def _whole(self, take: Callable[[], F | None]) -> F | None:
+        try:
+            return take()
+        except Overrun:
+            self._accounts.record.overruns += 1
+            raise
 
     def _taken(self, frame: F | None, alive: bool) -> F:
         if frame is None:

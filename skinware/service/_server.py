@@ -14,10 +14,12 @@ import msgspec
 from skinware.errors import NamespaceError
 from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.service._messages import ACQUIRE, CANCEL, MAX_PACKET, OPERATIONS, Answer, Ask
 
 _MAX_PEERS = 64
 _PACKETS_PER_TURN = 256
+_TURNS = 8
 
 
 class Request:
@@ -45,9 +47,11 @@ class Request:
             position: (generation, sequence) of the frame that goes with it.
         """
         try:
-            self._send(Answer(self._id, *position, result=result))
+            msgspec.json.encode(result)
         except TypeError as error:
             self.fail(f"its result cannot be sent: {error}")
+        else:
+            self._send(Answer(self._id, *position, result=result))
 
     def fail(self, error: str, why: str = "failed") -> None:
         """Answer that it went wrong (``failed``), or is not done at all (``refused``, ``paused``)."""
@@ -104,13 +108,18 @@ class RequestServer(ForkGuard):
             timeout_s: longest wait for one.
         """
         found: list[Request] = []
-        if self._epoll.closed:
-            return found
-        for fd, _ in self._epoll.poll(timeout_s):
-            if fd == self._listener.fileno():
-                self._accept()
-            elif fd in self._peers:
-                found += self._hear(self._peers[fd])
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        for _ in range(_TURNS):  # one to accept, one to hear; then others want their turn, however busy the peers
+            if self._epoll.closed:
+                break
+            events = self._epoll.poll(max(0, deadline_ns - now_ns()) / NS_PER_S)
+            for fd, _ in events:
+                if fd == self._listener.fileno():
+                    self._accept()
+                elif fd in self._peers:
+                    found += self._hear(self._peers[fd])
+            if found or not events:
+                break
         return [request for request in found if not request.cancelled]
 
     def answer(self, peer: socket.socket, number: int, answer: Answer | None) -> None:

@@ -78,6 +78,7 @@ class ServiceWriter:
         self._name_lock = _segment.take_name(self.namespace, name)
         try:
             sweep(self.namespace)
+            self.namespace.socket_path(name).unlink(missing_ok=True)  # of a predecessor that was killed
             self._ring = self._new_generation()
         except BaseException:
             self._name_lock.close()

@@ -1,0 +1,146 @@
+"""What writers and readers tell of themselves, for everybody to see."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+import time
+
+import pytest
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.memory.announcement import living_readers
+from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
+from skinware.realtime import now_ns
+from tests.conftest import wait_until
+
+SMALL = {"values": ("<i8", 4)}
+MS = 1_000_000
+
+
+def test_buckets_double() -> None:
+    assert [bucket_of(value) for value in (-5, 0, 1, 2, 3, 4, 1023, 1024)] == [0, 0, 1, 2, 2, 3, 10, 11]
+    assert bucket_of(1 << 60) == BUCKETS - 1
+
+
+def test_a_histogram_gives_bounds() -> None:
+    histogram = Histogram()
+    assert histogram.quantile_ns(0.5) is None
+    for value in [10] * 90 + [1000] * 10:
+        histogram.add(value)
+    assert histogram.total == 100
+    assert histogram.quantile_ns(0.5) == histogram.quantile_ns(0.9) == 15
+    assert histogram.quantile_ns(0.91) == histogram.quantile_ns(1.0) == 1023
+
+
+def test_a_spread_has_extremes_and_a_mean() -> None:
+    spread = Spread()
+    assert spread.mean_ns == 0.0
+    for value in (5, 3, 10):
+        spread.add(value)
+    assert (spread.count, spread.best_ns, spread.worst_ns, spread.mean_ns) == (3, 3, 10, 6.0)
+
+
+def test_a_writer_tells_how_long_it_takes_and_how_old_its_data_is() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        assert reader.writer_statistics.wall == Spread()
+        for pause_s, age_ns in ((0.0, 0), (0.02, 50 * MS), (0.0, 50 * MS)):
+            writer.begin()
+            time.sleep(pause_s)
+            writer.commit(now_ns() - age_ns)
+        told = reader.writer_statistics
+        assert told.published == told.wall.count == told.cpu.count == told.age.total == 3
+        assert told.wall.worst_ns >= 20 * MS > told.wall.best_ns > 0
+        assert told.wall.total_ns >= told.wall.best_ns + told.wall.worst_ns
+        assert told.cpu.worst_ns < told.wall.worst_ns  # it slept
+        assert sum(told.age.counts[bucket_of(50 * MS) :]) == 2
+
+
+def test_a_periodic_writer_tells_how_late_its_periods_begin() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        for count, _ in enumerate(writer.periodic(100)):
+            if count == 3:
+                time.sleep(0.1)  # misses about nine periods
+            if count == 6:
+                break
+        told = reader.writer_statistics
+        assert told.lateness.total == 7
+        assert told.missed_periods == writer.missed_periods >= 5
+
+
+def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
+    stop = threading.Event()
+
+    def publish() -> None:
+        with ServiceWriter("x", SMALL) as writer:
+            while not stop.is_set():
+                writer.begin()
+                writer.commit(now_ns())
+                time.sleep(0.002)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    with ServiceReader[Frame]("x", timeout_s=10.0) as reader:
+        for count, _ in enumerate(reader):
+            if count == 2:
+                time.sleep(0.03)
+            if count == 20:
+                break
+        told = reader.statistics
+        assert (told.frames, told.kind) == (21, "asap")
+        assert told.lost > 0
+        assert told.age.total == told.wall.count == 20  # the last one is still being looked at
+        assert told.wall.worst_ns >= 30 * MS > told.wall.best_ns
+        assert told.cpu.count >= 19
+        for count, _ in enumerate(reader.frames(200)):
+            if count == 5:
+                break
+        assert told.kind == "periodic 200 Hz"
+        assert told.lateness.total == 6
+        # everybody sees it, as it was a quarter of a second ago at the latest
+        (seen,) = living_readers(namespace)
+        assert (seen.service, seen.program) == ("x", told.program)
+        wait_until(lambda: _seen(namespace, reader) >= 27)
+        (seen,) = living_readers(namespace)
+        assert seen.age.total == sum(seen.age.counts) > 0
+        assert seen.lost > 0
+    stop.set()
+    thread.join()
+
+
+def _seen(namespace: Namespace, reader: ServiceReader[Frame]) -> int:
+    reader.read()
+    return next(record.frames for record in living_readers(namespace))
+
+
+def _read_for_ever() -> None:
+    with ServiceReader[Frame]("x", timeout_s=30.0) as reader:
+        for _ in reader.frames(50):
+            pass
+
+
+def test_a_killed_reader_vanishes_by_itself(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        writer.begin()
+        writer.commit(now_ns())
+        process = multiprocessing.get_context("spawn").Process(target=_read_for_ever)
+        process.start()
+        wait_until(lambda: [r.pid for r in living_readers(namespace)] == [process.pid])
+        process.kill()
+        process.join()
+        assert list(living_readers(namespace)) == []
+    with ServiceWriter("x", SMALL):  # sweeps its file away
+        assert list(namespace.reader_files()) == []
+
+
+def test_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from skinware.errors import Overrun
+
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+        writer.begin()
+        writer.commit(now_ns())
+        reader.read()
+        with monkeypatch.context() as patch, pytest.raises(Overrun, match="64 times in a row"):
+            patch.setattr(reader._ring, "_copy", lambda _: None)
+            reader.read()
+        assert reader.statistics.overruns == 1

@@ -13,21 +13,11 @@ from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Stat
 from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import CommandReceived, LostHalf, damaged_cycles
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.events import LostHalf, damaged_cycles
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
 from tests.conftest import wait_until
-from tests.sdk.driving import driving, emulated, read_until
-
-
-def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
-    assert isinstance(bus.hardware, EmulatedRoboskin)
-    return bus.hardware
-
-
-def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
-    return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+from tests.sdk.driving import LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 
 
 def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
@@ -169,30 +159,6 @@ def test_a_listener_sends_nothing_and_learns_what_it_hears() -> None:
     assert bus.counters.sent == bus.counters.send_failures == 0
 
 
-class LateBoards:
-    """Devices that are not there until ``present`` is set."""
-
-    def __init__(self, hardware: EmulatedHardware, present: bool = False) -> None:
-        self._hardware = hardware
-        self.present = present
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        if self.present:
-            self._hardware.receive(identifier, payload, now_ns)
-
-    def next_due_ns(self) -> int | None:
-        return self._hardware.next_due_ns()
-
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        return [frame for frame in self._hardware.emit(now_ns) if self.present]
-
-    def skip(self, now_ns: int) -> int:
-        return self._hardware.skip(now_ns)
-
-    def totals(self) -> dict[str, int]:
-        return self._hardware.totals()
-
-
 def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
     bus = VirtualCanBus.with_hardware(late)
@@ -221,30 +187,6 @@ def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
         reader.reattach()
         frame = read_until(reader, lambda f: not f.status.any())
         assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]
-
-
-class Together:
-    """Two sets of devices on one bus."""
-
-    def __init__(self, first: EmulatedHardware, second: EmulatedHardware) -> None:
-        self._both = (first, second)
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        for hardware in self._both:
-            hardware.receive(identifier, payload, now_ns)
-
-    def next_due_ns(self) -> int | None:
-        due = [time_ns for hardware in self._both if (time_ns := hardware.next_due_ns()) is not None]
-        return min(due, default=None)
-
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        return sorted(frame for hardware in self._both for frame in hardware.emit(now_ns))
-
-    def skip(self, now_ns: int) -> int:
-        return sum(hardware.skip(now_ns) for hardware in self._both)
-
-    def totals(self) -> dict[str, int]:
-        return self._both[0].totals()
 
 
 def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:

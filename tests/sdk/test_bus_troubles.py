@@ -184,19 +184,19 @@ def test_boards_that_cannot_be_stopped_are_told_of_and_the_others_are_stopped(
     assert namespace.services() == []
 
 
-class Endless(RoboskinDriver):
-    """A driver that never comes to an end with its first bus."""
+class Slow(RoboskinDriver):
+    """A driver that takes its time to stop."""
 
     async def stop(self, link: Link) -> None:
-        """Take for ever."""
-        await link.sleep(3600)
+        """Far too long."""
+        await link.sleep(10)
 
 
 def test_a_stop_that_takes_too_long_is_given_up(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "_STOP_TIMEOUT_S", 0.05)
-    with caplog.at_level(logging.WARNING), driving(emulated(boards=(7,)), driver=Endless):
+    with caplog.at_level(logging.WARNING), driving(emulated(boards=(7,)), driver=Slow):
         pass
     assert "bus0: not stopped in good order: it took too long" in caplog.text
 

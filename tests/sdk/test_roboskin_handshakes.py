@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, PatchState, Status
+from skinware_drivers.can import roboskin
 from skinware_drivers.can.roboskin import Kind
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import BoardSilenced
@@ -118,16 +119,36 @@ def test_a_named_board_that_sends_no_data_is_named_and_set_up_when_it_appears(
 
 def test_named_boards_of_which_none_answers_are_waited_for(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7, 8))))
+    bus = VirtualCanBus.with_hardware(late)
     with (
         caplog.at_level(logging.WARNING),
-        driving(VirtualCanBus.with_hardware(late), wait=False, boards=(7, 8)) as running,
+        driving(bus, wait=False, boards=(7, 8)) as running,
     ):
-        wait_until(lambda: "none of the boards 7, 8 answers; waiting" in caplog.text)
+        wait_until(lambda: bus.counters.sent >= 6)
+        assert "bus0: none of the boards 7, 8 answers; waiting for one to appear" in caplog.text
         late.present = True
         assert running.ready.wait(30)
         with DriverReader("roboskin") as reader:
             read_until(reader, lambda f: not f.status.any())
     assert caplog.text.count("none of the boards") == 1
+
+
+@pytest.mark.parametrize("boards", [(), (7,)], ids=["discovered", "named"])
+def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
+    monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...]
+) -> None:
+    monkeypatch.setattr(roboskin, "_REPLY_S", 0.05)
+    monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.4)
+    late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), pattern="idle")))
+    buses = emulated(boards=(7,), pattern="idle"), VirtualCanBus.with_hardware(late)
+    with driving(*buses, boards=boards) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        assert patches_of(reader) == ["board 7"]
+        running.do(lambda: setattr(late, "present", True))
+        wait_until(lambda: reader.latest is not None and reader.structure_changed)
+        reader.reattach()
+        frame = read_until(reader, lambda f: not f.status.any())
+        assert frame.structure.sensor_uid[[0, 192]].tolist() == [7 << 16, 1 << 32 | 7 << 16]
 
 
 # What they are told
@@ -187,7 +208,10 @@ def test_a_restarted_board_of_the_older_kind_is_set_up_while_the_others_stream_o
     assert not [event for event in log if isinstance(event, BoardSilenced)]
 
 
-def test_boards_of_a_second_bus_are_set_up_again_on_that_bus(caplog: pytest.LogCaptureFixture) -> None:
+def test_boards_of_a_second_bus_are_set_up_again_on_that_bus(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.5)  # states are logged four times a second
     first_log: list[msgspec.Struct] = []
     log: list[msgspec.Struct] = []
     first, second = emulated(first_log, boards=(7, 8)), emulated(log, boards=(7, 8), boot_s=0.1, pattern="idle")
@@ -243,15 +267,16 @@ def test_a_listener_believes_data_of_skin_only() -> None:
 
 
 def test_a_listener_learns_for_as_long_as_it_was_told() -> None:
-    rare = EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True))
-    late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(9,), streaming=True)))
-    bus = VirtualCanBus.with_hardware(Together(rare, late), listen_only=True)
+    early = EmulatedRoboskin(EmulatorOptions(boards=(9,), streaming=True))
+    late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)))
+    bus = VirtualCanBus.with_hardware(Together(early, late), listen_only=True)
     with driving(bus, listen_only=True, wait=False, learn_s=1.0) as running:
         wait_until(lambda: bus.counters.frames > 0)
         running.do(lambda: setattr(late, "present", True))
         assert running.ready.wait(30)
         with DriverReader("roboskin") as reader:
             assert patches_of(reader) == ["board 7", "board 9"]
+            assert np.all(np.diff(reader.structure.sensor_uid.astype(np.int64)) > 0)
 
 
 def test_a_listener_keeps_silent_beside_a_board_that_died() -> None:

@@ -48,7 +48,7 @@ def seven_and_eight(monkeypatch: pytest.MonkeyPatch) -> Iterator[Boards]:
         boards.close()
 
 
-def test_five_cycles_without_acknowledgement_move_the_baseline_of_the_whole_board(
+def test_five_cycles_without_acknowledgement_move_the_baseline_of_a_board(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with seven_and_eight(monkeypatch) as boards:
@@ -80,9 +80,7 @@ def test_several_triangles_count_together(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("tail", [NOT_CONNECTED, BOTH, "0010"], ids=["mtb3", "mtb4", "out of range"])
-def test_triangles_that_are_not_connected_or_out_of_range_move_nothing(
-    monkeypatch: pytest.MonkeyPatch, tail: str
-) -> None:
+def test_triangles_not_connected_or_out_of_range_move_nothing(monkeypatch: pytest.MonkeyPatch, tail: str) -> None:
     with seven_and_eight(monkeypatch) as boards:
         for _ in range(10):
             boards.cycle({3: tail, 4: tail})

@@ -40,7 +40,7 @@ class Driving:
         self._listen_only = listen_only
         self._loop: asyncio.AbstractEventLoop | None = None
         self.runner: Runner | None = None
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
 
     def _run(self) -> None:
         async def run() -> None:
@@ -68,6 +68,7 @@ class Driving:
         if self.runner is not None and self._loop is not None and self._thread.is_alive():
             self._loop.call_soon_threadsafe(self.runner.stop)
         self._thread.join(30)
+        assert not self._thread.is_alive(), "the driver did not stop"
         if self.failure is not None:
             raise self.failure
 

@@ -142,8 +142,11 @@ def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), pattern="idle")))
     buses = emulated(boards=(7,), pattern="idle"), VirtualCanBus.with_hardware(late)
     with driving(*buses, boards=boards) as running, DriverReader("roboskin") as reader:
-        read_until(reader, lambda f: not f.status.any())
+        frame = read_until(reader, lambda f: not f.status.any())
         assert patches_of(reader) == ["board 7"]
+        asked = buses[1].counters.sent
+        later = read_until(reader, lambda f: buses[1].counters.sent >= asked + 3)
+        assert later.generation == frame.generation
         running.do(lambda: setattr(late, "present", True))
         wait_until(lambda: reader.latest is not None and reader.structure_changed)
         reader.reattach()

@@ -89,6 +89,24 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
     assert lost - 2 * both - 4 <= total <= lost - 2 * both  # at most one head per board still waited at the end
 
 
+def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
+    bus = emulated(boards=(7, 8), pattern="cycle", jitter_us=8_000)
+    with driving(bus, period_ms=20), DriverReader("roboskin") as reader:
+        start = read_until(reader, lambda f: not f.status.any())
+        shown: list[list[int]] = [[], []]
+        for frame in reader.in_order(timeout_s=30):
+            assert not frame.status.any()
+            for board, values in enumerate(frame.values.reshape(2, 192).tolist()):
+                assert len(set(values)) == 1, "a frame holds two bursts of a board"
+                shown[board].append(values[0])
+            if frame.sequence >= start.sequence + 50:
+                break
+        assert reader.lost == 0
+    for cycles in shown:
+        assert set((np.diff(cycles) % 256).tolist()) <= {0, 1}
+        assert len(set(cycles)) >= 25
+
+
 def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> None:
     bus = emulated(boards=(7, 8))
     with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:

@@ -108,4 +108,5 @@ def test_a_missing_board_holds_nothing_up_for_long(monkeypatch: pytest.MonkeyPat
     desk.clock.now_ns += 50 * MS
     desk.feed(desk.burst(10))
     assert desk.writer.sequence == before + 1
+    assert set(desk.reader.read().values[:192].tolist()) == {10}  # shown when it is whole, not when the next begins
     desk.close()

@@ -11,7 +11,7 @@ import pytest
 
 from skinware import BusState, DriverReader, Namespace, PatchState, Status
 from skinware.errors import BusNotAvailable, BusSendError
-from skinware_drivers import runner
+from skinware_drivers import bus_line
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
 from tests.conftest import wait_until
@@ -195,7 +195,7 @@ class Slow(RoboskinDriver):
 def test_a_stop_that_takes_too_long_is_given_up(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner, "_STOP_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(bus_line, "_STOP_TIMEOUT_S", 0.05)
     with caplog.at_level(logging.WARNING), driving(emulated(boards=(7,)), driver=Slow):
         pass
     assert "bus0: not stopped in good order: it took too long" in caplog.text

@@ -42,6 +42,7 @@ def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
     assert times[0x207, "0700"] - times[0x208, "50000f02010022"] >= 510_000_000
 
 
+@pytest.mark.usefixtures("hurry")
 def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
     def source(board: int, triangle: int, cycle: int, time_ns: int) -> list[int]:
         return [(board + triangle + channel) % 256 for channel in range(12)]
@@ -57,6 +58,7 @@ def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
             assert len(skin.read().physical("pressure")) == 2 * 16 * 10
 
 
+@pytest.mark.usefixtures("hurry")
 def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> None:
     log: list[msgspec.Struct] = []
     bus = emulated(log, boards=(7, 8), pattern="cycle", lose=0.01)
@@ -96,6 +98,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
     assert lost - 2 * both - 4 <= total <= lost - 2 * both  # at most one head per board still waited at the end
 
 
+@pytest.mark.usefixtures("hurry")
 def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
     bus = emulated(boards=(7, 8), pattern="cycle", jitter_us=8_000)
     with driving(bus, period_ms=20), DriverReader("roboskin") as reader:
@@ -114,6 +117,7 @@ def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
         assert len(set(cycles)) >= 25
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> None:
     bus = emulated(boards=(7, 8))
     with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
@@ -144,6 +148,7 @@ def test_a_restarted_board_is_set_up_alone() -> None:
     assert {"4d0032f0", "50000f02010022", "0700"} <= {payload for _, payload in sent}
 
 
+@pytest.mark.usefixtures("hurry")
 def test_diagnostics_of_the_hardware_reach_the_user() -> None:
     bus = emulated(boards=(7,), out_of_range=("7/2/5",), not_connected=("7/3",), pattern="idle")
     with driving(bus, skin_type=2) as running, DriverReader("roboskin") as reader:
@@ -155,6 +160,7 @@ def test_diagnostics_of_the_hardware_reach_the_user() -> None:
         assert set(frame.values[48:60].tolist()) == {0}  # full pressure, if it were not for the flag
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_board_that_recalibrates_itself_is_suspect() -> None:
     bus = emulated(boards=(7, 8), pattern="idle")
     with driving(bus) as running, DriverReader("roboskin") as reader:
@@ -164,6 +170,7 @@ def test_a_board_that_recalibrates_itself_is_suspect() -> None:
         assert not (frame.status[192:] & Status.SUSPECT).any()
 
 
+@pytest.mark.usefixtures("hurry")
 def test_damaged_and_foreign_frames_are_counted() -> None:
     bus = emulated(boards=(7,), wrong_length=0.05, foreign_hz=200)
     with driving(bus) as running, DriverReader("roboskin") as reader:
@@ -184,6 +191,7 @@ def test_a_listener_sends_nothing_and_learns_what_it_hears() -> None:
     assert bus.counters.sent == bus.counters.send_failures == 0
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
     bus = VirtualCanBus.with_hardware(late)
@@ -214,6 +222,7 @@ def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
         assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:
     log: list[msgspec.Struct] = []
     first, second = emulated(boards=(7,)), emulated(log, boards=(7,))
@@ -234,12 +243,14 @@ def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: py
     assert caplog.text.count("went away") == 1
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_living_drivers_name_is_refused() -> None:
     with driving(emulated(boards=(7,))):
         with pytest.raises(NameInUse, match="roboskin"), driving(emulated(boards=(7,))):
             pass
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_burst_that_waited_is_published_cycle_by_cycle() -> None:
     """After a stall of the driver several cycles are decoded at once; each still becomes a frame of its own."""
     bus = emulated(boards=(7,), pattern="cycle")

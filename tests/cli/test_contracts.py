@@ -111,6 +111,9 @@ def test_output_into_a_pipe_that_closes_is_no_error() -> None:
         (["--bus", "virtual?board=7"], 2, "did you mean 'boards'"),
         (["--bus", "virtual", "--period-ms", "0"], 2, "period_ms"),
         (["--bus", "virtual", "--name", "a/b"], 2, "service name"),
+        (["--bus", "virtual?boards"], 2, "?key=value"),
+        (["--bus", "virtual", "--config", "/no/such/file.toml"], 2, "/no/such/file.toml"),
+        (["--bus", "virtual", "--slots", "1"], 2, "slots"),
         (["--bus", "no-such-can0"], 3, "CAN"),
         (["--nonsense"], 2, "No such option"),
         ([], 2, "which bus?"),
@@ -159,6 +162,28 @@ def test_a_file_configures_buses_kinds_and_names(tmp_path: Path) -> None:
         assert driver.wait_for("ready")["types"] == {"pressure": 5 * 12 + 11 * 10, "temperature": 22}
         with DriverReader("hand") as reader:
             assert reader.structure.module_kind[:6].tolist() == [b"fingertip"] * 5 + [b"triangle"]
+
+
+def test_a_listener_takes_boards_in_on_a_hangup_signal(tmp_path: Path) -> None:
+    """Told to listen only in the file, it sends nothing; SIGHUP makes it look again and does not end it."""
+    path = tmp_path / "skin.toml"
+    path.write_text(
+        """
+        listen_only = true
+        [[bus]]
+        name = "virtual?boards=7&streaming=true"
+        [options]
+        learn_s = 0.2
+        """
+    )
+    with running("skin-driver", "--config", str(path)) as driver:
+        assert driver.wait_for("ready")["patches"] == 1
+        os.kill(driver.process.pid, signal.SIGHUP)
+        for _ in range(2):
+            (bus,) = driver.wait_for("status")["buses"]
+            assert (bus["state"], bus["sent"], bus["send_failures"]) == ("live", 0, 0)
+        assert driver.stop()["event"] == "stopped"
+        assert driver.process.returncode == 0
 
 
 def test_a_name_in_use_is_refused() -> None:

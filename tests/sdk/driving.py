@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -11,9 +12,12 @@ from typing import Any
 import msgspec
 
 from skinware import DriverFrame, DriverReader
+from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.runner import Runner
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.events import CommandReceived
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
 
@@ -21,16 +25,22 @@ from skinware_drivers.virtual.roboskin_options import RoboskinOptions as Emulato
 class Driving:
     """A running driver; ``do`` runs something in its event loop, where the emulated hardware may be touched."""
 
-    def __init__(self, buses: Sequence[VirtualCanBus], options: dict[str, Any], listen_only: bool) -> None:
+    def __init__(
+        self,
+        buses: Sequence[VirtualCanBus],
+        options: dict[str, Any],
+        listen_only: bool,
+        driver: type[RoboskinDriver] = RoboskinDriver,
+    ) -> None:
         self.buses = buses
         self.ready = threading.Event()
         self.failure: BaseException | None = None
-        lines = [(f"bus{i}", RoboskinDriver(RoboskinOptions(**options)), bus) for i, bus in enumerate(buses)]
+        lines = [(f"bus{i}", driver(RoboskinOptions(**options)), bus) for i, bus in enumerate(buses)]
         self._lines = lines
         self._listen_only = listen_only
         self._loop: asyncio.AbstractEventLoop | None = None
         self.runner: Runner | None = None
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
 
     def _run(self) -> None:
         async def run() -> None:
@@ -58,6 +68,7 @@ class Driving:
         if self.runner is not None and self._loop is not None and self._thread.is_alive():
             self._loop.call_soon_threadsafe(self.runner.stop)
         self._thread.join(30)
+        assert not self._thread.is_alive(), "the driver did not stop"
         if self.failure is not None:
             raise self.failure
 
@@ -83,9 +94,136 @@ def emulated(log: list[msgspec.Struct] | None = None, *, listen_only: bool = Fal
     return VirtualCanBus.with_hardware(hardware, listen_only=listen_only)
 
 
+def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
+    assert isinstance(bus.hardware, EmulatedRoboskin)
+    return bus.hardware
+
+
+def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
+    """(time_ns, identifier, payload in hex) of what boards were told."""
+    return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+
+
+class LateBoards:
+    """Devices that are not there until ``present`` is set."""
+
+    def __init__(self, hardware: EmulatedHardware, present: bool = False) -> None:
+        self._hardware = hardware
+        self.present = present
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        if self.present:
+            self._hardware.receive(identifier, payload, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        return self._hardware.next_due_ns()
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        return [frame for frame in self._hardware.emit(now_ns) if self.present]
+
+    def skip(self, now_ns: int) -> int:
+        return self._hardware.skip(now_ns)
+
+    def totals(self) -> dict[str, int]:
+        return self._hardware.totals()
+
+
+class Together:
+    """Several sets of devices on one bus."""
+
+    def __init__(self, *parts: EmulatedHardware) -> None:
+        self._parts = parts
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        for hardware in self._parts:
+            hardware.receive(identifier, payload, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        due = [time_ns for hardware in self._parts if (time_ns := hardware.next_due_ns()) is not None]
+        return min(due, default=None)
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        return sorted(frame for hardware in self._parts for frame in hardware.emit(now_ns))
+
+    def skip(self, now_ns: int) -> int:
+        return sum(hardware.skip(now_ns) for hardware in self._parts)
+
+    def totals(self) -> dict[str, int]:
+        return self._parts[0].totals()
+
+
+class Chatter:
+    """Foreign devices that send the same frames every 10 ms, and hear everything that is sent on the bus."""
+
+    def __init__(self, *frames: tuple[int, bytes]) -> None:
+        self._frames = frames
+        self._due_ns = 0
+        self.heard: list[tuple[int, bytes]] = []
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        self.heard.append((identifier, payload))
+
+    def next_due_ns(self) -> int | None:
+        return self._due_ns if self._frames else None
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        if now_ns < self._due_ns:
+            return []
+        self._due_ns = now_ns + 10_000_000
+        return [WireFrame(now_ns, identifier, payload) for identifier, payload in self._frames]
+
+    def skip(self, now_ns: int) -> int:
+        return len(self.emit(now_ns))
+
+    def totals(self) -> dict[str, int]:
+        return {}
+
+
+class TroubledBus(VirtualCanBus):
+    """A bus whose troubles the test decides.
+
+    Attributes:
+        before_send: called before every send; may raise, or change the bus.
+        down: the interface is down: it cannot be opened, and nothing can be sent.
+        opened_at_s: when somebody tried to open it, CLOCK_MONOTONIC s.
+    """
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self.before_send: Callable[[int, bytes], object] = lambda _identifier, _payload: None
+        self.down = False
+        self.opened_at_s: list[float] = []
+
+    def open(self) -> None:
+        self.opened_at_s.append(time.monotonic())
+        if self.down:
+            raise BusNotAvailable("the bus is down", is_down=True)
+        super().open()
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        self.before_send(identifier, payload)
+        if self.down:
+            raise BusSendError("the bus is down")
+        super().send(identifier, payload)
+
+    def go_down(self) -> None:
+        self.down = True
+        self.fail_next_receive(BusNotAvailable("the bus went down", is_down=True))
+
+
+def troubled(log: list[msgspec.Struct] | None = None, **options: Any) -> TroubledBus:
+    return TroubledBus.with_hardware(EmulatedRoboskin(EmulatorOptions(**options), log=log))
+
+
 @contextmanager
-def driving(*buses: VirtualCanBus, listen_only: bool = False, wait: bool = True, **options: Any) -> Iterator[Driving]:
-    running = Driving(buses, options, listen_only)
+def driving(
+    *buses: VirtualCanBus,
+    listen_only: bool = False,
+    wait: bool = True,
+    driver: type[RoboskinDriver] = RoboskinDriver,
+    **options: Any,
+) -> Iterator[Driving]:
+    running = Driving(buses, options, listen_only, driver)
     running.start()
     try:
         if wait:

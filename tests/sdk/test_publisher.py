@@ -19,9 +19,11 @@ class Clock:
 
 
 class Desk:
-    """A publisher of one board, or more, in front of a real ring."""
+    """A publisher of one board, or more, in front of a real ring; ``watched`` as the driver watches them."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...] = (7,)) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...] = (7,), *, watched: bool = False
+    ) -> None:
         self.clock = clock = Clock()
         monkeypatch.setattr(publisher_module, "now_ns", lambda: clock.now_ns)
         self.rig = Rig(boards=boards)
@@ -29,7 +31,8 @@ class Desk:
         self.writer = DriverWriter(
             "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
         )
-        self.publisher = Publisher(self.writer, self.rig.decoder, Watch(tables), PERIOD_S, True)
+        self.watch = self.rig.driver.watch(tables) if watched else Watch(tables)
+        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)
         self.reader = DriverReader("desk")
 
     def feed(self, frames: list[Wire]) -> None:
@@ -105,4 +108,5 @@ def test_a_missing_board_holds_nothing_up_for_long(monkeypatch: pytest.MonkeyPat
     desk.clock.now_ns += 50 * MS
     desk.feed(desk.burst(10))
     assert desk.writer.sequence == before + 1
+    assert set(desk.reader.read().values[:192].tolist()) == {10}  # shown when it is whole, not when the next begins
     desk.close()

@@ -13,21 +13,11 @@ from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Stat
 from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import CommandReceived, LostHalf, damaged_cycles
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.events import LostHalf, damaged_cycles
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
 from tests.conftest import wait_until
-from tests.sdk.driving import driving, emulated, read_until
-
-
-def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
-    assert isinstance(bus.hardware, EmulatedRoboskin)
-    return bus.hardware
-
-
-def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
-    return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+from tests.sdk.driving import LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 
 
 def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
@@ -52,6 +42,7 @@ def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:
     assert times[0x207, "0700"] - times[0x208, "50000f02010022"] >= 510_000_000
 
 
+@pytest.mark.usefixtures("hurry")
 def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
     def source(board: int, triangle: int, cycle: int, time_ns: int) -> list[int]:
         return [(board + triangle + channel) % 256 for channel in range(12)]
@@ -67,23 +58,31 @@ def test_values_reach_the_user_as_they_were_on_the_wire() -> None:
             assert len(skin.read().physical("pressure")) == 2 * 16 * 10
 
 
+@pytest.mark.usefixtures("hurry")
 def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> None:
     log: list[msgspec.Struct] = []
-    bus = emulated(log, boards=(7, 8, 9, 10), pattern="cycle", lose=0.01)
-    fresh: dict[int, set[int]] = {module: set() for module in range(64)}
+    bus = emulated(log, boards=(7, 8), pattern="cycle", lose=0.01)
+    shown: dict[int, set[int]] = {module: set() for module in range(32)}
     with driving(bus, period_ms=20) as running, DriverReader("roboskin") as reader:
+        before_ns = np.zeros(32, np.int64)
         for count, frame in enumerate(reader.in_order(timeout_s=30)):
-            values, status = frame.values.reshape(64, 12), frame.status.reshape(64, 12)
-            for module in np.flatnonzero((status == 0).all(axis=1)).tolist():
+            values, status = frame.values.reshape(32, 12), frame.status.reshape(32, 12)
+            is_new = frame.module_time_ns != before_ns
+            before_ns = frame.module_time_ns.copy()
+            for module in np.flatnonzero(is_new | (status == 0).all(axis=1)).tolist():
                 cycles = set(values[module].tolist())
                 assert len(cycles) == 1, f"module {module} is torn: {values[module]}"
-                fresh[module].add(int(values[module][0]))
+                shown[module].add(int(values[module][0]))
             if count >= 200:
                 break
         assert reader.lost == 0
+        orphans = [counters["orphans"] for counters in reader.patch_counters(frame)]
+        assert min(orphans) > 10
+        told = running.status()["patches"]
+        assert all(few <= patch["orphans"] for few, patch in zip(orphans, told, strict=True))
         assert len(damaged_cycles(log)) > 20
     damaged = damaged_cycles(log)
-    for module, cycles in fresh.items():
+    for module, cycles in shown.items():
         board, triangle = 7 + module // 16, module % 16
         between = range(min(cycles), max(cycles) + 1) if max(cycles) - min(cycles) < 250 else range(0)
         missing = {cycle for cycle in between if cycle not in cycles}
@@ -99,6 +98,26 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
     assert lost - 2 * both - 4 <= total <= lost - 2 * both  # at most one head per board still waited at the end
 
 
+@pytest.mark.usefixtures("hurry")
+def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
+    bus = emulated(boards=(7, 8), pattern="cycle", jitter_us=8_000)
+    with driving(bus, period_ms=20), DriverReader("roboskin") as reader:
+        start = read_until(reader, lambda f: not f.status.any())
+        shown: list[list[int]] = [[], []]
+        for frame in reader.in_order(timeout_s=30):
+            for board, values in enumerate(frame.values.reshape(2, 192).tolist()):
+                assert len(set(values)) == 1, "a frame holds two bursts of a board"
+                assert len(set(frame.status[192 * board :][:192].tolist())) == 1, "part of a board is stale"
+                shown[board].append(values[0])
+            if frame.sequence >= start.sequence + 50:
+                break
+        assert reader.lost == 0
+    for cycles in shown:
+        assert set((np.diff(cycles) % 256).tolist()) <= {0, 1}
+        assert len(set(cycles)) >= 25
+
+
+@pytest.mark.usefixtures("hurry")
 def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> None:
     bus = emulated(boards=(7, 8))
     with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
@@ -129,6 +148,7 @@ def test_a_restarted_board_is_set_up_alone() -> None:
     assert {"4d0032f0", "50000f02010022", "0700"} <= {payload for _, payload in sent}
 
 
+@pytest.mark.usefixtures("hurry")
 def test_diagnostics_of_the_hardware_reach_the_user() -> None:
     bus = emulated(boards=(7,), out_of_range=("7/2/5",), not_connected=("7/3",), pattern="idle")
     with driving(bus, skin_type=2) as running, DriverReader("roboskin") as reader:
@@ -140,6 +160,7 @@ def test_diagnostics_of_the_hardware_reach_the_user() -> None:
         assert set(frame.values[48:60].tolist()) == {0}  # full pressure, if it were not for the flag
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_board_that_recalibrates_itself_is_suspect() -> None:
     bus = emulated(boards=(7, 8), pattern="idle")
     with driving(bus) as running, DriverReader("roboskin") as reader:
@@ -149,6 +170,7 @@ def test_a_board_that_recalibrates_itself_is_suspect() -> None:
         assert not (frame.status[192:] & Status.SUSPECT).any()
 
 
+@pytest.mark.usefixtures("hurry")
 def test_damaged_and_foreign_frames_are_counted() -> None:
     bus = emulated(boards=(7,), wrong_length=0.05, foreign_hz=200)
     with driving(bus) as running, DriverReader("roboskin") as reader:
@@ -169,30 +191,7 @@ def test_a_listener_sends_nothing_and_learns_what_it_hears() -> None:
     assert bus.counters.sent == bus.counters.send_failures == 0
 
 
-class LateBoards:
-    """Devices that are not there until ``present`` is set."""
-
-    def __init__(self, hardware: EmulatedHardware, present: bool = False) -> None:
-        self._hardware = hardware
-        self.present = present
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        if self.present:
-            self._hardware.receive(identifier, payload, now_ns)
-
-    def next_due_ns(self) -> int | None:
-        return self._hardware.next_due_ns()
-
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        return [frame for frame in self._hardware.emit(now_ns) if self.present]
-
-    def skip(self, now_ns: int) -> int:
-        return self._hardware.skip(now_ns)
-
-    def totals(self) -> dict[str, int]:
-        return self._hardware.totals()
-
-
+@pytest.mark.usefixtures("hurry")
 def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.LogCaptureFixture) -> None:
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,))))
     bus = VirtualCanBus.with_hardware(late)
@@ -223,30 +222,7 @@ def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
         assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]
 
 
-class Together:
-    """Two sets of devices on one bus."""
-
-    def __init__(self, first: EmulatedHardware, second: EmulatedHardware) -> None:
-        self._both = (first, second)
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        for hardware in self._both:
-            hardware.receive(identifier, payload, now_ns)
-
-    def next_due_ns(self) -> int | None:
-        due = [time_ns for hardware in self._both if (time_ns := hardware.next_due_ns()) is not None]
-        return min(due, default=None)
-
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        return sorted(frame for hardware in self._both for frame in hardware.emit(now_ns))
-
-    def skip(self, now_ns: int) -> int:
-        return sum(hardware.skip(now_ns) for hardware in self._both)
-
-    def totals(self) -> dict[str, int]:
-        return self._both[0].totals()
-
-
+@pytest.mark.usefixtures("hurry")
 def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: pytest.LogCaptureFixture) -> None:
     log: list[msgspec.Struct] = []
     first, second = emulated(boards=(7,)), emulated(log, boards=(7,))
@@ -267,12 +243,14 @@ def test_a_bus_that_goes_away_comes_back_and_never_holds_up_the_other(caplog: py
     assert caplog.text.count("went away") == 1
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_living_drivers_name_is_refused() -> None:
     with driving(emulated(boards=(7,))):
         with pytest.raises(NameInUse, match="roboskin"), driving(emulated(boards=(7,))):
             pass
 
 
+@pytest.mark.usefixtures("hurry")
 def test_a_burst_that_waited_is_published_cycle_by_cycle() -> None:
     """After a stall of the driver several cycles are decoded at once; each still becomes a frame of its own."""
     bus = emulated(boards=(7,), pattern="cycle")

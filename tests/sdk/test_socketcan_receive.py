@@ -1,0 +1,282 @@
+"""The receive path of SocketCAN without CAN in the kernel: datagrams of another kind of socket carry the frames.
+
+The kernel stamps, buffers and drops them as it does with CAN frames. On real CAN: tests/can/test_socketcan.py.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import socket
+import struct
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from skinware.errors import BusNotAvailable, BusSendError
+from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
+from skinware_drivers.can import socketcan
+from skinware_drivers.can.socketcan import SocketCanBus
+
+SO_RCVBUFFORCE = 33
+RMEM_MAX = "/proc/sys/net/core/rmem_max"
+
+
+class ChoosySocket(socket.socket):
+    """A socket that knows how its buffer was asked for, and may refuse force."""
+
+    allowed = False
+
+    def setsockopt(self, level: int, option: int, value: int) -> None:  # type: ignore[override]
+        """Set an option."""
+        if option == SO_RCVBUFFORCE and not self.allowed:
+            raise PermissionError(errno.EPERM, "Operation not permitted")
+        super().setsockopt(level, option, value)
+
+
+class Cable:
+    """A socket to receive from, and one that sends to it."""
+
+    def __init__(self) -> None:
+        self.end = ChoosySocket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.end.bind(("127.0.0.1", 0))
+        self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.out.connect(self.end.getsockname())
+        self.end.connect(self.out.getsockname())
+
+    def put(self, identifier: int, payload: bytes = bytes(8)) -> None:
+        self.out.send(struct.pack("=IB3x8s", identifier, len(payload), payload))
+
+    def close(self) -> None:
+        self.end.close()
+        self.out.close()
+
+
+@pytest.fixture
+def cable() -> Iterator[Cable]:
+    made = Cable()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def spare_cable() -> Iterator[Cable]:
+    made = Cable()
+    yield made
+    made.close()
+
+
+def drain(bus: SocketCanBus, batch: FrameBatch, ordinal: int = 0) -> None:
+    while bus.receive(batch, ordinal):
+        pass
+
+
+def pass_ms(duration_ms: int) -> None:
+    """Let time pass, so that moments before and after can be told apart."""
+    time.sleep(duration_ms / 1e3)
+
+
+def test_frames_arrive_whole_in_order_and_as_often_as_they_were_sent(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    for number in range(700):
+        cable.put(number, bytes([number % 256]) * (number % 9))
+    batch = FrameBatch(1000)
+    drain(bus, batch, ordinal=3)
+    wire = batch.wire[: len(batch)]
+    assert wire["identifier"].tolist() == list(range(700))
+    assert wire["length"].tolist() == [number % 9 for number in range(700)]
+    assert wire["payload"][8].tolist() == [8] * 8
+    assert set(batch.bus[:700].tolist()) == {3}
+    assert (bus.counters.frames, bus.counters.lost) == (700, 0)
+
+
+def test_a_full_batch_leaves_the_rest_for_the_next_one(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    for number in range(25):
+        cable.put(number)
+    found: list[int] = []
+    batch = FrameBatch(10)
+    for expected in (10, 10, 5):
+        batch.clear()
+        drain(bus, batch)
+        assert len(batch) == expected
+        found += batch.wire["identifier"][:expected].tolist()
+    assert found == list(range(25))
+    assert bus.counters.frames == 25
+
+
+# Drops
+
+
+def test_drops_are_counted_exactly_and_go_on_counting_when_the_bus_is_opened_again(
+    cable: Cable, spare_cable: Cable
+) -> None:
+    bus = SocketCanBus("can0", {"buffer": "20000"})
+    bus.adopt(cable.end)
+    for _ in range(1000):
+        cable.put(0x123)
+    batch = FrameBatch(2000)
+    drain(bus, batch)
+    dropped = bus.counters.lost
+    assert dropped > 0
+    assert bus.counters.frames + dropped == 1000
+    bus.close()
+    bus.adopt(spare_cable.end)
+    spare_cable.put(0x123)
+    drain(bus, batch)
+    assert bus.counters.lost == dropped
+    for _ in range(1000):
+        spare_cable.put(0x123)
+    drain(bus, batch)
+    assert bus.counters.lost > dropped
+    assert bus.counters.frames + bus.counters.lost == 2001
+
+
+# The receive buffer
+
+
+def test_the_buffer_is_enlarged_with_force_where_that_is_allowed(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int]] = []
+
+    def note(_self: object, level: int, option: int, value: int) -> None:
+        asked.append((option, value))
+        if option != SO_RCVBUFFORCE:
+            socket.socket.setsockopt(cable.end, level, option, value)
+
+    monkeypatch.setattr(ChoosySocket, "setsockopt", note)
+    SocketCanBus("can0", {"buffer": "100000"}).adopt(cable.end)
+    assert asked[0] == (SO_RCVBUFFORCE, 50_000)  # the kernel doubles it
+    assert socket.SO_RCVBUF not in dict(asked)
+
+
+def test_a_smaller_buffer_than_asked_for_is_told_with_both_figures(cable: Cable) -> None:
+    with open(RMEM_MAX) as file:
+        limit = int(file.read())
+    wanted = 4 * limit
+    bus = SocketCanBus("can0", {"buffer": str(wanted)})
+    assert bus.note == ""
+    bus.adopt(cable.end)
+    assert bus.granted_buffer == cable.end.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) == 2 * limit
+    assert f"receive buffer of {2 * limit} bytes granted, {wanted} wanted" in bus.note
+    assert "CAP_NET_ADMIN" in bus.note
+
+
+def test_a_buffer_that_was_granted_needs_no_words(cable: Cable) -> None:
+    bus = SocketCanBus("can0", {"buffer": "20000"})
+    bus.adopt(cable.end)
+    assert bus.granted_buffer == 20_000
+    assert bus.note == ""
+
+
+# Stamps
+
+
+def test_stamps_tell_when_a_frame_arrived_not_when_it_was_fetched(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    pass_ms(20)
+    before_ns = time.monotonic_ns()
+    for _ in range(10):
+        cable.put(0x123)
+    after_ns = time.monotonic_ns()
+    pass_ms(20)
+    batch = FrameBatch(10)
+    drain(bus, batch)
+    stamps = batch.time_ns[:10]
+    slack_ns = 5_000_000  # two clocks are read one after the other
+    assert before_ns - slack_ns <= stamps.min()
+    assert stamps.max() <= after_ns + slack_ns
+    assert np.all(np.diff(stamps) >= 0)
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600])
+def test_a_step_of_the_wall_clock_bends_no_stamp_for_long(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: int
+) -> None:
+    bus = SocketCanBus("can0")
+    opened_ns = time.monotonic_ns()
+    bus.adopt(cable.end)
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + step_s * 10**9)
+    cable.put(0x123)
+    batch = FrameBatch(10)
+    drain(bus, batch)
+    assert opened_ns <= batch.time_ns[0] <= time.monotonic_ns()
+    monkeypatch.setattr(time, "time_ns", real)
+    cable.put(0x123)
+    sent_ns = time.monotonic_ns()
+    pass_ms(20)
+    drain(bus, batch)
+    assert batch.time_ns[1] <= sent_ns + 5_000_000  # not clipped to the moment of the poll
+
+
+# What is no data
+
+
+def test_error_and_remote_frames_are_counted_and_kept_out(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch = FrameBatch(10)
+    kinds = [0x111, ERROR_FLAG | 0x40, 0x222, REMOTE_FLAG | 0x123, ERROR_FLAG | 0x4, EXTENDED_FLAG | 0x333]
+    for number, identifier in enumerate(kinds):
+        cable.put(identifier, bytes([number]))
+    drain(bus, batch)
+    assert batch.wire["identifier"][: len(batch)].tolist() == [0x111, 0x222, EXTENDED_FLAG | 0x333]
+    assert batch.wire["payload"][: len(batch), 0].tolist() == [0, 2, 5]
+    assert np.all(batch.time_ns[: len(batch)] > 0)
+    assert (bus.counters.frames, bus.counters.error_frames, bus.counters.refused) == (3, 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("number", "words", "is_down"),
+    [(errno.ENETDOWN, "bus can0 went down", True), (errno.ENODEV, "bus can0 vanished", False)],
+)
+def test_an_interface_that_fails_says_how(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int, words: str, is_down: bool
+) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    with pytest.raises(BusNotAvailable, match=words) as caught:
+        bus.receive(FrameBatch(10), 0)
+    assert caught.value.is_down is is_down
+
+
+@pytest.mark.parametrize("number", [errno.EAGAIN, errno.EINTR])
+def test_nothing_to_receive_is_no_failure(cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    assert bus.receive(FrameBatch(10), 0) == 0
+
+
+# Sending
+
+
+def test_a_listener_puts_nothing_on_the_wire(cable: Cable) -> None:
+    listener = SocketCanBus("can0", listen_only=True)
+    listener.adopt(cable.end)
+    with pytest.raises(BusSendError, match="listen only"):
+        listener.send(0x207, b"\x07\x00")
+    cable.out.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        cable.out.recv(16)
+    assert listener.counters.sent == 0
+
+
+def test_a_frame_is_sent_as_the_kernel_wants_it_or_the_failure_is_counted(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    with pytest.raises(BusSendError, match="not open"):
+        bus.send(0x207, b"\x07\x00")
+    bus.adopt(cable.end)
+    bus.send(0x207, b"\x07\x00")
+    assert cable.out.recv(100).hex() == "07020000" + "02000000" + "0700000000000000"
+    cable.out.close()
+    bus.send(0x207, b"\x07\x00")  # brings back that nobody is there any more
+    with pytest.raises(BusSendError, match="frame 207 not sent"):
+        bus.send(0x207, b"\x07\x00")
+    assert (bus.counters.sent, bus.counters.send_failures) == (2, 1)

@@ -1,9 +1,9 @@
 """The core beside iceoryx2 and zenoh: publish time, age at the reader, loss and CPU, in interleaved runs.
 
 A writer and 1, 4 or 15 readers, each in a process of its own; uint16 values; every reader wakes on data, takes every
-message in order, copies it into an array of its own and checks that it is whole. The age is the time from the stamp that
-the writer puts into the message just before it hands it over, to the reader holding its copy. Each repetition runs
-every cell with one product after the other; the table shows medians over the repetitions.
+message in order, copies it into an array of its own and checks that it is whole. The age is the time from the stamp
+that the writer puts into the message just before it hands it over, to the reader holding its copy. Each repetition
+runs every cell with one product after the other; the table shows medians over the repetitions.
 """
 
 from __future__ import annotations
@@ -44,8 +44,7 @@ def view_costs(namespace: Namespace, sensors: Iterable[int], rounds: int) -> dic
             with ServiceWriter("view", {"values": ("<u2", count)}, namespace=namespace) as writer:
                 writer.begin()["values"][:] = 1
                 writer.commit(now_ns())
-                reader: ServiceReader[Frame]
-                with ServiceReader("view", namespace=namespace, announce=False) as reader:
+                with ServiceReader[Frame]("view", namespace=namespace, announce=False) as reader:
                     passed = []
                     for _ in range(_VIEWS):
                         begin_ns = now_ns()
@@ -199,9 +198,7 @@ def main() -> None:
     parser.add_argument("--sensors", type=_numbers, help="comma-separated (default: 256,4096,30848)")
     parser.add_argument("--readers", type=_numbers, help="comma-separated, at most 16 (default: 1,4,15)")
     parser.add_argument("--rates", type=_numbers, help="Hz, comma-separated (default: 100,1000)")
-    parser.add_argument(
-        "--products", type=lambda text: text.split(","), default=["skinware", "iceoryx2", "zenoh"], help=", ".join(NAMES)
-    )
+    parser.add_argument("--products", type=lambda text: text.split(","), default=list(NAMES[:3]), help=", ".join(NAMES))
     parser.add_argument("--csv", type=Path, help="write every run's figures to this file")
     arguments = parser.parse_args()
     quick = arguments.quick

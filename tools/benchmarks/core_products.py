@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
@@ -58,12 +58,12 @@ class Product(Protocol):
     def publisher(self, topic: str, n_sensors: int) -> Publisher:
         """The writer's end; it is opened first."""
 
-    def subscriber(self, topic: str, n_sensors: int) -> Subscriber:
+    def subscriber(self, topic: str, n_sensors: int, /) -> Subscriber:
         """A reader's end."""
 
 
 class Skinware:
-    """Ours: a service of two columns; readers copy each frame in order and check it again."""
+    """Ours: a service of one column, its sequence, time stamp and flags; readers copy each frame in order."""
 
     name = "skinware"
 
@@ -73,21 +73,18 @@ class Skinware:
     def publisher(self, topic: str, n_sensors: int) -> Publisher:
         return _SkinwarePublisher(topic, n_sensors, self._namespace)
 
-    def subscriber(self, topic: str, n_sensors: int) -> Subscriber:
+    def subscriber(self, topic: str, _n_sensors: int) -> Subscriber:
         return _SkinwareSubscriber(topic, self._namespace)
 
 
 class _SkinwarePublisher:
     def __init__(self, topic: str, n_sensors: int, namespace: Namespace) -> None:
-        columns = {"head": ("<i8", HEAD), "values": ("<u2", n_sensors)}
-        self._writer = ServiceWriter(topic, columns, namespace=namespace, slots=DEPTH)
+        self._writer = ServiceWriter(topic, {"values": ("<u2", n_sensors)}, namespace=namespace, slots=DEPTH)
 
     def publish(self, phase: int, sequence: int, values: Values) -> None:
-        columns = self._writer.begin()
-        columns["values"][:] = values
-        stamp_ns = now_ns()
-        columns["head"][:] = phase, sequence, stamp_ns
-        self._writer.commit(stamp_ns)
+        self._writer.begin()["values"][:] = values
+        committed = self._writer.commit(now_ns(), flags=phase)
+        assert committed == sequence
 
     def close(self) -> None:
         self._writer.close()
@@ -100,8 +97,7 @@ class _SkinwareSubscriber:
     def messages(self) -> Iterator[Message]:
         try:
             for frame in self._reader.in_order(timeout_s=_WAIT_MS / 1000):
-                phase, sequence, stamp_ns = frame.column("head").tolist()
-                yield phase, sequence, stamp_ns, frame.column("values")
+                yield frame.flags, frame.sequence, frame.acquired_ns, frame.column("values")
         except ServiceTimeout:
             return
 
@@ -155,7 +151,7 @@ class _IceoryxEnd:
 
     def memory(self, sample: Any) -> npt.NDArray[np.uint8]:
         """The bytes of a sample, in place."""
-        return np.frombuffer(self.array_type.from_address(sample.payload_ptr), np.uint8)
+        return np.frombuffer(memoryview(self.array_type.from_address(sample.payload_ptr)), np.uint8)
 
 
 class _IceoryxPublisher:
@@ -211,7 +207,7 @@ class Zenoh:
     def publisher(self, topic: str, n_sensors: int) -> Publisher:
         return _ZenohPublisher(self._library, self._session("listen"), topic, n_sensors, self._shared_memory)
 
-    def subscriber(self, topic: str, n_sensors: int) -> Subscriber:
+    def subscriber(self, topic: str, _n_sensors: int) -> Subscriber:
         return _ZenohSubscriber(self._library, self._session("connect"), topic)
 
     def _session(self, role: str) -> Any:
@@ -276,7 +272,7 @@ def products(names: list[str], namespace: Namespace, port: int) -> list[Product]
     Raises:
         ImportError: a library of the extra ``bench`` is not installed.
     """
-    makers = {
+    makers: dict[str, Callable[[], Product]] = {
         "skinware": lambda: Skinware(namespace),
         "iceoryx2": Iceoryx2,
         "zenoh": lambda: Zenoh(port, shared_memory=True),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import secrets
 import time
 from dataclasses import asdict, dataclass
@@ -12,7 +11,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 import numpy.typing as npt
 from core_products import Product
-from processes import READY, Processes, RunFailed, answer, use_fifo
+from processes import READY, CpuShare, Processes, RunFailed, answer, use_fifo
 
 from skinware.realtime import Periodic, now_ns
 
@@ -89,22 +88,6 @@ def measure(product: Product, cell: Cell, seconds: float) -> Result:
     )
 
 
-class _CpuShare:
-    """CPU seconds of this process per second, over a stretch of time."""
-
-    def __init__(self) -> None:
-        self._begin = self._now()
-
-    @staticmethod
-    def _now() -> tuple[float, float]:
-        usage = resource.getrusage(resource.RUSAGE_SELF)
-        return usage.ru_utime + usage.ru_stime, time.monotonic()
-
-    def so_far(self) -> float:
-        cpu, passed = (now - begin for now, begin in zip(self._now(), self._begin, strict=True))
-        return cpu / passed
-
-
 def _write(pipe: Connection, product: Product, topic: str, cell: Cell, count: int) -> None:
     use_fifo(_WRITER_PRIORITY if cell.profile == "fifo" else None)
     publisher = product.publisher(topic, cell.sensors)
@@ -126,7 +109,7 @@ def _write(pipe: Connection, product: Product, topic: str, cell: Cell, count: in
     for _ in range(max(5, round(cell.rate_hz * _WARM_UP_S))):
         timer.wait()
         publish(WARM_UP)
-    share = _CpuShare()
+    share = CpuShare()
     for i in range(count):
         timer.wait()
         publish_ns[i] = publish(MEASURED)
@@ -149,7 +132,7 @@ def _read(pipe: Connection, product: Product, topic: str, cell: Cell) -> None:
         age_ns = now_ns() - stamp_ns
         if phase == MEASURED:
             if share is None:
-                share = _CpuShare()
+                share = CpuShare()
             ages.append(age_ns)
             torn += int(values[0]) != sequence & 0xFFFF or int(values[-1]) != sequence & 0xFFFF
         elif phase == OVER:

@@ -6,6 +6,7 @@ import contextlib
 import gc
 import multiprocessing
 import os
+import resource
 import shutil
 import time
 import traceback
@@ -88,6 +89,23 @@ def answer(pipe: Connection, deadline_s: float) -> Any:
     if isinstance(message, RunFailed):
         raise message
     return message
+
+
+class CpuShare:
+    """CPU seconds of this process per second, from when this object was made."""
+
+    def __init__(self) -> None:
+        self._begin = self._now()
+
+    @staticmethod
+    def _now() -> tuple[float, float]:
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        return usage.ru_utime + usage.ru_stime, time.monotonic()
+
+    def so_far(self) -> float:
+        """1.0 is one core all the time."""
+        cpu, passed = (now - begin for now, begin in zip(self._now(), self._begin, strict=True))
+        return cpu / passed
 
 
 def use_fifo(priority: int | None) -> None:

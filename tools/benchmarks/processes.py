@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Self
 
 from skinware import Namespace
+from skinware.realtime import Profile
 
 _FORK = multiprocessing.get_context("fork")  # everything is imported already: a child runs after a few ms
 READY = "ready"
@@ -109,15 +110,15 @@ class CpuShare:
 
 
 def use_fifo(priority: int | None) -> None:
-    """SCHED_FIFO for this process and the threads it starts later; None for normal scheduling."""
+    """The real-time profile for this thread and those it starts later; None for the scheduling that there is."""
     if priority is not None:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        Profile.fifo(priority).apply(strict=True)
 
 
 def may_use_fifo() -> bool:
     """Whether this user may use SCHED_FIFO; tried, then undone."""
     try:
-        use_fifo(1)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     except PermissionError:
         return False
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

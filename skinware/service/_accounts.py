@@ -15,7 +15,9 @@ _ANNOUNCE_EVERY_NS = NS_PER_S // 4
 
 
 class Accounts:
-    """Counts at the moments at which a reader is in no hurry: before it sleeps.
+    """Counts at the moments at which a reader is in no hurry: it notes times before it sleeps, and adds them up later.
+
+    With more readers than processors, what one does before it sleeps makes the next one's frame older.
 
     Args:
         namespace, service: what is read.
@@ -24,46 +26,65 @@ class Accounts:
 
     def __init__(self, namespace: Namespace, service: str, announce: bool) -> None:
         program = os.path.basename(sys.argv[0] or sys.executable)
-        self.record = ReaderRecord(service, os.getpid(), program, "on demand")
+        self._record = ReaderRecord(service, os.getpid(), program, "on demand")
         self._announcement = Announcement(namespace, service) if announce else None
         self._announced_ns = self._announced_frames = 0
         self._in_loop = False
         self._taken_ns = self._acquired_ns = 0
+        self._turns: list[tuple[int, int, int, int | None]] = []  # acquired, taken, settled; CPU time in a loop
         self._cpu_ns = 0
         self.settle()
 
+    @property
+    def record(self) -> ReaderRecord:
+        """What was counted up to now."""
+        self._add_up()
+        return self._record
+
     def begin_loop(self, kind: str) -> None:
         """The reader reads in a loop from now on, whose turns are timed."""
-        self.record.kind = kind
+        self._record.kind = kind
         self._in_loop = True
 
     def taken(self, frame: Frame, lost: int) -> None:
         """A frame is about to be handed out."""
         self._taken_ns, self._acquired_ns = now_ns(), frame.acquired_ns
-        self.record.frames += 1
-        self.record.lost += lost
+        self._record.frames += 1
+        if lost:
+            self._record.lost += lost
 
     def settle(self) -> None:
-        """Count what was done since the last call, and tell everybody now and then."""
+        """Note what was done since the last call; add up and tell everybody now and then."""
         time_ns = now_ns()
-        record = self.record
         if self._taken_ns:
-            age_ns = self._taken_ns - self._acquired_ns
+            cpu_ns = time.thread_time_ns() if self._in_loop else None
+            self._turns.append((self._acquired_ns, self._taken_ns, time_ns, cpu_ns))
+            self._taken_ns = 0
+        if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
+            self._add_up()
+            self._announce(time_ns)
+
+    def _add_up(self) -> None:
+        record = self._record
+        turns, self._turns = self._turns, []
+        for acquired_ns, taken_ns, settled_ns, cpu_ns in turns:
+            age_ns = taken_ns - acquired_ns
             record.age.add(age_ns)
             record.age_ms = round(age_ns / 1e6, 3)
-            if self._in_loop:
-                record.wall.add(time_ns - self._taken_ns)
-                cpu_ns = time.thread_time_ns()
+            if cpu_ns is not None:
+                record.wall.add(settled_ns - taken_ns)
                 if 0 < self._cpu_ns <= cpu_ns:
                     record.cpu.add(cpu_ns - self._cpu_ns)
                 self._cpu_ns = cpu_ns
-            self._taken_ns = 0
-        passed_ns = time_ns - self._announced_ns
-        if passed_ns >= _ANNOUNCE_EVERY_NS and self._announcement is not None:
-            if self._announced_ns:
-                record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
+
+    def _announce(self, time_ns: int) -> None:
+        record = self._record
+        if self._announced_ns:
+            passed_ns = time_ns - self._announced_ns
+            record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
+        if self._announcement is not None:
             self._announcement.write(record)
-            self._announced_ns, self._announced_frames = time_ns, record.frames
+        self._announced_ns, self._announced_frames = time_ns, record.frames
 
     def close(self) -> None:
         """Take the announcement back. Idempotent."""

@@ -103,3 +103,16 @@ def test_a_futex_wait_ends_by_another_value_or_a_wake_up() -> None:
     _futex.Word(memory.ctypes.data).wake_all()
     thread.join(20)
     assert woken.is_set()
+
+
+@pytest.mark.parametrize("announce", [True, False])
+def test_every_turn_is_counted_although_it_is_added_up_later(announce: bool) -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x", announce=announce) as reader:
+        frames = reader.in_order(timeout_s=5)
+        for value in range(1, 21):
+            publish(writer, value)
+            assert next(frames).sequence == value
+            assert reader.statistics.frames == value
+            assert reader.statistics.age.total == value - 1  # the one in hand is counted when its turn ends
+        assert reader.statistics.wall.count == 19
+        assert reader.statistics.cpu.count == 18

@@ -131,7 +131,7 @@ class BusLine:
                 await self.adapter.configure(self.link)
                 await self.adapter.start(self.link)
             except BusError as error:
-                log.warning("%s: set-up failed: %s; trying again", self.name, error)
+                log.warning("%s: set-up failed: %s; trying again", self.name, str(error))
             else:
                 self.started = True
                 return

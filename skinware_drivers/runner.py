@@ -79,6 +79,7 @@ class Runner:
         self._timer: asyncio.TimerHandle | None = None
         self._known_patch_state = np.zeros(0, np.uint8)
         self._join_requested = asyncio.Event()
+        self._begun_ns = 0  # the present generation
 
     @property
     def _payload_size(self) -> int:
@@ -154,6 +155,8 @@ class Runner:
 
     async def _check_data(self, line: BusLine) -> None:
         """Wait for the first data of every patch, and name those that send none."""
+        async with self._built:  # other buses may still be asked what hangs on them
+            await self._built.wait_for(lambda: self.publisher is not None)
         timer = Periodic(_DATA_CHECKS_HZ)
         for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * line.adapter.period_s))):
             if not line.lost.is_set() and not self._patches_in(line, PatchState.EXPECTED):
@@ -173,7 +176,7 @@ class Runner:
             try:
                 patches = await line.adapter.join(line.link, line.patches or ())
             except BusError as error:
-                log.warning("%s: nothing joined: %s", line.name, error)
+                log.warning("%s: nothing joined: %s", line.name, str(error))
                 continue
             if patches and patches != line.patches:
                 line.patches = patches
@@ -197,6 +200,7 @@ class Runner:
             if self.decoder is not None and tables.structure == self.decoder.tables.structure:
                 return
             self._go_over_to(tables, adapter)
+            self._built.notify_all()
 
     def _go_over_to(self, tables: SkinTables, adapter: AnyAdapter) -> None:
         if self.writer is None:
@@ -219,6 +223,7 @@ class Runner:
         self.publisher = Publisher(self.writer, self.decoder, self._watch, adapter.period_s, adapter.by_cycle)
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self._known_patch_state = self.publisher.patch_state.copy()
+        self._begun_ns = now_ns()
         self._publish_when_due()
 
     # -- data -----------------------------------------------------------------------------------------------------
@@ -294,8 +299,8 @@ class Runner:
     async def _recover_silent_patches(self, line: BusLine) -> None:
         if self._listen_only or line.lost.is_set():
             return
-        if now_ns() - line.opened_ns < 2 * self._silence_ns:
-            return  # the bus was away, not the boards: they are set up, and to do it again would move their baseline
+        if now_ns() - max(line.opened_ns, self._begun_ns) < 2 * self._silence_ns:
+            return  # nobody listened, the boards may send: to set them up again would move their baseline
         for patch in [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]:
             publisher, watch = self.publisher, self._watch
             if publisher is None or watch is None:
@@ -308,7 +313,7 @@ class Runner:
                 await line.adapter.revive(line.link, self._patch_of(line, patch))
                 watch.forget(patch)
             except BusError as error:
-                log.debug("%s: %s", line.name, error)
+                log.debug("%s: %s", line.name, str(error))
                 publisher.patch_state[patch] = PatchState.STALE
 
     def _patches_in(self, line: BusLine, state: PatchState) -> list[int]:

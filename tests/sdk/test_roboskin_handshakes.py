@@ -138,20 +138,22 @@ def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
     monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...]
 ) -> None:
     monkeypatch.setattr(roboskin, "_REPLY_S", 0.05)
-    monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.4)
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), pattern="idle")))
-    buses = emulated(boards=(7,), pattern="idle"), VirtualCanBus.with_hardware(late)
+    log: list[msgspec.Struct] = []
+    buses = emulated(log, boards=(7,), pattern="idle"), VirtualCanBus.with_hardware(late)
     with driving(*buses, boards=boards) as running, DriverReader("roboskin") as reader:
         frame = read_until(reader, lambda f: not f.status.any())
         assert patches_of(reader) == ["board 7"]
         asked = buses[1].counters.sent
         later = read_until(reader, lambda f: buses[1].counters.sent >= asked + 3)
         assert later.generation == frame.generation
+        before = len(commands(log))
         running.do(lambda: setattr(late, "present", True))
         wait_until(lambda: reader.latest is not None and reader.structure_changed)
         reader.reattach()
         frame = read_until(reader, lambda f: not f.status.any())
         assert frame.structure.sensor_uid[[0, 192]].tolist() == [7 << 16, 1 << 32 | 7 << 16]
+        assert len(commands(log)) == before  # to set it up again would move its baseline
 
 
 # What they are told

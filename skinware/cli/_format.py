@@ -8,10 +8,12 @@ NO_VALUE = "-"
 
 
 def age_text(age_ns: int | float | None) -> str:
-    """A duration with its unit, in three figures or so: ``0.6 ms``, ``12 ms``, ``3.4 s``, ``5 min``, ``7 h``."""
+    """A duration with its unit, in two figures or so: ``40 us``, ``0.6 ms``, ``12 ms``, ``3.4 s``, ``5 min``."""
     if age_ns is None:
         return NO_VALUE
     milliseconds = max(0.0, age_ns / 1e6)
+    if 0 < milliseconds < 0.0995:
+        return f"{max(1, round(milliseconds * 1e3))} us"
     if milliseconds < 9.95:
         return f"{milliseconds:.1f} ms"
     if milliseconds < 999.5:

@@ -10,9 +10,10 @@ import numpy as np
 from skinware.cli._health import bus_state_name, life_of, patch_ages_ns, patch_state_name, rate_now_hz, status_now
 from skinware.driver_service import KIND, DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
-from skinware.memory.announcement import living_readers
+from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
+from skinware.memory.statistics import WriterStatistics
 from skinware.service import ServiceReader
 
 FrameT = TypeVar("FrameT", bound=Frame)
@@ -33,7 +34,7 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
     drivers: list[dict[str, Any]] = []
     services: list[dict[str, Any]] = []
     problems: list[str] = []
-    readers = [msgspec.structs.asdict(record) for record in living_readers(namespace)]
+    readers = [_reader(record) for record in living_readers(namespace)]
     for name in [only] if only is not None else namespace.services():
         try:
             entry = _describe(namespace, name)
@@ -72,7 +73,8 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
 def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
     with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
         if service.kind != KIND:
-            return _common(service, _newest(service))
+            told = {"description": service.schema.description, "columns": _columns(service)}
+            return _common(service, _newest(service)) | told
     with DriverReader(name, namespace=namespace, announce=False) as driver:
         frame = _newest(driver)
         common = _common(driver, frame)
@@ -102,7 +104,39 @@ def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
         "age_ms": round(frame.age_ns / 1e6, 3) if frame else None,
         "missed_periods": service.missed_periods,
         "generation": service.generation,
+        "statistics": _times(service.writer_statistics),
     }
+
+
+def _reader(record: ReaderRecord) -> dict[str, Any]:
+    return msgspec.structs.asdict(record) | _times(record)
+
+
+def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
+    """How long things took: extremes and means, histograms with two bounds taken from them."""
+    spreads = {
+        name: {"count": s.count, "best_ns": s.best_ns, "mean_ns": round(s.mean_ns), "worst_ns": s.worst_ns}
+        for name, s in (("wall", of.wall), ("cpu", of.cpu))
+    }
+    histograms = {
+        name: {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
+        for name, h in (("age", of.age), ("lateness", of.lateness))
+    }
+    return spreads | histograms
+
+
+def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
+    """What a service's frames consist of."""
+    return [
+        {
+            "name": name,
+            "dtype": np.lib.format.dtype_to_descr(column.dtype),
+            "shape": column.shape,
+            "unit": column.unit,
+            "description": column.description,
+        }
+        for name, column in service.schema.columns.items()
+    ]
 
 
 def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[str, Any]:

@@ -67,7 +67,8 @@ def as_text(found: dict[str, Any]) -> list[str]:
     for driver in drivers:
         lines += ["", *_driver_lines(driver)]
     for service in services:
-        lines += ["", _life_line("service", service), *_indented(_reader_lines(service))]
+        own = [*_column_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
+        lines += ["", _life_line("service", service), *_indented(own)]
     if found["problems"]:
         lines += ["", *(click.style("problem: ", fg="red") + text for text in found["problems"])]
     return lines
@@ -101,7 +102,47 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             {"orphans"},
         ),
     ]
-    return [_life_line("driver", driver), *_indented([*lines, "", *_reader_lines(driver)])]
+    return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
+
+
+def _column_lines(service: dict[str, Any]) -> list[str]:
+    """What the frames of a service that is no driver consist of."""
+    rows = [
+        [c["name"], _dtype_text(c["dtype"]), "x".join(map(str, c["shape"])) or "1", c["unit"], c["description"]]
+        for c in service["columns"]
+    ]
+    titles = ["column", "dtype", "shape", "unit", "description"]
+    while not any(row[-1] for row in rows) and len(titles) > 3:
+        titles, rows = titles[:-1], [row[:-1] for row in rows]
+    described = [service["description"]] if service["description"] else []
+    return [*described, *table(titles, rows, left=len(titles))]
+
+
+def _dtype_text(descr: Any) -> str:
+    import numpy as np
+
+    if isinstance(descr, str):
+        return np.dtype(descr).name
+    return "{" + ", ".join(f"{field[0]}: {_dtype_text(field[1])}" for field in descr) + "}"
+
+
+def _statistics_lines(entry: dict[str, Any]) -> list[str]:
+    """How long its writer takes, once it has published anything."""
+    told = entry["statistics"]
+    if not told["wall"]["count"]:
+        return []
+    wall, cpu = told["wall"], told["cpu"]
+    text = (
+        f"a frame takes its writer {age_text(wall['mean_ns'])} (worst {age_text(wall['worst_ns'])}),"
+        f" {age_text(cpu['mean_ns'])} of a processor; 99 % of them hold data up to {_bound(told['age'])} old"
+    )
+    if told["lateness"]["p99_ns"] is not None:
+        text += f" and begin up to {_bound(told['lateness'])} late"
+    return [text]
+
+
+def _bound(histogram: dict[str, Any]) -> str:
+    return age_text(histogram["p99_ns"])
 
 
 def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
@@ -157,12 +198,16 @@ def _reader_lines(entry: dict[str, Any]) -> list[str]:
             str(reader["pid"]),
             rate_text(reader["rate_hz"]),
             age_text(reader["age_ms"] * 1e6),
+            _bound(reader["age"]),
+            age_text(reader["wall"]["mean_ns"] if reader["wall"]["count"] else None),
+            age_text(reader["cpu"]["mean_ns"] if reader["cpu"]["count"] else None),
             count_text(reader["frames"]),
             count_text(reader["lost"]),
         ]
         for reader in entry["readers"]
     ]
-    return table(("reader", "how", "pid", "rate", "data age", "frames", "not taken"), rows, left=2)
+    titles = ("reader", "how", "pid", "rate", "data age", "99 % below", "its loop", "CPU", "frames", "not taken")
+    return table(titles, rows, left=2)
 
 
 def _indented(lines: list[str]) -> list[str]:

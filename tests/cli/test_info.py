@@ -9,13 +9,15 @@ import subprocess
 from itertools import islice
 from typing import Any
 
+import numpy as np
 import pytest
 
-from skinware import DriverReader, Namespace, ServiceWriter
+from skinware import Column, DriverReader, Namespace, ServiceWriter
 from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
 from skinware.realtime import now_ns
+from skinware.service import Columns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
@@ -59,7 +61,12 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     ]
     (record,) = driver["readers"]
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
-    assert record.keys() == {"service", "pid", "program", "kind", "frames", "lost", "rate_hz", "age_ms"}
+    counts = {"frames", "lost", "overruns", "missed_periods", "rate_hz", "age_ms"}
+    assert record.keys() == {"service", "pid", "program", "kind", "wall", "cpu", "age", "lateness"} | counts
+    assert driver["statistics"]["wall"]["count"] == 3
+    assert driver["statistics"]["wall"]["worst_ns"] >= driver["statistics"]["wall"]["mean_ns"] > 0
+    assert sum(driver["statistics"]["age"]["counts"]) == 3
+    assert driver["statistics"]["lateness"]["p99_ns"] is None  # it is not periodic
     assert (driver["state"], driver["driver_type"], driver["dtype"]) == ("live", "fake", "uint8")
     assert (driver["paused"], driver["missed_periods"]) == (False, 0)
     first, second = driver["patch_list"]
@@ -146,6 +153,28 @@ def test_other_services_are_shown_beside_drivers(capsys: pytest.CaptureFixture[s
         assert service["age_ms"] > 0
         assert service["readers"] == []
         assert "service contacts: live" in text(capsys)
+
+
+def test_a_service_says_what_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    pose = np.dtype([("position", "<f8", (3,)), ("valid", "u1")])
+    columns: Columns = {"force": Column(np.dtype("f4"), (2, 3), unit="N"), "pose": (pose, 1)}
+    with ServiceWriter("arm", columns, description="forces at the arm's two ends"):
+        (service,) = told(capsys)["services"]
+        assert service["description"] == "forces at the arm's two ends"
+        assert service["columns"] == [
+            {"name": "force", "dtype": "<f4", "shape": [2, 3], "unit": "N", "description": ""},
+            {
+                "name": "pose",
+                "dtype": [["position", "<f8", [3]], ["valid", "|u1"]],
+                "shape": [1],
+                "unit": "",
+                "description": "",
+            },
+        ]
+        lines = text(capsys).splitlines()
+        assert "  forces at the arm's two ends" in lines
+        assert "  force   float32                            2x3    N" in lines
+        assert "  pose    {position: float64, valid: uint8}  1" in lines
 
 
 def test_a_name_narrows_it_down(capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,8 +270,13 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
     assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
     assert re.fullmatch(r"  board 8  can1  stale +0 of 48 +[\d.]+ ms +0 +0", lines[12])
-    assert lines[14].split()[:3] == ["reader", "how", "pid"]
-    assert "on demand" in lines[15]
+    assert re.fullmatch(
+        r"  a frame takes its writer [\d.]+ [mu]s \(worst [\d.]+ [mu]s\), [\d.]+ [mu]s of a processor;"
+        r" 99 % of them hold data up to [\d.]+ [a-z]+ old",
+        lines[14],
+    )
+    assert lines[15].split()[:3] == ["reader", "how", "pid"]
+    assert "on demand" in lines[16]
     assert max(map(len, lines)) <= 100
     assert "\x1b" not in out  # no colours without a terminal
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -27,6 +27,9 @@ from skinware.structure import Index, Structure
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
+
+Told = Callable[[str, Structure], object]
+"""Called with a driver's name and a structure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,41 @@ class SkinLayout:
         return np.concatenate(
             [np.full(len(self.structures[driver].sensor_uid[index]), driver) for driver, index in self.parts(type_name)]
         )
+
+    def position(self, type_name: str, uid: int, driver: str | None = None) -> int:
+        """Where a sensor is in the order of ``Snapshot.physical``.
+
+        Args:
+            type_name: its type.
+            uid: its uid, unique among the sensors of that type of one driver.
+            driver: which driver's, where several have it.
+
+        Raises:
+            StructureError: there is none, or several drivers have one.
+        """
+        found = self._positions(type_name).get(uid, [])
+        if driver is not None:
+            of = self.driver_of(type_name)
+            found = [position for position in found if self.drivers[of[position]] == driver]
+        if len(found) == 1:
+            return found[0]
+        whose = f" of driver {driver!r}" if driver is not None else ""
+        if not found:
+            raise StructureError(f"no {type_name!r} sensor with uid {uid:#x}{whose} in this skin")
+        names = ", ".join(self.drivers[self.driver_of(type_name)[position]] for position in found)
+        raise StructureError(f"several drivers have a {type_name!r} sensor with uid {uid:#x}: {names}; say which")
+
+    def _positions(self, type_name: str) -> dict[int, list[int]]:
+        if type_name not in self._by_uid:
+            positions: dict[int, list[int]] = {}
+            for position, uid in enumerate(self.uids(type_name).tolist()):
+                positions.setdefault(uid, []).append(position)
+            self._by_uid[type_name] = positions
+        return self._by_uid[type_name]
+
+    @cached_property
+    def _by_uid(self) -> dict[str, dict[int, list[int]]]:
+        return {}
 
     def __repr__(self) -> str:
         sensors = sum(structure.n_sensors for structure in self.structures)
@@ -135,13 +173,24 @@ class Skin:
 
     Args:
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
+        on_attach: called with a driver's name and structure when it joins, before the first snapshot that has it.
+        on_detach: called with its name and last structure when it leaves.
+        on_structure: called with its name and new structure when it came back with another one.
 
     Raises:
         ConfigurationError: a bad namespace name in the environment.
     """
 
-    def __init__(self, namespace: Namespace | None = None) -> None:
+    def __init__(
+        self,
+        namespace: Namespace | None = None,
+        *,
+        on_attach: Told | None = None,
+        on_detach: Told | None = None,
+        on_structure: Told | None = None,
+    ) -> None:
         self.namespace = namespace or Namespace()
+        self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._readers: dict[str, DriverReader] = {}
         self._layout = SkinLayout((), ())
         self._next_discovery_ns = 0
@@ -212,6 +261,10 @@ class Skin:
     def __iter__(self) -> Iterator[Snapshot]:
         return self.frames()
 
+    def stop(self) -> None:
+        """End a wait in another thread with ``Closed``, within 50 ms; that thread then closes this skin."""
+        self._closed = True
+
     def close(self) -> None:
         """Detach from all drivers; snapshots stay readable. Idempotent."""
         self._closed = True
@@ -234,7 +287,19 @@ class Skin:
         if drivers != self._layout.drivers or any(
             a is not b for a, b in zip(structures, self._layout.structures, strict=True)
         ):
-            self._layout = SkinLayout(drivers, structures)
+            before, self._layout = self._layout, SkinLayout(drivers, structures)
+            self._tell(before, self._layout)
+
+    def _tell(self, before: SkinLayout, after: SkinLayout) -> None:
+        old, new = (dict(zip(layout.drivers, layout.structures, strict=True)) for layout in (before, after))
+        for name, structure in old.items():
+            if name not in new and self._on_detach is not None:
+                self._on_detach(name, structure)
+        for name, structure in new.items():
+            if name not in old and self._on_attach is not None:
+                self._on_attach(name, structure)
+            elif name in old and old[name] is not structure and self._on_structure is not None:
+                self._on_structure(name, structure)
 
     def _attach(self, name: str) -> DriverReader | None:
         try:

@@ -132,13 +132,12 @@ def _statistics_lines(entry: dict[str, Any]) -> list[str]:
     if not told["wall"]["count"]:
         return []
     wall, cpu = told["wall"], told["cpu"]
-    text = (
-        f"a frame takes its writer {age_text(wall['mean_ns'])} (worst {age_text(wall['worst_ns'])}),"
-        f" {age_text(cpu['mean_ns'])} of a processor; 99 % of them hold data up to {_bound(told['age'])} old"
-    )
+    worst, on_cpu = age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
+    lines = [f"a frame takes its writer {age_text(wall['mean_ns'])} (worst {worst}), {on_cpu} of a processor"]
+    lines.append(f"99 % of its frames hold data up to {_bound(told['age'])} old when published")
     if told["lateness"]["p99_ns"] is not None:
-        text += f" and begin up to {_bound(told['lateness'])} late"
-    return [text]
+        lines.append(f"99 % of its periods begin up to {_bound(told['lateness'])} late")
+    return lines
 
 
 def _bound(histogram: dict[str, Any]) -> str:

@@ -283,6 +283,10 @@ class ServiceReader(Generic[F]):
         """
         self._adopt(self._attach(self._ring))
 
+    def stop(self) -> None:
+        """End a wait in another thread with ``Closed``, within 50 ms; that thread then closes this reader."""
+        self._closed = True
+
     def close(self) -> None:
         """Stop reading and take the announcement back. Frames that were handed out stay readable. Idempotent."""
         self._closed = True

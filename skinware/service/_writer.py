@@ -66,7 +66,7 @@ class ServiceWriter:
         self.name = check_name(name, "service")
         self.namespace = namespace or Namespace()
         self.missed_periods = 0
-        self._paused = False
+        self._paused = self._stopping = False
         self._kind = kind
         self._slots = slots
         self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
@@ -147,7 +147,7 @@ class ServiceWriter:
             from_last: as for ``begin``.
         """
         timer = Periodic(rate_hz)
-        while timer.wait(lambda: self.closed):
+        while timer.wait(self._must_end):
             if timer.missed > self.missed_periods:
                 self._ring.count_missed_periods(timer.missed - self.missed_periods)
                 self.missed_periods = timer.missed
@@ -168,7 +168,7 @@ class ServiceWriter:
         Args:
             from_last: as for ``begin``.
         """
-        while not self.closed:
+        while not self._must_end():
             waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
             if waiting and not self._paused:
                 acquired_ns = now_ns()
@@ -223,6 +223,13 @@ class ServiceWriter:
             raise
         self._ring.segment.descriptor.close()
         self._ring = ring
+
+    def stop(self) -> None:
+        """End ``periodic`` or ``on_request`` in another thread, within 50 ms; that thread then closes this writer."""
+        self._stopping = True
+
+    def _must_end(self) -> bool:
+        return self._stopping or self.closed
 
     @property
     def closed(self) -> bool:

@@ -1,0 +1,257 @@
+"""Callbacks in threads of their own, for programs that would rather be called than loop.
+
+::
+
+    def show(frame):
+        print(frame.physical("pressure").max())
+
+    with skinware.threads.read(skinware.DriverReader("roboskin"), show, rate_hz=30):
+        ...  # do something else
+
+The thread owns what it was given, and closes it at its end. Its callback must not be slow for long: a reader then loses
+frames, a writer misses periods; nobody else is held up.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+import numpy.typing as npt
+
+from skinware.errors import Closed, ServiceTimeout, StructureChanged
+from skinware.memory.ring import Frame
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
+from skinware.service import ServiceReader, ServiceWriter
+from skinware.skin import Skin, Snapshot
+
+log = logging.getLogger("skinware.threads")
+
+T = TypeVar("T")
+F = TypeVar("F", bound=Frame)
+
+
+class _Stoppable(Protocol):
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Worker(Generic[T]):
+    """A thread that calls a function again and again.
+
+    Args:
+        name: of the thread.
+        owned: what it works on; closed at its end.
+        items: what the function is called with.
+        function: called in the thread; if it raises, the worker ends (``error``).
+        profile: how the thread is scheduled.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        owned: _Stoppable,
+        items: Callable[[], Iterator[T]],
+        function: Callable[[T], object],
+        profile: Profile | None = None,
+    ) -> None:
+        self.error: BaseException | None = None
+        self._owned = owned
+        self._items = items
+        self._function = function
+        self._profile = profile
+        self._running = threading.Event()
+        self._running.set()
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def active(self) -> bool:
+        """Whether it works: neither paused, nor stopped, nor ended by an error."""
+        return self._thread.is_alive() and not self.paused
+
+    @property
+    def paused(self) -> bool:
+        """Whether ``pause`` was called last."""
+        return not self._running.is_set()
+
+    def pause(self) -> None:
+        """Call the function no more until ``resume``."""
+        self._running.clear()
+
+    def resume(self) -> None:
+        """Go on after ``pause``, with what is newest then."""
+        self._running.set()
+
+    def stop(self) -> None:
+        """End the thread and wait for it. Idempotent; not from within the function itself.
+
+        Raises:
+            BaseException: what the function raised, if that ended it.
+        """
+        self._owned.stop()
+        self._running.set()
+        self._thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _work(self) -> None:
+        try:
+            if self._profile is not None:
+                self._profile.apply()
+            for item in self._items():
+                if self.paused:
+                    self._running.wait()
+                    continue
+                self._function(item)
+        except Closed:
+            pass  # the usual end
+        except BaseException as error:  # noqa: BLE001, whatever it is belongs to the thread that calls stop()
+            self.error = error
+            log.error("%s ended: %s: %s", self._thread.name, type(error).__name__, error)
+        finally:
+            self._owned.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+def read(
+    reader: ServiceReader[F],
+    function: Callable[[F], object],
+    *,
+    rate_hz: float | None = None,
+    in_order: bool = False,
+    profile: Profile | None = None,
+) -> Worker[F]:
+    """Call a function with the frames of a service.
+
+    When the service comes back with another structure, its frames of that structure follow.
+
+    Args:
+        reader: belongs to the thread from now on.
+        function: called with each frame, a private copy.
+        rate_hz: None: each time the writer publishes; otherwise at this rate with what is newest.
+        in_order: every frame instead of the newest.
+        profile: how the thread is scheduled.
+    """
+
+    def frames() -> Iterator[F]:
+        while True:
+            try:
+                yield from reader.in_order() if in_order else reader.frames(rate_hz)
+                return
+            except StructureChanged:
+                reader.reattach()
+
+    return Worker(f"reader of {reader.name}", reader, frames, function, profile)
+
+
+def write(
+    writer: ServiceWriter,
+    function: Callable[[dict[str, npt.NDArray[Any]]], object],
+    *,
+    rate_hz: float | None = None,
+    from_last: bool = False,
+    profile: Profile | None = None,
+) -> Worker[dict[str, npt.NDArray[Any]]]:
+    """Call a function to fill each frame of a service.
+
+    Args:
+        writer: belongs to the thread from now on.
+        function: called with the arrays of the next frame, to be filled in place.
+        rate_hz: at this rate; None: whenever a program asks for a frame.
+        from_last: the arrays hold the newest frame first.
+        profile: how the thread is scheduled.
+    """
+
+    def frames() -> Iterator[dict[str, npt.NDArray[Any]]]:
+        if rate_hz is None:
+            return writer.on_request(from_last=from_last)
+        return writer.periodic(rate_hz, from_last=from_last)
+
+    if rate_hz is None:
+        writer.request_server()  # programs may ask from now on
+    return _WriterWorker(f"writer of {writer.name}", writer, frames, function, profile)
+
+
+class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
+    """While it is paused, readers and requesters are told so."""
+
+    _owned: ServiceWriter
+
+    @property
+    def paused(self) -> bool:
+        return self._owned.paused
+
+    def pause(self) -> None:
+        self._owned.pause()
+
+    def resume(self) -> None:
+        self._owned.resume()
+
+
+class SkinReplica(Worker[Snapshot]):
+    """The whole skin, kept up to date by a thread, for any number of other threads to look at.
+
+    Every snapshot is whole and never changes: per driver it is one published frame.
+
+    Args:
+        skin: belongs to the thread from now on.
+        function: called in the thread with each new snapshot.
+        rate_hz: None: each time a driver publishes; otherwise at this rate.
+        profile: how the thread is scheduled.
+    """
+
+    def __init__(
+        self,
+        skin: Skin | None = None,
+        function: Callable[[Snapshot], object] = lambda _: None,
+        *,
+        rate_hz: float | None = None,
+        profile: Profile | None = None,
+    ) -> None:
+        self._snapshot: Snapshot | None = None
+        self._news = threading.Condition()
+        skin = skin or Skin()
+
+        def keep(snapshot: Snapshot) -> None:
+            with self._news:
+                self._snapshot = snapshot
+                self._news.notify_all()
+            function(snapshot)
+
+        super().__init__("replica of the skin", skin, lambda: skin.frames(rate_hz), keep, profile)
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """The newest snapshot, None before the first."""
+        return self._snapshot
+
+    def wait(self, *, newer_than: Snapshot | None = None, timeout_s: float = 5.0) -> Snapshot:
+        """The next snapshot.
+
+        Args:
+            newer_than: another than this one. Default: any.
+            timeout_s: longest wait.
+
+        Raises:
+            ServiceTimeout: none came in time.
+            Closed: the replica was stopped, or ended by an error.
+        """
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        with self._news:
+            while self._snapshot is None or self._snapshot is newer_than:
+                if not self._thread.is_alive():
+                    raise Closed(f"the replica of the skin has ended{f' ({self.error})' if self.error else ''}")
+                remaining_ns = deadline_ns - now_ns()
+                if remaining_ns <= 0:
+                    raise ServiceTimeout(f"nothing new on the skin within {timeout_s:g} s (skin-info shows who runs)")
+                self._news.wait(min(remaining_ns, WAIT_SLICE_NS) / NS_PER_S)
+            return self._snapshot

@@ -358,12 +358,12 @@ class Skin:
         return f"<Skin of namespace {self.namespace.name!r}: {', '.join(self._readers) or 'no driver'}>"
 
 
-def _sleep_on(words: list[tuple[int, int]], until_ns: int) -> None:
+def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
     """Sleep until any of the futex words changes or the time comes; may return early."""
     remaining_ns = max(0, until_ns - now_ns())
     if len(words) == 1:
-        address, expected = words[0]
-        _futex.Word(address).wait(expected, remaining_ns)
+        word, expected = words[0]
+        word.wait(expected, remaining_ns)
     elif not words:
         time.sleep(remaining_ns / NS_PER_S)
     elif not _futex.wait_any(words[: _futex.MAX_WORDS], until_ns):

@@ -111,7 +111,7 @@ class Worker(Generic[T]):
             pass  # the usual end
         except BaseException as error:  # noqa: BLE001, whatever it is belongs to the thread that calls stop()
             self.error = error
-            log.error("%s ended: %s: %s", self._thread.name, type(error).__name__, error)
+            log.error("%s ended: %s: %s", self._thread.name, type(error).__name__, str(error))
         finally:
             self._owned.close()
 
@@ -176,8 +176,7 @@ def write(
             return writer.on_request(from_last=from_last)
         return writer.periodic(rate_hz, from_last=from_last)
 
-    if rate_hz is None:
-        writer.request_server()  # programs may ask from now on
+    writer.request_server()  # programs may ask from now on
     return _WriterWorker(f"writer of {writer.name}", writer, frames, function, profile)
 
 

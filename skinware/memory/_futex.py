@@ -9,6 +9,9 @@ import struct
 from collections.abc import Sequence
 from errno import EAGAIN, EINTR, ENOSYS, ETIMEDOUT
 
+import numpy as np
+import numpy.typing as npt
+
 from skinware.errors import PlatformError
 from skinware.realtime import NS_PER_S
 
@@ -47,17 +50,23 @@ _all_waiters = ctypes.c_int(_EVERYBODY)
 
 
 class Word:
-    """A futex word at a fixed address, which must stay mapped. Not for several threads at once.
+    """A futex word in an array, which it keeps mapped. Not for several threads at once.
 
     After a sleep the processor's caches are cold, and each object that need not be touched then is time saved:
     the arguments of the system calls are made here, and what could go wrong with them is found here.
+
+    Args:
+        memory: (n,) uint8.
+        offset: of the word in it, bytes.
 
     Raises:
         OSError: the kernel refuses the address.
     """
 
-    def __init__(self, address: int) -> None:
-        self._address = ctypes.c_void_p(address)
+    def __init__(self, memory: npt.NDArray[np.uint8], offset: int) -> None:
+        self._memory = memory
+        self.address = memory.ctypes.data + offset
+        self._address = ctypes.c_void_p(self.address)
         self._expected = ctypes.c_uint32()
         self._timeout = _Timespec()
         self._timeout_at = ctypes.byref(self._timeout)
@@ -84,18 +93,20 @@ class Word:
         _sleep(_sys_futex, self._address, _wait, self._expected, self._timeout_at)
 
 
-def wait_any(words: Sequence[tuple[int, int]], deadline_ns: int) -> bool:
+def wait_any(words: Sequence[tuple[Word, int]], deadline_ns: int) -> bool:
     """Sleep until one of several words is woken or differs from its expected value, or the deadline is there.
 
     Args:
-        words: (address, expected) pairs, 1 to :data:`MAX_WORDS`.
+        words: with what is expected in each, 1 to :data:`MAX_WORDS`.
         deadline_ns: CLOCK_MONOTONIC ns.
 
     Returns:
         False if the kernel is older than 5.16 and cannot do it; the caller then polls.
     """
     entry = struct.Struct("QQII")  # struct futex_waitv: val, uaddr, flags, reserved
-    table = ctypes.create_string_buffer(b"".join(entry.pack(value, at, _FUTEX_32, 0) for at, value in words))
+    table = ctypes.create_string_buffer(
+        b"".join(entry.pack(value, word.address, _FUTEX_32, 0) for word, value in words)
+    )
     deadline = _Timespec(deadline_ns // NS_PER_S, deadline_ns % NS_PER_S)
     result = _syscall(
         ctypes.c_long(_SYS_FUTEX_WAITV),

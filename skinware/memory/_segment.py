@@ -54,10 +54,6 @@ class Segment:
         """Unique per creation, growing."""
         return int(self.header["generation"])
 
-    def address(self, offset: int) -> int:
-        """Memory address of a byte of the file."""
-        return self.data.ctypes.data + offset
-
     def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
         """(shape, dtype, offset in the slot) of every column of a slot, by name."""
         columns = self.schema.columns
@@ -81,7 +77,7 @@ class Segment:
         control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
         control["state"] |= state
         control["wake_word"] += np.uint32(1)
-        _futex.Word(self.address(_layout.WAKE_WORD_OFFSET)).wake_all()
+        _futex.Word(self.data, _layout.WAKE_WORD_OFFSET).wake_all()
 
 
 def take_name(namespace: Namespace, name: str) -> Descriptor:

@@ -129,8 +129,7 @@ class RingReader(Generic[F]):
         self.generation = segment.generation
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
-        self.wake_address = segment.address(_layout.WAKE_WORD_OFFSET)
-        self._wake_word = _futex.Word(self.wake_address)
+        self.wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slots = _slots(segment)
         self._slot_words = _slot_headers(segment)
@@ -161,7 +160,7 @@ class RingReader(Generic[F]):
         Returns:
             Whether the newest frame is another than ``latest`` now.
         """
-        self._wake_word.wait(wake_count, timeout_ns)
+        self.wake_word.wait(wake_count, timeout_ns)
         return self._words[_LATEST] != latest
 
     def copy(self, sequence: int | None = None) -> F | None:
@@ -238,7 +237,7 @@ class RingWriter:
         self.segment = segment
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
-        self._wake_word = _futex.Word(segment.address(_layout.WAKE_WORD_OFFSET))
+        self._wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slot_words = _slot_headers(segment)
         self._columns = [

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from skinware.errors import Closed, Overrun, PeerGone, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory import _layout, _segment
+from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import Frame, RingReader
@@ -134,9 +135,9 @@ class ServiceReader(Generic[F]):
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
 
-    def wake_word(self) -> tuple[int, int]:
-        """(address, present value) of the futex that every publication wakes; take it before ``latest``."""
-        return self._ring.wake_address, self._ring.wake_count
+    def wake_word(self) -> tuple[Word, int]:
+        """The futex that every publication wakes, and its present value; take it before ``latest``."""
+        return self._ring.wake_word, self._ring.wake_count
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns of the generation that is being read, read-only."""

@@ -6,7 +6,7 @@ Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self, cast
 
 import numpy as np
@@ -16,7 +16,7 @@ from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import _segment
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import DEFAULT_SLOTS, Columns, ServiceReader, ServiceWriter
+from skinware.service import DEFAULT_SLOTS, Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
 KIND = "driver"
@@ -78,7 +78,8 @@ class DriverWriter:
         driver_type: name of the driver's class (``roboskin``), for people.
         bus_counters: names of the counters that every bus has.
         patch_counters: names of the counters that every patch has.
-        namespace, slots, rate_hz, group: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+        namespace, slots, rate_hz, group, operations: as for :class:`skinware.service.ServiceWriter`, which also lists
+            the errors.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class DriverWriter:
         slots: int = DEFAULT_SLOTS,
         rate_hz: float | None = None,
         group: str | None = None,
+        operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
         self.structure = structure
         self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
@@ -105,6 +107,7 @@ class DriverWriter:
             slots=slots,
             rate_hz=rate_hz,
             group=group,
+            operations=operations,
         )
 
     @property
@@ -123,27 +126,57 @@ class DriverWriter:
         return self._service.sequence
 
     @property
+    def position(self) -> tuple[int, int]:
+        """(generation, sequence) of the newest frame."""
+        return self._service.position
+
+    @property
+    def paused(self) -> bool:
+        """Whether ``pause`` was called last."""
+        return self._service.paused
+
+    def pause(self) -> None:
+        """Publish nothing until ``resume``; users are told."""
+        self._service.pause()
+
+    def resume(self) -> None:
+        """Go on after ``pause``."""
+        self._service.resume()
+
+    def request_server(self) -> RequestServer:
+        """Where users' requests come in; see :class:`skinware.service.ServiceWriter`."""
+        return self._service.request_server()
+
+    @property
     def closed(self) -> bool:
         """Whether ``close`` was called, or this is the child of a fork."""
         return self._service.closed
 
-    def begin(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of the next frame by column name, to be filled whole; then ``commit``."""
-        return self._service.begin()
+    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
+        """Arrays of the next frame by column name, to be filled; then ``commit``.
+
+        Args:
+            from_last: begin with the newest frame, to change parts of it only.
+        """
+        return self._service.begin(from_last=from_last)
 
     def commit(self, acquired_ns: int) -> int:
         """Publish; ``acquired_ns`` is the newest time stamp in the frame. Returns its sequence."""
         return self._service.commit(acquired_ns)
 
-    def restructure(self, structure: Structure) -> None:
+    def restructure(self, structure: Structure, *, rate_hz: float | None = None) -> None:
         """Go on with other sensors or another dtype, as a new generation; users are told.
+
+        Args:
+            structure: the new one. With an equal one users go over without noticing.
+            rate_hz: the nominal rate from now on, if it is another.
 
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
         before, self.structure = self.structure, structure
         try:
-            self._service.restructure(self._columns(), self._static())
+            self._service.restructure(self._columns(), self._static(), rate_hz=rate_hz)
         except BaseException:
             self.structure = before
             raise

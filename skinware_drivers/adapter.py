@@ -53,6 +53,8 @@ class Adapter(ABC, Generic[OptionsT]):
 
     In listen-only mode only ``describe`` and ``join`` are called, and every send is refused.
 
+    What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
+
     Attributes:
         medium: kind of bus: ``can``.
         Options: struct of the options; becomes command-line options and TOML keys.

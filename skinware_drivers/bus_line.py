@@ -40,6 +40,7 @@ class BusLine:
         opened_ns: when it was last opened.
         started: its devices have been told to send.
         lost: set while it is away.
+        busy: held while its devices are being set up or asked to do something, and may be silent for it.
     """
 
     def __init__(self, name: str, ordinal: int, adapter: AnyAdapter, bus: Bus, epoll: select.epoll) -> None:
@@ -54,6 +55,7 @@ class BusLine:
         self.opened_ns = 0
         self.started = False
         self.lost = asyncio.Event()
+        self.busy = asyncio.Lock()
         self._epoll = epoll
 
     def open(self) -> None:
@@ -128,8 +130,9 @@ class BusLine:
             if self.lost.is_set():
                 await self.reopen()
             try:
-                await self.adapter.configure(self.link)
-                await self.adapter.start(self.link)
+                async with self.busy:
+                    await self.adapter.configure(self.link)
+                    await self.adapter.start(self.link)
             except BusError as error:
                 log.warning("%s: set-up failed: %s; trying again", self.name, str(error))
             else:

@@ -20,7 +20,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import msgspec.structs
@@ -43,6 +43,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole file.
 
     Attributes:
+        publish: when frames are published: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
     """
@@ -50,6 +51,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     driver: str = ""
     name: str = ""
     listen_only: bool = False
+    publish: Literal["", "cycle", "rate", "request"] = ""
     realtime: str | None = None
     cpus: tuple[int, ...] = ()
     options: dict[str, Any] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,17 @@ _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
 
+class Desk(Protocol):
+    """Who waits for frames; see :class:`skinware_drivers.desk.RequestDesk`."""
+
+    @property
+    def waited_for(self) -> bool: ...  # noqa: D102
+
+    def wants(self, oldest_ns: int) -> bool: ...  # noqa: D102
+
+    def published(self, oldest_ns: int, position: tuple[int, int]) -> None: ...  # noqa: D102
+
+
 class Publisher:
     """Copies the state of the skin into the ring at the right moments.
 
@@ -43,14 +55,26 @@ class Publisher:
         watch: marks doubtful modules.
         period_s: nominal time between two updates of a module.
         by_cycle: see above.
+        desk: who asks for frames.
+        on_request: publish only what somebody waits for (beside the very first frame).
     """
 
-    def __init__(self, writer: DriverWriter, decoder: Decoder, watch: Watch, period_s: float, by_cycle: bool) -> None:
+    def __init__(
+        self,
+        writer: DriverWriter,
+        decoder: Decoder,
+        watch: Watch,
+        period_s: float,
+        by_cycle: bool,
+        desk: Desk | None = None,
+        on_request: bool = False,
+    ) -> None:
         self._writer = writer
         self._state = decoder.state
         self._watch = watch
         self._period_ns = round(period_s * NS_PER_S)
         self._by_cycle = by_cycle
+        self._desk, self._on_request = desk, on_request
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
         self._patience_ns = self._period_ns * 3 // 2
         self._pause_ns = self._period_ns // 2
@@ -118,6 +142,24 @@ class Publisher:
         """Publish what there is."""
         state, time_ns = self._state, now_ns()
         self._update_patch_states(time_ns)
+        if self._wanted(time_ns):
+            self._write(time_ns)
+        state.begin_frame()
+        self._due_ns = 0
+        self._last_published_ns = time_ns
+
+    def _wanted(self, time_ns: int) -> bool:
+        if self._desk is None or not self._on_request or not self._writer.sequence:
+            return True
+        return self._desk.wants(self._oldest_new_ns(time_ns))
+
+    def _oldest_new_ns(self, time_ns: int) -> int:
+        """Oldest stamp of what is new in this frame; if nothing is, the frame says so as of now."""
+        new = self._state.updated
+        return int(self._state.module_time_ns[new].min()) if new.any() else time_ns
+
+    def _write(self, time_ns: int) -> None:
+        state = self._state
         columns = self._writer.begin()
         columns["values"][:] = state.values
         columns["module_time_ns"][:] = state.module_time_ns
@@ -127,9 +169,8 @@ class Publisher:
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         self._writer.commit(state.newest_ns or time_ns)
-        state.begin_frame()
-        self._due_ns = 0
-        self._last_published_ns = time_ns
+        if self._desk is not None and self._desk.waited_for:
+            self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import select
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,10 @@ from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
+from skinware_drivers.desk import RequestDesk
+from skinware_drivers.figures import figures
 from skinware_drivers.link import split_by_bus
+from skinware_drivers.operations import operations_of
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log = logging.getLogger("skinware.driver")
@@ -31,6 +34,8 @@ _BATCH_FRAMES = 2048
 _TURNS = 8  # batches per wake-up before handshakes and timers get their turn
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
+
+PublishMode = Literal["cycle", "rate", "request"]
 
 
 class Runner:
@@ -41,6 +46,8 @@ class Runner:
         lines: name, adapter and (unopened) bus of every bus, in order.
         name: the driver's name in the namespace.
         listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.
+        publish: ``cycle`` (when every living patch has delivered), ``rate`` (at the adapter's rate), ``request`` (by
+            cycle, but only what a program has asked for); default: what the adapter says.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         on_ready: called once, when frames are being published.
     """
@@ -52,6 +59,7 @@ class Runner:
         *,
         name: str,
         listen_only: bool = False,
+        publish: PublishMode | None = None,
         namespace: Namespace | None = None,
         slots: int = DEFAULT_SLOTS,
         group: str | None = None,
@@ -68,6 +76,8 @@ class Runner:
         self.decoder: Decoder | None = None
         self.ready = False
         self._listen_only = listen_only
+        self._publish = publish
+        self._desk: RequestDesk | None = None
         self._namespace = namespace or Namespace()
         self._slots = slots
         self._group = group
@@ -80,6 +90,7 @@ class Runner:
         self._known_patch_state = np.zeros(0, np.uint8)
         self._join_requested = asyncio.Event()
         self._begun_ns = 0  # the present generation
+        self._built_period_s = 0.0
 
     @property
     def _payload_size(self) -> int:
@@ -125,6 +136,9 @@ class Runner:
         await self._stopping.wait()
 
     async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
+        if self._desk is not None and self.writer is not None:
+            loop.remove_reader(self.writer.request_server().fileno())
+            await self._desk.close()
         for line in self.lines:
             await line.stop()
         loop.remove_reader(self._epoll.fileno())
@@ -204,7 +218,7 @@ class Runner:
 
     def _go_over_to(self, tables: SkinTables, adapter: AnyAdapter) -> None:
         if self.writer is None:
-            self.writer = DriverWriter(
+            self.writer = writer = DriverWriter(
                 self.name,
                 tables.structure,
                 driver_type=self.driver_type,
@@ -212,19 +226,41 @@ class Runner:
                 patch_counters=ALL_PATCH_COUNTERS,
                 namespace=self._namespace,
                 slots=self._slots,
-                rate_hz=1 / adapter.period_s,
+                rate_hz=1 / self._period_s,
+                operations={name: operation.method for name, operation in operations_of(type(adapter)).items()},
             )
+            server = writer.request_server()
+            self._desk = RequestDesk(server, self.lines, self._listen_only, self._after_operation)
+            asyncio.get_running_loop().add_reader(server.fileno(), self._desk.take)
         else:
-            self.writer.restructure(tables.structure)
+            writer = self.writer
+            writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
         self.decoder = Decoder(adapter.layout, tables)
         self._watch = adapter.watch(tables)
         self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size, self.decoder.headroom)
-        self.publisher = Publisher(self.writer, self.decoder, self._watch, adapter.period_s, adapter.by_cycle)
+        by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
+        on_request = self._publish == "request"
+        self.publisher = Publisher(writer, self.decoder, self._watch, self._period_s, by_cycle, self._desk, on_request)
+        self._built_period_s = self._period_s
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self._known_patch_state = self.publisher.patch_state.copy()
         self._begun_ns = now_ns()
         self._publish_when_due()
+
+    @property
+    def _period_s(self) -> float:
+        return max(line.adapter.period_s for line in self.lines)
+
+    def _after_operation(self, line: BusLine, patches: Sequence[Patch], set_up: bool) -> None:
+        if self.decoder is None or self._watch is None or line.patches is None:
+            return
+        if self._period_s != self._built_period_s:  # which layout and publisher depend on
+            self._go_over_to(self.decoder.tables, self.lines[0].adapter)
+        elif set_up:
+            first = int(np.argmax(self.decoder.tables.structure.patch_bus == line.ordinal))
+            for patch in patches:
+                self._watch.forget(first + list(line.patches).index(patch))
 
     # -- data -----------------------------------------------------------------------------------------------------
 
@@ -297,7 +333,7 @@ class Runner:
         return self.publisher.silence_ns if self.publisher is not None else NS_PER_S // 2
 
     async def _recover_silent_patches(self, line: BusLine) -> None:
-        if self._listen_only or line.lost.is_set():
+        if self._listen_only or line.lost.is_set() or line.busy.locked():
             return
         if now_ns() - max(line.opened_ns, self._begun_ns) < 2 * self._silence_ns:
             return  # nobody listened, the boards may send: to set them up again would move their baseline
@@ -310,7 +346,8 @@ class Runner:
                     continue
                 log.warning("%s: %s is silent but answers: it has restarted", line.name, self._patch_name(patch))
                 publisher.patch_state[patch] = PatchState.RESTARTED
-                await line.adapter.revive(line.link, self._patch_of(line, patch))
+                async with line.busy:
+                    await line.adapter.revive(line.link, self._patch_of(line, patch))
                 watch.forget(patch)
             except BusError as error:
                 log.debug("%s: %s", line.name, str(error))
@@ -345,31 +382,6 @@ class Runner:
                 log.warning("%s: %s is live again", line.name, self._patch_name(patch))
         self._known_patch_state = now.copy()
 
-    # -- for people -----------------------------------------------------------------------------------------------
-
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
-        if self.publisher is None or self.decoder is None or self.writer is None:
-            return {
-                "sequence": 0,
-                "buses": [{"name": line.name, "state": line.state.name.lower()} for line in self.lines],
-            }
-        structure, state, time_ns = self.decoder.tables.structure, self.decoder.state, now_ns()
-        buses = []
-        for line, row in zip(self.lines, self.publisher.count_buses().tolist(), strict=True):
-            counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
-            buses.append({"name": line.name, "state": line.state.name.lower(), **counters})
-        patches = []
-        for patch in range(structure.n_patches):
-            last_ns = int(state.patch_time_ns[patch])
-            counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
-            patches.append(
-                {
-                    "name": self._patch_name(patch),
-                    "bus": self.lines[int(structure.patch_bus[patch])].name,
-                    "state": PatchState(int(self.publisher.patch_state[patch])).name.lower(),
-                    "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
-                    **counters,
-                }
-            )
-        return {"sequence": self.writer.sequence, "buses": buses, "patches": patches}
+        return figures(self.lines, self.writer, self.decoder, self.publisher)

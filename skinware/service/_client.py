@@ -21,8 +21,8 @@ from skinware.errors import (
 from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
-from skinware.service._messages import CANCEL, MAX_PACKET, Answer, Ask
 from skinware.service._server import short_path
+from skinware.service.messages import CANCEL, MAX_PACKET, Answer, Ask
 
 _ERRORS: dict[str, type[Exception]] = {
     "refused": RequestRefused,

@@ -19,7 +19,7 @@ from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.service._accounts import Accounts
 from skinware.service._client import PendingRequest, RequestClient
-from skinware.service._messages import ACQUIRE, OPERATIONS
+from skinware.service.messages import ACQUIRE, OPERATIONS
 
 _MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
 

@@ -15,7 +15,7 @@ from skinware.errors import NamespaceError
 from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.service._messages import ACQUIRE, CANCEL, MAX_PACKET, OPERATIONS, Answer, Ask
+from skinware.service.messages import ACQUIRE, CANCEL, MAX_PACKET, OPERATIONS, Answer, Ask
 
 _MAX_PEERS = 64
 _PACKETS_PER_TURN = 256
@@ -80,22 +80,31 @@ class RequestServer(ForkGuard):
         self._path = namespace.socket_path(name)
         self._peers: dict[int, socket.socket] = {}
         self._open: dict[tuple[int, int], Request] = {}
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
         self._epoll = select.epoll()
-        temporary = namespace.path / f".{name}.sock"
+        self._listener = self._listen()
+
+    def renew(self) -> None:
+        """Make the socket's file again, after somebody removed it; connections stay."""
+        self._epoll.unregister(self._listener)
+        self._listener.close()
+        self._listener = self._listen()
+
+    def _listen(self) -> socket.socket:
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        temporary = self._path.with_name(f".{self._path.name}")
         try:
             with short_path(temporary) as path:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(path)
-                self._listener.bind(path)
+                listener.bind(path)
                 os.chmod(path, 0o660)
-                self._listener.listen(_MAX_PEERS)
-            self._listener.setblocking(False)
-            self._epoll.register(self._listener, select.EPOLLIN)
+                listener.listen(_MAX_PEERS)
             os.rename(temporary, self._path)
+            self._epoll.register(listener, select.EPOLLIN)
         except OSError as error:
-            self.abandon()
+            listener.close()
             raise NamespaceError(f"cannot make the request socket {self._path}: {error.strerror}") from None
+        return listener
 
     def fileno(self) -> int:
         """Readable when ``take`` has something to do; -1 once closed."""

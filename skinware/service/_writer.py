@@ -16,8 +16,8 @@ from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import RingWriter
 from skinware.memory.schema import Column, Schema
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.service._messages import ACQUIRE
 from skinware.service._server import Request, RequestServer
+from skinware.service.messages import ACQUIRE
 
 DEFAULT_SLOTS = _layout.DEFAULT_SLOTS
 _FILE_CHECK_NS = NS_PER_S
@@ -207,19 +207,32 @@ class ServiceWriter:
         """(generation, sequence) of the newest frame."""
         return self.generation, self.sequence
 
-    def restructure(self, columns: Columns, static: Mapping[str, npt.NDArray[Any]] | None = None) -> None:
+    def restructure(
+        self,
+        columns: Columns,
+        static: Mapping[str, npt.NDArray[Any]] | None = None,
+        *,
+        rate_hz: float | None = None,
+    ) -> None:
         """Go on under the same name with other columns, as a new generation; readers are told.
+
+        Args:
+            columns: as for a new writer.
+            static: as for a new writer.
+            rate_hz: the nominal rate from now on; None: as before.
 
         Raises:
             ConfigurationError: columns that the format cannot hold; the old generation then goes on.
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        before = self._schema, self._static
+        before = self._schema, self._static, self._period_ns
         try:
+            if rate_hz is not None:
+                self._period_ns = round(NS_PER_S / rate_hz)
             self._schema, self._static = Schema.of(columns, self._schema.description), dict(static or {})
             ring = self._new_generation()
         except BaseException:
-            self._schema, self._static = before
+            self._schema, self._static, self._period_ns = before
             raise
         self._ring.segment.descriptor.close()
         self._ring = ring
@@ -304,9 +317,7 @@ class ServiceWriter:
             self._ring.segment.descriptor.close()
             self._ring = ring
             if self._server is not None:
-                self._server.close()
-                self._server = None
-                self.request_server()
+                self._server.renew()
 
     def __enter__(self) -> Self:
         return self

@@ -27,6 +27,7 @@ from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Heard, Link, Match
+from skinware_drivers.operations import operation
 from skinware_drivers.skin_state import Updates
 
 FIRST_BOARD, LAST_BOARD = 1, 14
@@ -170,10 +171,9 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
 
     def __init__(self, options: RoboskinOptions) -> None:
         super().__init__(options)
-        # a tail belongs to the very frame before it from the same board, within half a period, or to none
-        pair = Cycle(("head", "tail"), within="patch", maximum_age_s=self.period_s / 2)
-        self.layout = Layout(frames=(HEAD, TAIL), cycle=pair)
         self._boards: tuple[int, ...] = options.boards
+        self._disabled: set[int] = set()
+        self.layout = self._layout()
 
     @property
     def period_s(self) -> float:
@@ -217,7 +217,9 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
             await link.send(0x200 | board, b"\x07\x01")
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask for the version by unicast: a silent board that answers has restarted."""
+        """Ask for the version by unicast: a silent board that answers has restarted, if it should not be silent."""
+        if patch.key in self._disabled:
+            return False
         try:
             await self._version(link, patch.key)
         except HandshakeTimeout:
@@ -229,10 +231,41 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         await self._configure(link, (patch.key,))
         await link.send(0x200 | patch.key, b"\x07\x00")
 
+    @operation(sets_up=True)
+    async def rebaseline(self, link: Link, patches: Sequence[Patch]) -> None:
+        """Make the boards take the present load as no load; nobody may touch the skin for about a second."""
+        await self._configure(link, [patch.key for patch in patches])
+        await self.enable(link, [patch for patch in patches if patch.key not in self._disabled])
+
+    @operation(sets_up=True)
+    async def rate(self, link: Link, patches: Sequence[Patch], hz: float) -> float:
+        """Change how often all boards of the bus send, 4 to 1000 times a second; the baseline moves with it."""
+        period_ms = round(1e3 / hz) if hz > 0 else 0
+        if not 1 <= period_ms <= 255:
+            raise ConfigurationError(f"{hz:g} Hz: boards send every 1 to 255 ms, so give 3.93 to 1000 Hz")
+        if len(patches) < len(self._boards):
+            raise ConfigurationError("all boards of a bus have one rate: do not name a patch")
+        self.options = msgspec.structs.replace(self.options, period_ms=period_ms)
+        self.layout = self._layout()
+        await self.rebaseline(link, patches)
+        return 1e3 / period_ms
+
+    @operation()
+    async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:
+        """Make boards send (on=true) or be silent (on=false)."""
+        for patch in patches:
+            await link.send(0x200 | patch.key, b"\x07\x00" if on else b"\x07\x01")
+            (self._disabled.discard if on else self._disabled.add)(patch.key)
+
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
         """Marks silent re-calibration."""
         return BaselineWatch(tables)
+
+    def _layout(self) -> Layout:
+        """A tail belongs to the very frame before it from the same board, within half a period, or to none."""
+        pair = Cycle(("head", "tail"), within="patch", maximum_age_s=self.period_s / 2)
+        return Layout(frames=(HEAD, TAIL), cycle=pair)
 
     async def _configure(self, link: Link, boards: Iterable[int]) -> None:
         options = self.options

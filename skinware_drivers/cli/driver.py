@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.config import DriverConfig
-    from skinware_drivers.runner import Runner
+    from skinware_drivers.runner import PublishMode, Runner
 
 
 class DriverCommand(click.Command):
@@ -53,6 +53,11 @@ class DriverCommand(click.Command):
 @click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of all this.")
 @click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
+@click.option(
+    "--publish",
+    type=click.Choice(["cycle", "rate", "request"]),
+    help="When every patch has delivered, at the driver's rate, or what programs ask for.  [default: as the driver]",
+)
 @click.option("--slots", type=int, default=8, show_default=True, help="Frames that slow users may lag behind, 2-64.")
 @click.option("--group", metavar="GROUP", help="Group whose members may read, if the namespace is new.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
@@ -66,6 +71,7 @@ def command(
     name: str | None,
     config: Path | None,
     listen_only: bool,
+    publish: PublishMode | None,
     slots: int,
     group: str | None,
     realtime: str | None,
@@ -113,6 +119,7 @@ def command(
         lines,
         name=name or settings.name or driver_type,
         listen_only=listen_only,
+        publish=publish or settings.publish or None,
         namespace=Namespace(namespace),
         slots=slots,
         group=group,

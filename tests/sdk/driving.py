@@ -14,7 +14,7 @@ import msgspec
 from skinware import DriverFrame, DriverReader
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
-from skinware_drivers.runner import Runner
+from skinware_drivers.runner import PublishMode, Runner
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import CommandReceived
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
@@ -31,6 +31,7 @@ class Driving:
         options: dict[str, Any],
         listen_only: bool,
         driver: type[RoboskinDriver] = RoboskinDriver,
+        publish: PublishMode | None = None,
     ) -> None:
         self.buses = buses
         self.ready = threading.Event()
@@ -38,6 +39,7 @@ class Driving:
         lines = [(f"bus{i}", driver(RoboskinOptions(**options)), bus) for i, bus in enumerate(buses)]
         self._lines = lines
         self._listen_only = listen_only
+        self._publish = publish
         self._loop: asyncio.AbstractEventLoop | None = None
         self.runner: Runner | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
@@ -50,6 +52,7 @@ class Driving:
                 self._lines,
                 name="roboskin",
                 listen_only=self._listen_only,
+                publish=self._publish,
                 slots=64,
                 on_ready=self.ready.set,
             )
@@ -221,9 +224,10 @@ def driving(
     listen_only: bool = False,
     wait: bool = True,
     driver: type[RoboskinDriver] = RoboskinDriver,
+    publish: PublishMode | None = None,
     **options: Any,
 ) -> Iterator[Driving]:
-    running = Driving(buses, options, listen_only, driver)
+    running = Driving(buses, options, listen_only, driver, publish)
     running.start()
     try:
         if wait:

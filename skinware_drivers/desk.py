@@ -1,0 +1,131 @@
+"""Where user programs' requests to a running driver are answered."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from skinware.errors import BusError, ConfigurationError
+from skinware.realtime import now_ns
+from skinware.service import Request, RequestServer
+from skinware.service.messages import ACQUIRE
+from skinware_drivers.bus_line import BusLine
+from skinware_drivers.description import Patch
+from skinware_drivers.operations import Operation, check_arguments, operations_of
+
+Changed = Callable[[BusLine, Sequence[Patch], bool], object]
+
+
+class RequestDesk:
+    """Carries out operations on the buses, and remembers who waits for a frame.
+
+    Args:
+        server: where requests come from.
+        lines: the driver's buses.
+        listen_only: nothing may be sent: operations are refused.
+        changed: called after an operation with its bus, its patches, and whether it set them up anew.
+    """
+
+    def __init__(self, server: RequestServer, lines: Sequence[BusLine], listen_only: bool, changed: Changed) -> None:
+        self._server = server
+        self._lines = lines
+        self._listen_only = listen_only
+        self._changed = changed
+        self._waiting: list[tuple[int, Request]] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def take(self) -> None:
+        """Take the requests that have arrived; safe as a callback of the loop."""
+        for request in self._server.take():
+            if request.operation == ACQUIRE:
+                self._waiting.append((now_ns(), request))
+            else:
+                task = asyncio.get_running_loop().create_task(self._carry_out(request))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+
+    @property
+    def waited_for(self) -> bool:
+        """Whether anybody waits for a frame."""
+        return bool(self._waiting)
+
+    def wants(self, oldest_ns: int) -> bool:
+        """Whether somebody waits for a frame whose data is no older than this."""
+        return any(time_ns <= oldest_ns for time_ns, request in self._waiting if not request.cancelled)
+
+    def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
+        """A frame was published: answer those who waited for it.
+
+        Args:
+            oldest_ns: of the data that is new in it, CLOCK_MONOTONIC ns.
+            position: of the frame.
+        """
+        if self._waiting:
+            answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
+            self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
+            for request in answered:
+                request.reply(position=position)
+
+    async def close(self) -> None:
+        """Give up what is under way; those who asked see the driver hang up."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _carry_out(self, request: Request) -> None:
+        arguments = dict(request.arguments)
+        bus, patch = arguments.pop("bus", None), arguments.pop("patch", None)
+        try:
+            if self._listen_only:
+                raise ConfigurationError("this driver only listens (--listen-only)")
+            meant = self._meant(bus, patch)
+            operation = operations_of(type(self._lines[0].adapter))[request.operation]
+            check_arguments(operation.method, arguments)
+        except (ConfigurationError, TypeError) as error:
+            request.fail(f"{request.operation}: {error}", "refused")
+            return
+        results = await asyncio.gather(
+            *(self._on_bus(line, patches, request, operation, arguments) for line, patches in meant),
+            return_exceptions=True,
+        )
+        failures = [
+            f"{line.name}: {_why(result)}"
+            for (line, _), result in zip(meant, results, strict=True)
+            if isinstance(result, BaseException)
+        ]
+        if failures:
+            request.fail(f"{request.operation}: {'; '.join(failures)}")
+        else:
+            request.reply({line.name: result for (line, _), result in zip(meant, results, strict=True)})
+
+    async def _on_bus(
+        self, line: BusLine, patches: Sequence[Patch], request: Request, operation: Operation, arguments: dict[str, Any]
+    ) -> object:
+        async with line.busy:
+            if request.cancelled:
+                return None
+            if line.lost.is_set():
+                raise ConfigurationError("the bus is away")
+            result = await operation.method(line.adapter, line.link, patches, **arguments)
+        self._changed(line, patches, operation.sets_up)
+        return result
+
+    def _meant(self, bus: object, patch: object) -> list[tuple[BusLine, Sequence[Patch]]]:
+        lines = [line for line in self._lines if bus in (None, line.name) and line.patches]
+        if not lines:
+            there_are = ", ".join(line.name for line in self._lines if line.patches) or "none"
+            raise ConfigurationError(f"no bus {bus!r} with patches; there are: {there_are}")
+        if patch is None:
+            return [(line, line.patches or ()) for line in lines]
+        meant = [(line, [p for p in line.patches or () if p.name == patch]) for line in lines]
+        if not any(patches for _, patches in meant):
+            there_are = ", ".join(p.name for line in lines for p in line.patches or ())
+            raise ConfigurationError(f"no patch {patch!r}; there are: {there_are}")
+        return [(line, patches) for line, patches in meant if patches]
+
+
+def _why(error: BaseException) -> str:
+    if isinstance(error, BusError | ConfigurationError | ValueError):
+        return str(error)
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,40 @@
+"""What a running driver tells people and programs about its buses and patches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from skinware.driver_service import DriverWriter
+from skinware.realtime import now_ns
+from skinware.status import PatchState
+from skinware_drivers.bus_line import BusLine
+from skinware_drivers.decoder import Decoder
+from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+
+
+def figures(
+    lines: Sequence[BusLine], writer: DriverWriter | None, decoder: Decoder | None, publisher: Publisher | None
+) -> dict[str, Any]:
+    """State and counters of every bus and patch; only the buses' states as long as nothing is published."""
+    if writer is None or decoder is None or publisher is None:
+        return {"sequence": 0, "buses": [{"name": line.name, "state": line.state.name.lower()} for line in lines]}
+    structure, state, time_ns = decoder.tables.structure, decoder.state, now_ns()
+    buses = []
+    for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
+        counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
+        buses.append({"name": line.name, "state": line.state.name.lower(), **counters})
+    patches = []
+    for patch in range(structure.n_patches):
+        last_ns = int(state.patch_time_ns[patch])
+        counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
+        patches.append(
+            {
+                "name": bytes(structure.patch_name[patch]).decode(),
+                "bus": lines[int(structure.patch_bus[patch])].name,
+                "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
+                "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
+                **counters,
+            }
+        )
+    return {"sequence": writer.sequence, "buses": buses, "patches": patches}

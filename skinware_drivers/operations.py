@@ -1,0 +1,70 @@
+"""What user programs may ask a driver to do: methods of its adapter that are marked as operations."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+OperationT = TypeVar("OperationT", bound=Callable[..., Any])
+
+_MARK = "__skinware_operation__"
+_OWN_PARAMETERS = 3  # self, link, patches
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One operation of an adapter class.
+
+    Attributes:
+        method: coroutine function (adapter, link, patches, ...).
+        sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
+    """
+
+    method: Callable[..., Any]
+    sets_up: bool
+
+
+def operation(*, sets_up: bool = False) -> Callable[[OperationT], OperationT]:
+    """Mark an adapter's coroutine method as an operation, under its own name.
+
+    ::
+
+        @operation()
+        async def tare(self, link: Link, patches: Sequence[Patch], samples: int = 10) -> None:
+            \"\"\"Take the present values as zero.\"\"\"
+
+    Programs call it with ``reader.call("tare", samples=20)``; the docstring's first line describes it to them. It is
+    called once per bus, with the patches on it that are meant: all, unless the program says ``bus=`` or ``patch=``
+    (their names). What it returns must be something that JSON can hold; what it raises is told to the program.
+
+    Args:
+        sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
+    """
+
+    def mark(method: OperationT) -> OperationT:
+        setattr(method, _MARK, Operation(method, sets_up))
+        return method
+
+    return mark
+
+
+def operations_of(adapter: type[Any]) -> dict[str, Operation]:
+    """The operations of an adapter class by name, sorted."""
+    members = inspect.getmembers(adapter, inspect.iscoroutinefunction)
+    return {name: getattr(member, _MARK) for name, member in members if hasattr(member, _MARK)}
+
+
+def check_arguments(method: Callable[..., Any], arguments: dict[str, Any]) -> None:
+    """Whether a method of an adapter takes these arguments beside the link and the patches.
+
+    Raises:
+        TypeError: it does not; the message says what it takes.
+    """
+    parameters = list(inspect.signature(method).parameters.values())[_OWN_PARAMETERS:]
+    try:
+        inspect.Signature(parameters).bind(**arguments)
+    except TypeError as error:
+        takes = ", ".join(["bus", "patch", *map(str, parameters)])
+        raise TypeError(f"{error}; it takes: {takes}") from None

@@ -53,9 +53,9 @@ class Decoder:
         self._compile_assemblies()
         self._compile_pairing()
         self._entry, self._kinds_of = self._compile_identifiers()
-        self._length_ok = np.zeros((len(self._frames) + 1, 256), bool)  # the last row: right for any frame
+        self._length_ok = np.zeros((256, 256), bool)  # by kind; the last row: right for any frame
         for kind, frame in enumerate(self._frames):
-            self._length_ok[[kind, -1], np.array(frame.length)[:, None]] = True
+            self._length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
@@ -167,7 +167,7 @@ class Decoder:
         return entry, kinds
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
-        """One table over one payload byte, if that byte alone tells all kinds of frame apart (a fast case)."""
+        """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
         conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self._frames]
         if not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
             return None
@@ -175,10 +175,12 @@ class Decoder:
             return None
         if len({tuple(c for c in frame.when if isinstance(c, Identifier)) for frame in self._frames}) > 1:
             return None
-        table = np.full(256, _NO_KIND, np.uint8)
-        for number, condition in enumerate(conditions):
-            table[condition[0].value] = number
-        return conditions[0][0].offset, table
+        offset = conditions[0][0].offset
+        table = np.full((256, 256), _NO_KIND, np.uint8)
+        for number, (frame, condition) in enumerate(zip(self._frames, conditions, strict=True)):
+            # what lies behind the end of a payload means nothing
+            table[condition[0].value, [length for length in frame.length if length > offset]] = number
+        return offset, table
 
     # -- decoding -----------------------------------------------------------------------------------------------
 
@@ -190,28 +192,32 @@ class Decoder:
         ours = entry < self._nobody
         if self._header is not None:
             at, table = self._header
-            kind = table[payload[:, at]]
-            kind[length <= at] = _NO_KIND  # what lies behind the end of a payload means nothing
+            kind = table[payload[:, at], length]
             kind[~ours] = _NO_KIND
         else:
-            kind = np.full(len(entry), _NO_KIND, np.uint8)
-            possible = self._kinds_of[key]
-            for number, frame in enumerate(self._frames):
-                match = (possible & (1 << number)) != 0
-                for condition in frame.when:
-                    if isinstance(condition, Byte):
-                        match &= payload[:, condition.offset] & condition.mask == condition.value
-                        match &= length > condition.offset
-                kind[match] = number
-        known = kind != _NO_KIND
-        length_ok = self._length_ok[np.where(known, kind, len(self._frames)), length]
-        kind[~length_ok] = _NO_KIND
-        wrong = ours & ((kind == _NO_KIND) | ~known)
+            kind = self._match_kinds(key, payload, length)
+        wrong = kind == _NO_KIND
+        wrong &= ours
         if wrong.any():
             rows = np.flatnonzero(wrong)
-            bad_length = bus[rows[~length_ok[rows]]]
-            self.state.bus_counters[:, 1] += np.bincount(bad_length, minlength=n_buses)
-            self.state.bus_counters[:, 2] += np.bincount(bus[rows[length_ok[rows]]], minlength=n_buses)
+            is_length = ~self._length_ok[self._match_kinds(key[rows], payload[rows], length[rows], False), length[rows]]
+            self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
+            self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
+        return kind
+
+    def _match_kinds(self, key: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
+        """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
+        kind = np.full(len(key), _NO_KIND, np.uint8)
+        possible = self._kinds_of[key]
+        for number, frame in enumerate(self._frames):
+            match = (possible & (1 << number)) != 0
+            for condition in frame.when:
+                if isinstance(condition, Byte):
+                    match &= payload[:, condition.offset] & condition.mask == condition.value
+                    match &= length > condition.offset
+            kind[match] = number
+        if check_length:
+            kind[~self._length_ok[kind, length]] = _NO_KIND
         return kind
 
     def _count_foreign(self, rows: Indices, identifier: npt.NDArray[np.uint32], bus: npt.NDArray[np.uint16]) -> None:

@@ -87,22 +87,32 @@ class FrameKind:
             columns: where this frame's values are among them.
             channels: (all,) channel of each of them.
         """
+        words: dict[tuple[int, str], tuple[Indices, npt.NDArray[np.uint32]]] = {}  # several flags share one
         for flag in self.frame.flags:
             if isinstance(flag, Sentinel):
                 hit = np.isnan(raw) if flag.value != flag.value else raw == flag.value
                 status[:, columns] |= np.where(hit, np.uint8(flag.status), np.uint8(0))
-            else:
-                _flag_bits(flag, payload, length, status, channels)
+                continue
+            place = flag.offset, np.dtype(flag.dtype).str
+            if place not in words:
+                words[place] = _flag_words(flag, payload, length)
+            flagged, word = words[place]
+            if len(flagged):
+                _flag_bits(flag, flagged, word, status, channels)
 
 
-def _flag_bits(flag: Flag, payload: Bytes, length: Bytes, status: Bytes, channels: Indices) -> None:
+def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, npt.NDArray[np.uint32]]:
+    """The frames in which a flag's word is there and not 0 (few, as a rule), and the word of each."""
     dtype = np.dtype(flag.dtype)
     end = flag.offset + dtype.itemsize
     word = np.ascontiguousarray(payload[:, flag.offset : end]).view(dtype)[:, 0]
-    if not word.any():
-        return
-    flagged = np.flatnonzero((word != 0) & (length >= end))  # few, as a rule
-    word = word[flagged].astype(np.uint32)
+    flagged = np.flatnonzero(word)
+    if len(flagged):
+        flagged = flagged[length[flagged] >= end]
+    return flagged, word[flagged].astype(np.uint32)
+
+
+def _flag_bits(flag: Flag, flagged: Indices, word: npt.NDArray[np.uint32], status: Bytes, channels: Indices) -> None:
     bit = np.uint8(flag.status)
     if flag.mask:
         status[flagged[(word & flag.mask) != 0]] |= bit

@@ -113,7 +113,7 @@ class Pairing:
         n = self._n
         if not len(module):
             return np.zeros(0, np.int64)
-        ends = np.append(np.flatnonzero(group[1:] != group[:-1]), len(group) - 1)
+        ends = np.concatenate([np.flatnonzero(group[1:] != group[:-1]), [len(group) - 1]])
         ends = ends[(place[ends] < n) & ~used[ends]]
         if not len(ends):
             return np.zeros(0, np.int64)

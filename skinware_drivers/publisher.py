@@ -88,6 +88,7 @@ class Publisher:
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
         self._behind = np.zeros(structure.n_modules, bool)
         self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
+        self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
         self._due_ns = 0
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
@@ -114,6 +115,7 @@ class Publisher:
         time_ns = now_ns()
         self.count_buses()
         self._hear(updates, time_ns)
+        self._update_patch_states(time_ns)
         if not self._by_cycle:
             self._show(updates)
             return
@@ -126,6 +128,7 @@ class Publisher:
         if time_ns < self.deadline_ns:
             return
         self.count_buses()
+        self._update_patch_states(time_ns)
         if self._by_cycle:
             living = self._living(time_ns)
             open_patches = self._bursts.in_the_middle(living, time_ns)
@@ -141,7 +144,6 @@ class Publisher:
     def publish(self) -> None:
         """Publish what there is."""
         state, time_ns = self._state, now_ns()
-        self._update_patch_states(time_ns)
         if self._wanted(time_ns):
             self._write(time_ns)
         state.begin_frame()
@@ -180,8 +182,7 @@ class Publisher:
         return self._counts
 
     def _update_patch_states(self, time_ns: int) -> None:
-        heard_ns = self._state.patch_time_ns
-        live = heard_ns > max(0, time_ns - self._silence_ns)
+        live = self._patch_updated_ns > max(0, time_ns - self._silence_ns)
         if not live.all() or not (self.patch_state == _LIVE).all():
             self.patch_state[~live & (self.patch_state == _LIVE)] = _NOW_STALE
             self.patch_state[live] = _LIVE
@@ -210,6 +211,8 @@ class Publisher:
             self._module_heard_ns[begins[self._module_patch]] = time_ns
         self._patch_heard_ns[patch_sends] = time_ns
         self._module_heard_ns[updates.module] = time_ns
+        whole = updates.whole
+        self._patch_updated_ns[self._module_patch[updates.module[whole]]] = updates.newest_ns[whole]
 
     def _living(self, time_ns: int) -> npt.NDArray[np.bool_]:
         living: npt.NDArray[np.bool_] = time_ns - self._module_heard_ns < self._silence_ns

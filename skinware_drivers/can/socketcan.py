@@ -27,15 +27,13 @@ _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
-_SO_TIMESTAMPING = 37
+_SO_TIMESTAMPNS = 35
 _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
-_TIMESTAMPING_RX_SOFTWARE = 1 << 3
-_TIMESTAMPING_SOFTWARE = 1 << 4
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 
-_CONTROL_WORDS = 8  # cmsghdr (2 words), then three timespecs: software, legacy, hardware
+_CONTROL_WORDS = 4  # cmsghdr (2 words), then a timespec
 WANTED_BUFFER_BYTES = 8 << 20
 """Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
 
@@ -122,7 +120,9 @@ class SocketCanBus(Bus):
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
         self.granted_buffer = _enlarge_buffer(sock, self._wanted_buffer)
-        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, _TIMESTAMPING_RX_SOFTWARE | _TIMESTAMPING_SOFTWARE)
+        # not SO_TIMESTAMPING: that costs 20 ns a frame more, and leaves frames unstamped that came before the kernel
+        # began to stamp (in the background)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         sock.setblocking(False)
         self._socket = sock
         self._lost_before = self.counters.lost
@@ -195,7 +195,8 @@ class SocketCanBus(Bus):
         poll_ns = now_ns()
         offset_ns = poll_ns - time.time_ns()
         stamps = control[:, 2] * NS_PER_S + control[:, 3] + offset_ns
-        np.clip(stamps, self._last_poll_ns, poll_ns, out=stamps)
+        np.maximum(stamps, self._last_poll_ns, out=stamps)
+        np.minimum(stamps, poll_ns, out=stamps)
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
         self._last_poll_ns = min(int(stamps[-1]), poll_ns)
         return stamps
@@ -204,9 +205,10 @@ class SocketCanBus(Bus):
         """Take error and remote frames out of the new rows; returns how many are left."""
         rows = slice(first, first + count)
         identifier = batch.wire["identifier"][rows]
-        special = identifier & np.uint32(ERROR_FLAG | REMOTE_FLAG)
-        if not special.any():
+        flags = np.uint32(ERROR_FLAG | REMOTE_FLAG)
+        if not np.bitwise_or.reduce(identifier) & flags:
             return count
+        special = identifier & flags
         is_error = (special & np.uint32(ERROR_FLAG)) != 0
         self.counters.error_frames += int(is_error.sum())
         self.counters.refused += int(((special != 0) & ~is_error).sum())
@@ -227,7 +229,7 @@ class _Rows:
 
     Attributes:
         batch: the batch.
-        control: (capacity, 8) int64, ancillary data of each row.
+        control: (capacity, 4) int64, ancillary data of each row.
     """
 
     def __init__(self, batch: FrameBatch) -> None:

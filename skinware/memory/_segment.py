@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, NameInUse, NamespaceError, ServiceNotFound
 from skinware.memory import _futex, _layout
+from skinware.memory._fences import fence
 from skinware.memory._layout import Layout
 from skinware.memory._locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
@@ -80,6 +81,7 @@ class Segment:
         """Set bits of the state word and wake everybody who waits (needs a writable map)."""
         control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
         control["state"] |= state
+        fence()
         control["wake_word"] += np.uint32(1)
         _futex.Word(self.address(_layout.WAKE_WORD_OFFSET)).wake_all()
 

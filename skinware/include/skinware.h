@@ -534,8 +534,8 @@ static skinware_result skinware__check_column(const skinware__header *header, co
     if (!skinware__copy_text(column->name, row->name, sizeof row->name) || column->name[0] == '\0')
         return skinware__fail(SKINWARE_BAD_FILE, "a column has no proper name");
     for (i = 0; column->name[i] != '\0'; i++)
-        if (column->name[i] & ~0x7f)
-            return skinware__fail(SKINWARE_BAD_FILE, "a column's name is not ASCII");
+        if (column->name[i] < ' ' || column->name[i] > '~')
+            return skinware__fail(SKINWARE_BAD_FILE, "a column's name is not printable ASCII");
     if (!skinware__copy_text(code, row->dtype, sizeof row->dtype) ||
         !skinware__parse_dtype(code, &column->kind, &column->itemsize))
         return skinware__fail(SKINWARE_BAD_FILE, "a column has a dtype that cannot be read");

@@ -25,9 +25,7 @@ LANGUAGES: dict[str, tuple[str, ...]] = {
 _compiled: dict[tuple[Path, str], Path] = {}
 
 
-def compiled(
-    source: Path, language: str, folder: pytest.TempPathFactory, options: Sequence[str] = (), extra: Sequence[str] = ()
-) -> Path:
+def compiled(source: Path, language: str, folder: pytest.TempPathFactory, options: Sequence[str] = ()) -> Path:
     """The program that a source file makes; skips the test where there is no compiler, fails it in CI.
 
     Args:
@@ -35,7 +33,6 @@ def compiled(
         language: one of ``LANGUAGES``.
         folder: where to put it.
         options: more of them.
-        extra: of the same, after the source file: libraries.
     """
     compiler, *language_options = LANGUAGES[language]
     if shutil.which(compiler) is None:
@@ -46,7 +43,7 @@ def compiled(
     if (source, language) not in _compiled:
         program = folder.mktemp("compiled") / source.stem
         command = [compiler, *language_options, *_WARNINGS, *options, f"-I{skinware.get_include()}", str(source)]
-        result = subprocess.run([*command, "-o", str(program), *extra], capture_output=True, text=True)
+        result = subprocess.run([*command, "-o", str(program)], capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
         assert not result.stderr
         _compiled[source, language] = program

@@ -430,8 +430,11 @@ static skinware_result skinware__fail(skinware_result result, const char *reason
 
 /* -- shared memory ------------------------------------------------------------------------------------------------ */
 
+/* Words of 8 bytes lie on multiples of 8, also where the compiler expects no more than 4. */
+typedef uint64_t skinware__word __attribute__((aligned(8)));
+
 static uint64_t skinware__load_64(const unsigned char *at) {
-    return __atomic_load_n((const uint64_t *)(const void *)at, __ATOMIC_ACQUIRE);
+    return __atomic_load_n((const skinware__word *)(const void *)at, __ATOMIC_ACQUIRE);
 }
 
 static uint32_t skinware__load_32(const unsigned char *at) {
@@ -441,7 +444,7 @@ static uint32_t skinware__load_32(const unsigned char *at) {
 /* The second look at a slot's sequence: everything that was read before this call was read before this load. */
 static int skinware__still(const unsigned char *slot, uint64_t sequence) {
     __atomic_thread_fence(__ATOMIC_ACQUIRE);
-    return __atomic_load_n((const uint64_t *)(const void *)slot, __ATOMIC_RELAXED) == sequence;
+    return __atomic_load_n((const skinware__word *)(const void *)slot, __ATOMIC_RELAXED) == sequence;
 }
 
 static const unsigned char *skinware__slot_at(const skinware_reader *reader, uint64_t sequence) {
@@ -505,11 +508,16 @@ static int skinware__copy_text(char *to, const char *from, size_t size) {
     return 1;
 }
 
+static int skinware__is_number(char kind) {
+    return kind == 'u' || kind == 'i' || kind == 'f';
+}
+
 /* A dtype code as numpy writes it: '<' or '|', kind, size in decimal. 0 if it is none that a column may have. */
 static int skinware__parse_dtype(const char code[9], char *kind, uint32_t *itemsize) {
     uint32_t size = 0;
     size_t i;
-    if ((code[0] != '<' && code[0] != '|') || code[1] == '\0' || strchr("uifSV", code[1]) == NULL || code[2] == '0')
+    const int is_text = code[1] == 'S' || code[1] == 'V';
+    if ((code[0] != '<' && code[0] != '|') || !(is_text || skinware__is_number(code[1])) || code[2] == '0')
         return 0;
     for (i = 2; code[i] != '\0'; i++) { /* at most six digits: no overflow */
         if (code[i] < '0' || code[i] > '9')
@@ -518,7 +526,7 @@ static int skinware__parse_dtype(const char code[9], char *kind, uint32_t *items
     }
     *kind = code[1];
     *itemsize = size;
-    if (*kind == 'S' || *kind == 'V')
+    if (is_text)
         return size > 0;
     if (*kind == 'f')
         return size == 2 || size == 4 || size == 8 || size == 16;
@@ -671,7 +679,9 @@ static skinware_result skinware__read_driver(skinware_reader *reader) {
         !skinware__table(reader, "module_kind", 'S', 16, modules) ||
         !skinware__table(reader, "sensor_uid", 'u', 8, sensors) || sensors == 0 || sensors > UINT32_MAX)
         return skinware__fail(SKINWARE_BAD_FILE, "a table of the driver's structure is missing or of a wrong form");
-    if (values == NULL || values->count != sensors || strchr("uif", values->kind) == NULL || values->itemsize > 4 ||
+    if (!(skinware__is(values, 'u', 1, sensors) || skinware__is(values, 'i', 2, sensors) ||
+          skinware__is(values, 'u', 2, sensors) || skinware__is(values, 'i', 4, sensors) ||
+          skinware__is(values, 'f', 4, sensors)) ||
         !skinware__is(skinware_find_column(reader, "status"), 'u', 1, sensors) ||
         !skinware__is(skinware_find_column(reader, "module_time_ns"), 'i', 8, modules) ||
         !skinware__is(skinware_find_column(reader, "patch_state"), 'u', 1, patches) ||
@@ -881,6 +891,8 @@ skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *new
         const uint64_t latest = skinware_latest(reader);
         int64_t remaining_ns;
         int gone, error;
+        if (!(state & SKINWARE_STATE_PAUSED))
+            reader->told_paused = 0;
         if ((look_around || (state & (SKINWARE_STATE_SUPERSEDED | SKINWARE_STATE_CLOSED))) &&
             skinware__is_replaced(reader))
             return SKINWARE_RESTARTED;
@@ -896,8 +908,6 @@ skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *new
             reader->told_paused = 1;
             return SKINWARE_PAUSED;
         }
-        if (!(state & SKINWARE_STATE_PAUSED))
-            reader->told_paused = 0;
         remaining_ns = deadline_ns == SKINWARE_FOREVER ? skinware__slice_ns : deadline_ns - skinware_now_ns();
         if (remaining_ns > 0) {
             error = skinware__sleep(reader->map + SKINWARE__WAKE_WORD_OFFSET, wake_word,
@@ -1032,7 +1042,7 @@ const skinware_column *skinware_column_at(const skinware_reader *reader, size_t 
 
 double skinware_number(const skinware_column *column, const void *data, size_t index) {
     const unsigned char *at = (const unsigned char *)data + index * column->itemsize;
-    if (index >= column->count || strchr("uif", column->kind) == NULL)
+    if (index >= column->count || !skinware__is_number(column->kind))
         return __builtin_nan("");
     switch (column->itemsize << 8 | (unsigned char)column->kind) {
 #define SKINWARE__CASE(size, kind, type)                                                                               \

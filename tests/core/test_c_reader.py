@@ -29,6 +29,7 @@ from skinware.memory import _layout
 from skinware.memory.namespace import ROOT
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from tests.compiling import LANGUAGES, compiled
+from tests.conftest import wait_until
 
 SPAWN = multiprocessing.get_context("spawn")
 SOURCE = Path(__file__).with_name("c_reader.c")
@@ -145,6 +146,10 @@ class Talk:
             except subprocess.TimeoutExpired:
                 self.process.send_signal(signal.SIGUSR1)
         raise AssertionError("it did not leave within a minute")
+
+    def stop(self) -> None:
+        self.process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: ") T " in Path(f"/proc/{self.process.pid}/stat").read_text())
 
     def next(self) -> Event:
         assert self.process.stdout is not None
@@ -428,8 +433,10 @@ def test_pause_resume_restructure_and_close_are_told_at_once(any_program: Path) 
         writer.pause()
         seen = talk.next()
         assert (seen["event"], seen["state"], seen["value"]) == ("paused", _layout.STATE_PAUSED, 1)
+        talk.stop()  # so that it sees the end of the pause and the frame at the same moment
         writer.resume()
         publish(2)
+        talk.process.send_signal(signal.SIGCONT)
         seen = talk.next()
         assert (seen["event"], seen["value"]) == ("frame", 2)
         writer.pause()
@@ -485,6 +492,7 @@ def ring_file(namespace: Namespace) -> bytes:
         (lambda d: d[:44] + b"\x01" + d[45:], "make no ring"),
         (lambda d: d[:56] + bytes(8) + d[64:], "make no ring"),
         (lambda d: d.replace(b"sensor_module", b"sensor_nodule"), "structure is missing"),
+        (lambda d: d.replace(b"<u2", b"<f2"), "do not fit its structure"),
         (lambda d: d.replace(np.arange(6, dtype="<u4") % 2, np.arange(6, dtype="<u4")), "does not exist"),
         (lambda d: d.replace(STRAIN.to_bytes(4, "little"), b"\x63\0\0\0", 1), "not in the driver's table"),
     ],
@@ -605,3 +613,25 @@ def test_damage_of_any_kind_does_no_harm(
     path.unlink()
     assert attached > 20
     assert refused > 20
+
+
+def test_damage_while_a_file_is_read_does_no_harm(
+    namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    program = compiled(SOURCE, "sanitized", tmp_path_factory)
+    path = namespace.ring_path("x")
+    path.write_bytes(ring_file(namespace))
+    size = path.stat().st_size
+    generator = random.Random(7)
+    fd = os.open(path, os.O_RDWR)
+    try:
+        with talking(program, "follow", "x", 0) as talk:
+            for _ in range(1000):
+                offset = generator.choice([0, 512, 1152, generator.randrange(size)])
+                os.pwrite(fd, generator.randbytes(min(640, size - offset)), offset)
+                talk.next()
+            talk.end_input()
+    finally:
+        os.close(fd)
+    assert path.stat().st_size == size
+    path.unlink()

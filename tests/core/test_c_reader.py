@@ -23,7 +23,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skinware import DriverReader, DriverWriter, Namespace, ServiceWriter, Structure
+from skinware import DriverReader, DriverWriter, Namespace, ServiceWriter, Structure, get_include
 from skinware.errors import BadServiceFile
 from skinware.memory import _layout
 from skinware.memory.namespace import ROOT
@@ -211,10 +211,8 @@ def test_the_header_needs_nothing_and_warns_of_nothing(
         "#include <skinware.h>\n#include <skinware.h>\nint main(void) { return skinware_text(SKINWARE_OK) == NULL; }\n"
     )
     implementation.write_text("#define SKINWARE_IMPLEMENTATION\n#include <skinware.h>\n")
-    import skinware
-
     options = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow", "-Wconversion", "-Wcast-align"]
-    command = [LANGUAGES[language][0], f"-std={standard}", *options, f"-I{skinware.get_include()}"]
+    command = [LANGUAGES[language][0], f"-std={standard}", *options, f"-I{get_include()}"]
     subprocess.run([*command, str(user), str(implementation), "-o", str(tmp_path / "user")], check=True)
     subprocess.run([str(tmp_path / "user")], check=True)
 

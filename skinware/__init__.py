@@ -9,6 +9,8 @@ Read a skin without knowing its hardware::
             pressure = snapshot.physical("pressure")  # (n,) float32
 """
 
+import os
+
 from skinware.driver_service import DriverFrame, DriverReader, DriverWriter
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -34,4 +36,10 @@ __all__ = [
     "Snapshot",
     "Status",
     "Structure",
+    "get_include",
 ]
+
+
+def get_include() -> str:
+    """The folder of ``skinware.h``, with which C and C++ programs read skins: ``cc -I"$(...)"``."""
+    return os.path.join(os.path.dirname(__file__), "include")

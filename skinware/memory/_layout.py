@@ -1,6 +1,7 @@
 """The bytes of a service's file: header, column table, static columns, ring of slots.
 
-Version 1.0, little-endian. The same major number means that a reader of this version can read the file.
+Version 1.0, little-endian. The same major number means that a reader of this version can read the file. Everything
+here is public: docs/reference/shared-memory.md tells it byte by byte, and what a later version may change.
 
 =========  ====================================================================================
 offset     what
@@ -36,7 +37,7 @@ ALIGNMENT = 64
 MIN_SLOTS, MAX_SLOTS, DEFAULT_SLOTS = 2, 64, 8
 MAX_COLUMNS = 256
 MAX_FILE_SIZE = 1 << 32
-NAME_BYTES = 48
+KIND_BYTES = 16
 
 
 def _packed(itemsize: int, *fields: tuple[str, str, int]) -> np.dtype[np.void]:
@@ -60,7 +61,7 @@ HEADER = _packed(
     ("writer_start_ticks", "<u8", 72),
     ("pid_namespace", "<u8", 80),
     ("period_ns", "<i8", 88),
-    ("kind", "S16", 96),
+    ("kind", f"S{KIND_BYTES}", 96),
     ("name", "S48", 112),
     ("digest", "V32", 160),
 )
@@ -195,6 +196,8 @@ def plan(
     end = COLUMN_OFFSET + COLUMN.itemsize * (len(static) + len(slot))
     static_columns = []
     for name, array in static.items():
+        if array.ndim != 1:
+            raise ConfigurationError(f"table {name!r} has shape {array.shape}: give arrays of one dimension")
         offset = aligned(end)
         static_columns.append(_checked(Column(name, array.dtype, len(array), offset)))
         end = offset + array.nbytes
@@ -212,10 +215,11 @@ def plan(
 
 
 def _checked(column: Column) -> Column:
-    name, code = column.name.encode(), column.dtype.str.encode()
-    if not 0 < len(name) <= 24 or len(code) > 8 or column.dtype.kind not in "uifSV" or code[:1] == b">":
+    name, code = column.name, column.dtype.str
+    named = 0 < len(name) <= 24 and name.isascii() and name.isprintable()
+    if not named or len(code) > 8 or column.dtype.kind not in "uifSV" or code[0] == ">":
         raise ConfigurationError(
-            f"column {column.name!r} of {column.dtype}: give a name of 1 to 24 bytes and little-endian"
+            f"column {name!r} of {column.dtype}: give a name of 1 to 24 printable ASCII characters and little-endian"
             " integers, floats, fixed-length bytes or structures of them"
         )
     return column

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BadServiceFile, NameInUse, NamespaceError, ServiceNotFound
+from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, NamespaceError, ServiceNotFound
 from skinware.memory import _futex, _layout
+from skinware.memory._fences import fence
 from skinware.memory._layout import Layout
 from skinware.memory._locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
-from skinware.memory.schema import Schema, from_file
+from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_BYTES = _layout.COLUMN_OFFSET + _layout.COLUMN.itemsize * _layout.MAX_COLUMNS
@@ -76,6 +77,7 @@ class Segment:
         """Set bits of the state word and wake everybody who waits (needs a writable map)."""
         control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
         control["state"] |= state
+        fence()
         control["wake_word"] += np.uint32(1)
         _futex.Word(self.data, _layout.WAKE_WORD_OFFSET).wake_all()
 
@@ -115,9 +117,13 @@ def create(
     """Make a new generation and put it in the place of the old one. The caller owns the name.
 
     Raises:
-        ConfigurationError: slots or columns that the format cannot hold.
+        ConfigurationError: slots, columns or a kind that the format cannot hold.
         NamespaceError: no room in shared memory, or no rights.
     """
+    if STATIC_NAME in static:
+        raise ConfigurationError(f"the table name {STATIC_NAME!r} is taken: give yours another name")
+    if len(kind.encode()) > _layout.KIND_BYTES:
+        raise ConfigurationError(f"kind {kind!r}: at most {_layout.KIND_BYTES} bytes")
     static = {**static, **schema.for_file()}
     layout = _layout.plan(static, schema.for_layout(), slots)
     _remove_leftovers(namespace, name)

@@ -1,7 +1,8 @@
 """The ring: one writer that waits for nobody, any number of readers that cannot disturb it.
 
-Slot protocol. Writer: sequence = 0; fence; fill; fence; sequence = n; latest = n; wake. Reader: load the sequence;
-fence; copy the slot; fence; load it again: equal means that the copy is whole.
+Slot protocol. Writer: sequence = 0; fence; fill; fence; sequence = n; latest = n; fence; bump the wake word; wake.
+Reader: load the sequence; fence; copy the slot; fence; load it again: equal means that the copy is whole. Before it
+sleeps: load the wake word; fence; look at latest and state. docs/reference/shared-memory.md has all of it.
 """
 
 from __future__ import annotations
@@ -152,7 +153,9 @@ class RingReader(Generic[F]):
     @property
     def wake_count(self) -> int:
         """Present value of the futex word; take it before looking at ``latest`` or ``state``."""
-        return self._half_words[_WAKE_WORD]
+        count = self._half_words[_WAKE_WORD]
+        fence()
+        return count
 
     def sleep(self, wake_count: int, latest: int, timeout_ns: int) -> bool:
         """Sleep until the futex word is another than ``wake_count``, or the time is up; may return early.
@@ -295,8 +298,8 @@ class RingWriter:
 
     def wake(self) -> None:
         """Wake everybody who waits for this generation."""
+        fence()  # who sees the new word sees what it is about; the system call itself orders the word
         self._half_words[_WAKE_WORD] = (self._half_words[_WAKE_WORD] + 1) & 0xFFFF_FFFF
-        fence()
         self._wake_word.wake_all()
 
     def count_missed_periods(self, count: int) -> None:

@@ -1,0 +1,87 @@
+"""The programs of docs/how-to/c-and-cpp.md, compiled and run as they stand there."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinware import BusState, DriverReader, DriverWriter, PatchState
+from tests.compiling import compiled
+from tests.core.test_c_reader import structure
+
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "how-to" / "c-and-cpp.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", DOCUMENT, flags=re.M | re.S)
+
+
+def program_text(language: str, beginning: str) -> str:
+    (text,) = [text for name, text in BLOCKS if name == language and text.startswith(beginning)]
+    return str(text)
+
+
+@contextmanager
+def lines_of(*words: object) -> Iterator[Iterator[str]]:
+    process = subprocess.Popen([str(word) for word in words], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield iter(process.stdout)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def publish(writer: DriverWriter, value: int) -> None:
+    columns = writer.begin()
+    columns["values"][:] = value
+    columns["status"][:] = 0
+    columns["status"][0] = 2  # the first pressure sensor is stale
+    writer.commit(1)
+
+
+@pytest.mark.parametrize("language", ["c99", "c++11"])
+def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    source = tmp_path / "touch.c"
+    source.write_text(program_text("c", "/* touch.c"))
+    program = compiled(source, language, tmp_path_factory)
+    assert subprocess.run([program, "torso"], capture_output=True).returncode == 1
+    writer = DriverWriter("torso", structure())
+    publish(writer, 10)
+    with lines_of(program, "torso") as lines:
+        assert next(lines) == "frame 1: 2.0 Pa over 17 of 18 taxels\n"
+        publish(writer, 20)
+        assert next(lines) == "frame 2: 7.0 Pa over 17 of 18 taxels\n"
+        writer.close()
+        with DriverWriter("torso", structure()) as writer:
+            publish(writer, 30)
+            assert next(lines) == "frame 1: 12.0 Pa over 17 of 18 taxels\n"
+            writer.restructure(structure(n_modules=2))
+            publish(writer, 40)
+            assert next(lines) == "frame 1: 17.0 Pa over 5 of 6 taxels\n"
+
+
+def test_the_writing_program(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    source, script = tmp_path / "fingers.c", tmp_path / "fingers.py"
+    source.write_text(program_text("c", "/* fingers.c"))
+    script.write_text(program_text("python", "import ctypes"))
+    options = ["-D_POSIX_C_SOURCE=200809L", "-shared", "-fPIC"]
+    library = compiled(source, "c99", tmp_path_factory, options)
+    with lines_of(sys.executable, script, library), DriverReader("fingers", timeout_s=60) as reader:
+        frames = reader.in_order(timeout_s=60)
+        taken = [next(frames) for _ in range(50)]
+        for before, frame in pairwise(taken):
+            assert frame.values.tolist() == (np.arange(16) + frame.sequence - 1).tolist()
+            assert frame.acquired_ns > before.acquired_ns
+            assert frame.module_time_ns.tolist() == [frame.acquired_ns]
+            assert (frame.status == 0).all()
+            assert frame.patch_state.tolist() == [PatchState.LIVE]
+            assert frame.bus_state.tolist() == [BusState.LIVE]
+    with DriverWriter("fingers", structure()):  # what the killed script left is taken over and removed
+        pass

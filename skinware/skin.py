@@ -193,7 +193,7 @@ class Skin:
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._readers: dict[str, DriverReader] = {}
         self._layout = SkinLayout((), ())
-        self._next_discovery_ns = 0
+        self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
 
     @property
@@ -231,7 +231,8 @@ class Skin:
         while True:
             if self._closed:
                 raise Closed("this skin was closed")
-            self._discover()
+            if now_ns() >= self._next_look_ns or self._moved_on():
+                self._discover()
             words = [reader.wake_word() for reader in self._readers.values()]
             if self._readers and self._is_newer(newer_than):
                 snapshot = self._snapshot()
@@ -242,6 +243,10 @@ class Skin:
                 raise ServiceTimeout(self._why_nothing_came())
             until_ns = time_ns + WAIT_SLICE_NS
             _sleep_on(words, until_ns if deadline_ns is None else min(until_ns, deadline_ns))
+
+    def _moved_on(self) -> bool:
+        """Whether a driver has told that it closed, or published something else; who was killed is found by looking."""
+        return any(reader.peek() is None for reader in self._readers.values())
 
     def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[Snapshot]:
         """Snapshots for ever: whenever any driver publishes, or at the deadlines of a rate.
@@ -273,6 +278,7 @@ class Skin:
         self._readers = {}
 
     def _discover(self) -> None:
+        self._next_look_ns = now_ns() + WAIT_SLICE_NS
         for name in [name for name, reader in self._readers.items() if not self._still_there(reader)]:
             self._readers.pop(name).close()
         if now_ns() >= self._next_discovery_ns:
@@ -326,22 +332,16 @@ class Skin:
         if known is None or known.layout is not self._layout:
             return True
         return any(
-            reader.latest != frame.position for reader, frame in zip(self._readers.values(), known.frames, strict=True)
+            reader.peek() != frame.position for reader, frame in zip(self._readers.values(), known.frames, strict=True)
         )
 
     def _snapshot(self) -> Snapshot | None:
-        frames = []
-        for reader, structure in zip(self._readers.values(), self._layout.structures, strict=True):
-            if reader.latest is None:
-                return None  # between two lives of a driver
-            try:
-                frame = reader.read(timeout_s=0.0)
-            except (ServiceTimeout, Overrun):
-                return None
-            if frame.structure is not structure:
-                return None  # it came back with another one this very moment
-            frames.append(frame)
-        return Snapshot(self._layout, tuple(frames))
+        if self._moved_on():
+            return None  # between two lives of a driver
+        try:
+            return Snapshot(self._layout, tuple(reader.take_newest() for reader in self._readers.values()))
+        except Overrun:
+            return None
 
     def _why_nothing_came(self) -> str:
         if not self._readers:

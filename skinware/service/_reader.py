@@ -135,6 +135,27 @@ class ServiceReader(Generic[F]):
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
 
+    def peek(self) -> Position | None:
+        """Position of the newest frame of the generation at hand, None before the first or if that has ended.
+
+        Unlike ``latest`` it neither looks for a new generation nor asks whether the writer lives.
+        """
+        if self._ring.state & _MOVED_ON:
+            return None
+        sequence = self._ring.latest
+        return (self._ring.generation, sequence) if sequence else None
+
+    def take_newest(self) -> F:
+        """A copy of the newest frame of the generation at hand, as lightly as ``peek``.
+
+        Raises:
+            ServiceTimeout: nothing was published yet.
+            Overrun: the writer is too fast for this number of slots.
+        """
+        frame = self._taken(self._whole(self._ring.copy), True)
+        self._accounts.settle()
+        return frame
+
     def wake_word(self) -> tuple[Word, int]:
         """The futex that every publication wakes, and its present value; take it before ``latest``."""
         return self._ring.wake_word, self._ring.wake_count

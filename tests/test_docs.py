@@ -1,0 +1,126 @@
+"""The documentation does what it says: snippets run, and what is named exists."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import skinware
+from skinware import realtime, threads
+from tests.commands import PATIENCE_S, running
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+_BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path) -> list[tuple[int, str]]:
+    """(line, text) of every Python block, also of those in comments, which set the stage for the others."""
+    text = page.read_text()
+    return [(text.count("\n", 0, match.start(1)), match[1]) for match in _BLOCK.finditer(text)]
+
+
+def as_program(page: Path) -> str:
+    """All blocks of a page, each at the line where it stands, so that errors name the line."""
+    lines: list[str] = []
+    for line, block in blocks(page):
+        lines += [""] * (line - len(lines)) + block.splitlines()
+    return "\n".join(lines)
+
+
+def execute(page: Path) -> subprocess.CompletedProcess[str]:
+    """Run a page in a process of its own."""
+    compile_and_run = "import sys; path = sys.argv[1]; exec(compile(sys.stdin.read(), path, 'exec'))"
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", compile_and_run, str(page)],
+        input=as_program(page),
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=PATIENCE_S,
+    )
+
+
+@pytest.mark.parametrize("page", ["services", "skin"])
+def test_a_how_to_runs_from_its_first_snippet_to_its_last(page: str) -> None:
+    done = execute(ROOT / f"docs/how-to/{page}.md")
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+
+
+def test_a_snippet_that_raises_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Text\n\n<!-- python\nready = 1\n-->\n\n```python\nassert ready == 1\nassert ready == 2\n```\n")
+    done = execute(page)
+    assert done.returncode == 1
+    assert f'"{page}", line 9' in done.stderr
+
+
+def test_the_first_reader_of_the_readme_reads(tmp_path: Path) -> None:
+    (reader,) = (text for _, text in blocks(ROOT / "README.md") if "skinware.Skin()" in text)
+    with running("skin-driver", "--bus", "virtual?boards=7,8"):
+        process = subprocess.Popen(
+            [sys.executable, "-u", "-W", "error", "-c", reader], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        try:
+            lines = [process.stdout.readline() for _ in range(5)]
+        finally:
+            process.send_signal(signal.SIGINT)
+            _, errors = process.communicate(timeout=PATIENCE_S)
+    counts = [re.fullmatch(r"[\d.]+ counts over (\d+) of (\d+) taxels\n", line) for line in lines]
+    assert all(counts), f"{lines}\n{errors}"
+    assert counts[-1] is not None
+    assert int(counts[-1][1]) > 0
+
+
+def test_the_first_driver_of_the_readme_is_one() -> None:
+    (driver,) = (text for _, text in blocks(ROOT / "README.md") if "CanAdapter" in text)
+    names: dict[str, object] = {"__name__": "readme"}
+    exec(compile(driver, "README.md", "exec"), names)
+    adapter = names["Fingertip"]
+    assert isinstance(adapter, type)
+    assert sum(len(module.channels) for patch in adapter.patches for module in patch.modules) == 16  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_tests_that_are_named_exist(page: Path) -> None:
+    text = page.read_text()
+    targets = [target for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text) if "://" not in target]
+    assert [target for target in targets if not (page.parent / target).exists()] == []
+    named = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", text)
+    missing = [
+        (file, name)
+        for file, name in named
+        if not (ROOT / file).exists() or (name and f"def {name}(" not in (ROOT / file).read_text())
+    ]
+    assert missing == []
+
+
+def test_every_capability_of_the_c_library_has_an_answer() -> None:
+    text = (ROOT / "docs/reference/skinware2-parity.md").read_text()
+    rows = [line.split(" | ") for line in text.splitlines() if re.match(r"\| \d+ \|", line)]
+    assert [int(row[0].strip("| ")) for row in rows] == list(range(1, 58))
+    verdicts = {re.match(r"\*\*(\w+)\*\*", row[3]) for row in rows}
+    assert None not in verdicts
+    assert {verdict[1] for verdict in verdicts if verdict} == {"same", "better", "declined"}
+    assert all(len(row) == 4 for row in rows)
+
+
+def test_attributes_that_the_parity_table_names_exist() -> None:
+    text = (ROOT / "docs/reference/skinware2-parity.md").read_text()
+    classes = {
+        **vars(skinware),
+        **{name: getattr(threads, name) for name in ("SkinReplica", "Worker")},
+        **{name: getattr(realtime, name) for name in ("Periodic", "Profile")},
+    }
+    found = {(cls, name) for cls, name in re.findall(r"`(\w+)\.(\w+)", text) if isinstance(classes.get(cls), type)}
+    assert len(found) > 20
+    assert [f"{cls}.{name}" for cls, name in found if not hasattr(classes[cls], name)] == []
+    functions = re.findall(r"`threads\.(\w+)", text)
+    assert functions
+    assert [name for name in functions if not hasattr(threads, name)] == []

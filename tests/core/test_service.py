@@ -15,6 +15,7 @@ from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import (
     BadServiceFile,
     Closed,
+    ConfigurationError,
     NameInUse,
     NamespaceError,
     PlatformError,
@@ -282,6 +283,15 @@ def test_of_two_writers_of_one_name_one_wins() -> None:
         process.close()
     results.close()
     results.join_thread()
+
+
+@pytest.mark.parametrize("slots", [0, 1, 65])
+def test_impossible_slots_are_refused_and_the_name_is_free_again(slots: int, namespace: Namespace) -> None:
+    with pytest.raises(ConfigurationError, match=f"{slots} slots: give 2 to 64"):
+        ServiceWriter("x", SMALL, slots=slots)
+    assert namespace.services() == []
+    with ServiceWriter("x", SMALL) as writer:
+        assert writer.sequence == 0
 
 
 def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:

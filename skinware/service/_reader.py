@@ -339,7 +339,7 @@ class ServiceReader(Generic[F]):
             timer.wait()
 
     def _adopt(self, ring: RingReader[F]) -> None:
-        if self._last is not None and self._last[0] == self._ring.generation:
+        if self._last is not None and self._last[0] == self._ring.generation != ring.generation:
             self._accounts.record.lost += self._ring.latest - self._last[1]
             self._last = (ring.generation, 0)
         self._ring.segment.descriptor.close()

@@ -131,6 +131,7 @@ class ServiceWriter:
         if now_ns() >= self._next_file_check_ns:
             self._keep_files()
         if self._paused:
+            self._require_open()
             raise Paused(f"service {self.name!r} is paused; call resume() first")
         return self._ring.begin(from_last=from_last)
 

@@ -1,4 +1,8 @@
-"""Child processes of the proofs: made quickly, watched through a board of numbers, killed at any line they run."""
+"""Child processes of the proofs: made quickly, watched through a board of numbers, killed at any line they run.
+
+Sizes and seeds of the proofs can be given: SKINWARE_TEST_SEED (printed by each run that has one), SKINWARE_TEST_KILLS
+(500), SKINWARE_TEST_EXAMPLES (of hypothesis, per test).
+"""
 
 from __future__ import annotations
 

@@ -163,8 +163,8 @@ def flood() -> int:
 def wake_ups() -> int:
     """Wake all readers without an end, and move them to a futex that nobody wakes."""
     with ServiceReader[Frame]("x", announce=False) as reader:
-        address, _ = reader.wake_word()
-        elsewhere = reader._ring.segment.address(_layout.STATISTICS_OFFSET)
+        start = reader._ring.segment.data.ctypes.data
+        address, elsewhere = start + _layout.WAKE_WORD_OFFSET, start + _layout.STATISTICS_OFFSET
         libc = ctypes.CDLL(None)
         end = time.monotonic() + 2.0
         moved = 0

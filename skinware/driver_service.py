@@ -262,6 +262,6 @@ class DriverReader(ServiceReader[DriverFrame]):
             for name, count in expected.items():
                 if columns[name].count != count:
                     raise StructureError(f"{columns[name].count} {name} for {count} rows of the structure")
-        except (StructureError, KeyError, UnicodeDecodeError) as error:
+        except (ValueError, TypeError, LookupError, OverflowError) as error:  # StructureError is a ValueError
             raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
         return structure

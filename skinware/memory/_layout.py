@@ -263,6 +263,10 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
         raise refuse(f"layout version {major}.{minor}, this program reads {VERSION[0]}.x")
     if int(header["file_size"]) != file_size or file_size > MAX_FILE_SIZE or file_size % 4096:
         raise refuse(f"truncated or absurd: the header says {header['file_size']} bytes, the file has {file_size}")
+    try:
+        bytes(header["kind"]).decode("ascii")
+    except UnicodeDecodeError:
+        raise refuse("a kind that is no text") from None
     slot_count = int(header["slot_count"])
     slot_offset, stride = int(header["slot_offset"]), int(header["slot_stride"])
     n_columns = int(header["column_count"])
@@ -277,8 +281,10 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, Layout]:
     slot: list[Column] = []
     for row in np.frombuffer(head, COLUMN, n_columns, COLUMN_OFFSET):
         try:
-            name = bytes(row["name"]).decode("ascii")
-            dtype = np.dtype(bytes(row["dtype"]).decode("ascii"))
+            name, code = bytes(row["name"]).decode("ascii"), bytes(row["dtype"]).decode("ascii")
+            dtype = np.dtype(code)
+            if dtype.str != code:  # numpy reads more than we write: structures, arrays, objects, aliases
+                raise ValueError(f"dtype {code!r}")
             column = _checked(Column(name, dtype, int(row["count"]), int(row["offset"])))
         except (UnicodeDecodeError, TypeError, ValueError, SyntaxError) as error:
             raise refuse(f"a column that cannot be read ({error})") from None

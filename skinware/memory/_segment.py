@@ -85,6 +85,8 @@ class Segment:
 def take_name(namespace: Namespace, name: str) -> Descriptor:
     """Become the owner of a service's name, for as long as the returned descriptor is open.
 
+    What the owner before left half made or cannot take back (it was killed) is removed.
+
     Raises:
         NameInUse: a living process owns it.
         NamespaceError: the lock file cannot be used.
@@ -101,6 +103,11 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
             f"a living driver or service is called {name!r} in namespace {namespace.name!r};"
             " stop it (skin-info shows its pid), or choose another name (--name) or namespace (SKINWARE_NAMESPACE)"
         )
+    try:
+        _remove_leftovers(namespace, name)
+    except OSError as error:
+        descriptor.close()
+        raise NamespaceError(f"cannot remove what a dead {name!r} left in {namespace.path}: {error.strerror}") from None
     return descriptor
 
 
@@ -126,7 +133,6 @@ def create(
         raise ConfigurationError(f"kind {kind!r}: at most {_layout.KIND_BYTES} bytes")
     static = {**static, **schema.for_file()}
     layout = _layout.plan(static, schema.for_layout(), slots)
-    _remove_leftovers(namespace, name)
     final = namespace.ring_path(name)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
     header = _header(name, layout, layout.digest(static), kind, period_ns)
@@ -180,8 +186,11 @@ def _previous(namespace: Namespace, name: str) -> Segment | None:
 
 
 def _remove_leftovers(namespace: Namespace, name: str) -> None:
-    """Remove what a writer that was killed left half made; the caller owns the name."""
-    pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)")
+    """Remove what a writer that was killed left half made, and its socket; the caller owns the name.
+
+    The ring stays until another takes its place: readers still want its last frame.
+    """
+    pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
     for entry in os.listdir(namespace.path):
         if pattern.fullmatch(entry):
             os.unlink(namespace.path / entry)

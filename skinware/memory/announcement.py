@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import time
 import zlib
 from collections.abc import Iterator
 
@@ -20,7 +19,6 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread
 
 _SIZE = 2048
-_HALF_MADE_S = 60.0
 _READ_ATTEMPTS = 5
 
 
@@ -61,23 +59,21 @@ class ReaderRecord(msgspec.Struct):
 
 
 class Announcement:
-    """This reader's own file. A namespace that cannot be written is no obstacle to reading."""
+    """This reader's own file. A namespace that cannot be written is no obstacle to reading.
+
+    The file is locked before it has a name: whoever sees it, sees it locked, or its reader is dead.
+    """
 
     def __init__(self, namespace: Namespace, service: str) -> None:
-        name = f"{service}.{os.getpid()}.{secrets.token_hex(4)}"
-        self._path = namespace.readers_path / name
+        self._folder = namespace.readers_path
+        self._path = self._folder / f"{service}.{os.getpid()}.{secrets.token_hex(4)}"
         self._descriptor: Descriptor | None = None
-        temporary = namespace.readers_path / f".{name}"
-        try:
-            fd = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o640)
-        except OSError:
-            return
-        self._descriptor = Descriptor(fd)
-        try_lock(fd)
-        os.rename(temporary, self._path)
+        self._make()
 
     def write(self, record: ReaderRecord) -> None:
-        """Tell the present figures."""
+        """Tell the present figures; makes the file again if there was no place for it yet, or somebody removed it."""
+        if self._descriptor is None or (self._descriptor.fd >= 0 and os.fstat(self._descriptor.fd).st_nlink == 0):
+            self._make()
         if self._descriptor is None or self._descriptor.fd < 0:
             return
         text = msgspec.json.encode(record)[: _SIZE - 9].ljust(_SIZE - 9)
@@ -90,6 +86,15 @@ class Announcement:
         with contextlib.suppress(OSError):
             self._path.unlink()
         self._descriptor.close()
+
+    def _make(self) -> None:
+        with contextlib.suppress(OSError):
+            descriptor = Descriptor(os.open(self._folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o640))
+            os.fchmod(descriptor.fd, 0o640)  # whatever the umask: the namespace's owner reads it
+            try_lock(descriptor.fd)
+            # a source folder, though not needed, makes this a linkat(2) that follows /proc's link to the open file
+            os.link(f"/proc/self/fd/{descriptor.fd}", self._path, src_dir_fd=descriptor.fd, follow_symlinks=True)
+            self._descriptor = descriptor
 
 
 def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
@@ -123,9 +128,6 @@ def sweep(namespace: Namespace) -> int:
     for name in names:
         path = namespace.readers_path / name
         with contextlib.suppress(OSError):
-            # a name that begins with a dot is being made, unless it has been for a minute
-            if name.startswith(".") and time.time() - path.lstat().st_mtime < _HALF_MADE_S:
-                continue
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
             try:
                 alive = is_locked(fd)
@@ -142,7 +144,16 @@ def _read(fd: int) -> ReaderRecord | None:
         data = os.pread(fd, _SIZE, 0)
         if data[:8] == b"%08x" % zlib.crc32(data[9:]):
             try:
-                return msgspec.json.decode(data[9:], type=ReaderRecord)
-            except msgspec.DecodeError:
+                return _speakable(msgspec.json.decode(data[9:], type=ReaderRecord))
+            except (msgspec.MsgspecError, ValueError, RecursionError):
                 return None
     return None
+
+
+def _speakable(record: ReaderRecord) -> ReaderRecord:
+    """Whoever may announce a reader must not command the terminals of those who look."""
+    for name in ("service", "program", "kind"):
+        text: str = getattr(record, name)
+        if not text.isprintable():
+            setattr(record, name, ascii(text)[1:-1])
+    return record

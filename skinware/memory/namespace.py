@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import grp
 import os
 import pwd
 import re
 import stat
 from collections.abc import Iterator
+from errno import EEXIST, ENOTEMPTY, EPERM
 from pathlib import Path
 
 from skinware.errors import ConfigurationError, NamespaceError
@@ -59,11 +61,12 @@ class Namespace:
             ConfigurationError: unknown group.
             NamespaceError: the folder belongs to somebody else or cannot be made.
         """
+        group_id = _group_id(group)
         try:
             for path, mode in ((self.path, 0o2750), (self.readers_path, 0o3770)):
                 if not path.is_symlink() and not path.exists():
-                    _make_folder(path, mode, group)
-        except PermissionError as error:
+                    _make_folder(path, mode, group_id)
+        except OSError as error:
             raise NamespaceError(f"cannot make {error.filename or self.path}: {error.strerror}") from None
         owner = self.check()
         if owner != os.geteuid():
@@ -145,18 +148,36 @@ class Namespace:
         return f"<Namespace {self.name} at {self.path}>"
 
 
-def _make_folder(path: Path, mode: int, group: str | None) -> None:
+def _make_folder(path: Path, mode: int, group_id: int) -> None:
+    """Make a folder that has its group and mode as soon as it can be seen, whoever dies or is faster meanwhile."""
+    begun = path.with_name(f".{path.name}")
     try:
-        path.mkdir(mode=0o700)
-    except FileExistsError:
-        return  # another driver was faster
-    if group is not None:
+        with contextlib.suppress(FileExistsError):  # another driver's, or one that was killed here left it
+            begun.mkdir(mode=0o700)
+        folder = os.open(begun, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
-            os.chown(path, -1, grp.getgrnam(group).gr_gid)
-        except KeyError:
-            path.rmdir()
-            raise ConfigurationError(f"there is no group {group!r} on this machine (see: getent group)") from None
-    path.chmod(mode)
+            if os.fstat(folder).st_uid != os.geteuid():
+                raise PermissionError(EPERM, "somebody else's folder is in the way", str(begun))
+            os.fchown(folder, -1, group_id)
+            os.fchmod(folder, mode)
+        finally:
+            os.close(folder)
+        os.rename(begun, path)
+    except OSError as error:
+        if not path.is_dir():
+            raise
+        if error.errno in (ENOTEMPTY, EEXIST):
+            with contextlib.suppress(FileNotFoundError):
+                begun.rmdir()
+
+
+def _group_id(group: str | None) -> int:
+    if group is None:
+        return -1
+    try:
+        return grp.getgrnam(group).gr_gid
+    except KeyError:
+        raise ConfigurationError(f"there is no group {group!r} on this machine (see: getent group)") from None
 
 
 def _user_id(user: str | int | None) -> int | None:

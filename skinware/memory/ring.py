@@ -21,7 +21,8 @@ from skinware.memory._segment import Segment
 from skinware.memory.statistics import bucket_of
 from skinware.realtime import now_ns
 
-_COPY_ATTEMPTS = 64
+COPY_ATTEMPTS = 64
+"""How often a reader tries again while the writer overwrites what it copies."""
 _LATEST = _layout.LATEST_OFFSET // 8
 _MISSED_PERIODS = _layout.MISSED_PERIODS_OFFSET // 8
 _WAKE_WORD = _layout.WAKE_WORD_OFFSET // 4
@@ -180,7 +181,7 @@ class RingReader(Generic[F]):
         """
         if sequence is not None:
             return self._copy(sequence)
-        for _ in range(_COPY_ATTEMPTS):
+        for _ in range(COPY_ATTEMPTS):
             latest = self.latest
             if latest == 0:
                 return None
@@ -188,7 +189,7 @@ class RingReader(Generic[F]):
             if frame is not None:
                 return frame
         raise Overrun(
-            f"{self.segment.path}: the writer was faster {_COPY_ATTEMPTS} times in a row; "
+            f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
             f"give the service more slots (it has {self._count}) or publish less often"
         )
 
@@ -221,7 +222,7 @@ class RingReader(Generic[F]):
 
     def view(self) -> F | None:
         """The newest frame in place, without a copy; ask ``frame.valid`` after using it."""
-        for _ in range(_COPY_ATTEMPTS):
+        for _ in range(COPY_ATTEMPTS):
             wanted = self.latest
             if wanted == 0:
                 return None
@@ -229,7 +230,7 @@ class RingReader(Generic[F]):
             frame = self._frame_class(self, self._slots[slot], wanted, self._slot_words[slot])
             if frame.valid:
                 return frame
-        raise Overrun(f"{self.segment.path}: the writer was faster {_COPY_ATTEMPTS} times in a row")
+        raise Overrun(f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row")
 
 
 class RingWriter:
@@ -281,7 +282,12 @@ class RingWriter:
 
         Returns:
             The frame's sequence.
+
+        Raises:
+            Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
         """
+        if self.segment.descriptor.fd < 0:
+            raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         sequence = self.sequence + 1
         words = self._slot_words[sequence % self._count]
         published_ns = now_ns()

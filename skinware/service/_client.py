@@ -22,7 +22,7 @@ from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._server import short_path
-from skinware.service.messages import CANCEL, MAX_PACKET, Answer, Ask
+from skinware.service.messages import CANCEL, MAX_PACKET, UNREADABLE, UNSPEAKABLE, Answer, Ask
 
 _ERRORS: dict[str, type[Exception]] = {
     "refused": RequestRefused,
@@ -114,7 +114,7 @@ class RequestClient(ForkGuard):
         ask = Ask(next(self._numbers), operation, arguments)
         try:
             packet = msgspec.json.encode(ask)
-        except TypeError as error:
+        except UNSPEAKABLE as error:
             raise RequestRefused(f"{self.name}: the arguments of {operation!r} cannot be sent: {error}") from None
         if len(packet) > MAX_PACKET:
             raise RequestRefused(f"{self.name}: a request of {len(packet)} bytes; at most {MAX_PACKET}")
@@ -148,7 +148,7 @@ class RequestClient(ForkGuard):
                 packet = b""
             try:
                 answer = msgspec.json.decode(packet, type=Answer) if packet else None
-            except msgspec.DecodeError:
+            except UNREADABLE:
                 answer = None
             if answer is None:
                 self._lose()

@@ -13,7 +13,7 @@ from skinware.memory import _layout, _segment
 from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import Frame, RingReader
+from skinware.memory.ring import COPY_ATTEMPTS, Frame, RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
@@ -176,7 +176,7 @@ class ServiceReader(Generic[F]):
             ServiceTimeout: nothing newer came in time; the message says whether the writer lives.
             StructureChanged: the service came back with another structure (only when waiting for newer).
             Overrun: the writer is too fast for this number of slots.
-            Closed: this reader was closed.
+            Closed: this reader was closed, or belongs to the process before a fork.
         """
         known = newer_than.position if isinstance(newer_than, Frame) else newer_than
         deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
@@ -195,6 +195,7 @@ class ServiceReader(Generic[F]):
 
         Raises:
             ServiceTimeout: nothing was published yet.
+            Overrun, Closed: as ``read``.
         """
         alive = self._keep_up()
         frame = self._taken(self._whole(self._ring.view), alive)
@@ -233,14 +234,14 @@ class ServiceReader(Generic[F]):
         is counted in ``lost``.
 
         Raises:
-            ServiceTimeout, StructureChanged, Closed: as ``read``.
+            ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         self._accounts.begin_loop("in order")
         timeout_ns = None if timeout_s is None else round(timeout_s * NS_PER_S)
         while True:
             deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
-            alive = self._wait_for_newer(self._last, deadline_ns)
-            yield self._taken(self._next_in_order(), alive)
+            alive = self.alive if self._lags() else self._wait_for_newer(self._last, deadline_ns)
+            yield self._taken(self._whole(self._next_in_order), alive)
 
     def request(self, *, timeout_s: float = 5.0) -> F:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
@@ -281,8 +282,6 @@ class ServiceReader(Generic[F]):
         Raises:
             RequestRefused, PeerGone, Closed: as ``call``.
         """
-        if self._closed:
-            raise Closed(f"the reader of {self.name!r} was closed")
         self._keep_up()
         if not self.alive:
             raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
@@ -340,15 +339,20 @@ class ServiceReader(Generic[F]):
             timer.wait()
 
     def _adopt(self, ring: RingReader[F]) -> None:
-        if self._last is not None and self._last[0] == self._ring.generation:
+        if self._last is not None and self._last[0] == self._ring.generation != ring.generation:
             self._accounts.record.lost += self._ring.latest - self._last[1]
             self._last = (ring.generation, 0)
         self._ring.segment.descriptor.close()
         self._ring = ring
         self._moved = False
 
+    def _require_open(self) -> None:
+        if self._ring.segment.descriptor.fd < 0:
+            raise Closed(f"the reader of {self.name!r} was closed, or belongs to the process before a fork")
+
     def _keep_up(self) -> bool:
         """Go over to a new generation if there may be one; whether the writer of the present one lives."""
+        self._require_open()
         alive = self.alive
         if (self._ring.state & _MOVED_ON or not alive) and not self._moved:
             self._follow()
@@ -380,8 +384,7 @@ class ServiceReader(Generic[F]):
         """
         look_around = False
         while True:
-            if self._closed:
-                raise Closed(f"the reader of {self.name!r} was closed")
+            self._require_open()
             ring = self._ring
             wake_count = ring.wake_count
             if (look_around or ring.state & _MOVED_ON) and not self._moved:
@@ -413,23 +416,28 @@ class ServiceReader(Generic[F]):
             return f"no frame of {self.name!r} yet: its writer lives, but has published nothing so far"
         return f"no newer frame of {self.name!r}: its writer lives, but is silent (hung, stopped or waiting)"
 
+    def _lags(self) -> bool:
+        """Whether the generation that is being read has newer frames, though there may be another one already."""
+        return not self._closed and self._last is not None and self._last < (self._ring.generation, self._ring.latest)
+
     def _next_in_order(self) -> F | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
-            return self._whole(self._ring.copy)
+            return self._ring.copy()
         frame = self._ring.copy(last + 1)
         if frame is not None:
             return frame
-        while True:  # it lost some
+        for _ in range(COPY_ATTEMPTS):  # it lost some
             latest = self._ring.latest
             oldest = max(last + 1, latest - self._ring.slot_count + 2)
             for sequence in range(oldest, latest + 1):
                 frame = self._ring.copy(sequence)
                 if frame is not None:
                     return frame
-            if latest == self._ring.latest:
-                self._accounts.record.overruns += 1
-                raise Overrun(f"no slot of {self.name!r} could be read; its writer may have died while filling one")
+        raise Overrun(
+            f"no slot of {self.name!r} could be read, {COPY_ATTEMPTS} times in a row: give it more slots, publish less"
+            " often, or start it again if it died while it filled one"
+        )
 
     def _whole(self, take: Callable[[], F | None]) -> F | None:
         try:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import select
 import socket
+import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,11 +16,22 @@ from skinware.errors import NamespaceError
 from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.service.messages import ACQUIRE, CANCEL, MAX_PACKET, OPERATIONS, Answer, Ask
+from skinware.service.messages import (
+    ACQUIRE,
+    CANCEL,
+    MAX_PACKET,
+    OPERATIONS,
+    UNREADABLE,
+    UNSPEAKABLE,
+    Answer,
+    Ask,
+)
 
 _MAX_PEERS = 64
-_PACKETS_PER_TURN = 256
+_MAX_PEERS_OF_A_STRANGER = 16
+_PACKETS_PER_TURN = 32
 _TURNS = 8
+_CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 class Request:
@@ -48,13 +60,14 @@ class Request:
         """
         try:
             msgspec.json.encode(result)
-        except TypeError as error:
+        except UNSPEAKABLE as error:
             self.fail(f"its result cannot be sent: {error}")
         else:
             self._send(Answer(self._id, *position, result=result))
 
     def fail(self, error: str, why: str = "failed") -> None:
         """Answer that it went wrong (``failed``), or is not done at all (``refused``, ``paused``)."""
+        error = error.encode(errors="backslashreplace").decode()  # a file name in it may be no text
         self._send(Answer(self._id, error=error, why=why))  # type: ignore[arg-type]
 
     def _send(self, answer: Answer) -> None:
@@ -78,7 +91,9 @@ class RequestServer(ForkGuard):
         self.operations = dict(operations)
         self.paused = False
         self._path = namespace.socket_path(name)
+        self._inode = 0
         self._peers: dict[int, socket.socket] = {}
+        self._users: dict[int, int] = {}  # of the peers
         self._open: dict[tuple[int, int], Request] = {}
         self._epoll = select.epoll()
         self._listener = self._listen()
@@ -100,6 +115,7 @@ class RequestServer(ForkGuard):
                 os.chmod(path, 0o660)
                 listener.listen(_MAX_PEERS)
             os.rename(temporary, self._path)
+            self._inode = os.lstat(self._path).st_ino
             self._epoll.register(listener, select.EPOLLIN)
         except OSError as error:
             listener.close()
@@ -122,11 +138,12 @@ class RequestServer(ForkGuard):
             if self._epoll.closed:
                 break
             events = self._epoll.poll(max(0, deadline_ns - now_ns()) / NS_PER_S)
+            share = max(1, _PACKETS_PER_TURN // max(1, len(events)))  # however many ask, the writer's loop goes on
             for fd, _ in events:
                 if fd == self._listener.fileno():
                     self._accept()
                 elif fd in self._peers:
-                    found += self._hear(self._peers[fd])
+                    found += self._hear(self._peers[fd], share)
             if found or not events:
                 break
         return [request for request in found if not request.cancelled]
@@ -148,33 +165,37 @@ class RequestServer(ForkGuard):
         """Take no more requests; those that wait are told by the hang-up. Idempotent."""
         if not self._epoll.closed:
             with contextlib.suppress(FileNotFoundError):
-                self._path.unlink()
+                if os.lstat(self._path).st_ino == self._inode:  # not the socket of somebody who came after us
+                    self._path.unlink()
         self.abandon()
 
     def abandon(self) -> None:
         """See :class:`skinware.memory._locks.ForkGuard`."""
         for peer in self._peers.values():
             peer.close()
-        self._peers, self._open = {}, {}
+        self._peers, self._users, self._open = {}, {}, {}
         self._listener.close()
         self._epoll.close()
 
     def _accept(self) -> None:
-        while True:
+        for _ in range(_MAX_PEERS):
             try:
                 peer, _ = self._listener.accept()
             except OSError:
                 return
-            if len(self._peers) >= _MAX_PEERS:
+            user = _user_of(peer)
+            stranger = user != os.geteuid()
+            of_this_user = sum(other == user for other in self._users.values())
+            if len(self._peers) >= _MAX_PEERS or (stranger and of_this_user >= _MAX_PEERS_OF_A_STRANGER):
                 peer.close()
                 continue
             peer.setblocking(False)
-            self._peers[peer.fileno()] = peer
+            self._peers[peer.fileno()], self._users[peer.fileno()] = peer, user
             self._epoll.register(peer, select.EPOLLIN)
 
-    def _hear(self, peer: socket.socket) -> list[Request]:
+    def _hear(self, peer: socket.socket, limit: int) -> list[Request]:
         found: list[Request] = []
-        for _ in range(_PACKETS_PER_TURN):  # one peer that never stops asking must not hold up the others
+        for _ in range(limit):  # one peer that never stops asking must not hold up the others
             try:
                 packet = peer.recv(MAX_PACKET)
             except BlockingIOError:
@@ -183,7 +204,7 @@ class RequestServer(ForkGuard):
                 packet = b""
             try:
                 ask = msgspec.json.decode(packet, type=Ask) if packet else None
-            except msgspec.DecodeError:
+            except UNREADABLE:
                 ask = None
             if ask is None:  # it hung up, or speaks nonsense
                 self._drop(peer)
@@ -216,10 +237,17 @@ class RequestServer(ForkGuard):
         fd = peer.fileno()
         if self._peers.pop(fd, None) is None:
             return
+        del self._users[fd]
         for key in [key for key in self._open if key[0] == fd]:
             self._open.pop(key).cancelled = True
         self._epoll.unregister(fd)
         peer.close()
+
+
+def _user_of(peer: socket.socket) -> int:
+    credentials = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    user: int = _CREDENTIALS.unpack(credentials)[1]
+    return user
 
 
 class short_path:  # noqa: N801

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, Paused
+from skinware.errors import Closed, NameInUse, Paused
 from skinware.memory import _layout, _segment
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
@@ -73,6 +73,7 @@ class ServiceWriter:
         self._schema = Schema.of(columns, description)
         self._static = dict(static or {})
         self._operations = dict(operations or {})
+        self._group = group
         self._server: RequestServer | None = None
         self.namespace.create(group)
         self._name_lock = _segment.take_name(self.namespace, name)
@@ -100,11 +101,19 @@ class ServiceWriter:
         return self._paused
 
     def pause(self) -> None:
-        """Publish nothing until ``resume``; readers and requesters are told. From any thread."""
+        """Publish nothing until ``resume``; readers and requesters are told. From any thread.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
         self._set_paused(True)
 
     def resume(self) -> None:
-        """Go on after ``pause``. From any thread."""
+        """Go on after ``pause``. From any thread.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
         self._set_paused(False)
 
     def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
@@ -117,10 +126,12 @@ class ServiceWriter:
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
             Paused: it is paused.
+            NameInUse: somebody removed the lock of the name, and another writer has it now; this one is closed then.
         """
         if now_ns() >= self._next_file_check_ns:
-            self._keep_file()
+            self._keep_files()
         if self._paused:
+            self._require_open()
             raise Paused(f"service {self.name!r} is paused; call resume() first")
         return self._ring.begin(from_last=from_last)
 
@@ -133,6 +144,9 @@ class ServiceWriter:
 
         Returns:
             The frame's sequence.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
         """
         return self._ring.commit(acquired_ns, flags)
 
@@ -157,6 +171,8 @@ class ServiceWriter:
             acquired_ns = now_ns()
             self._ring.count_lateness(acquired_ns - (timer.deadline_ns - timer.period_ns))
             yield self.begin(from_last=from_last)
+            if self.closed:  # meanwhile
+                return
             self.commit(acquired_ns)
             self._answer(waiting)
 
@@ -173,6 +189,8 @@ class ServiceWriter:
             if waiting and not self._paused:
                 acquired_ns = now_ns()
                 yield self.begin(from_last=from_last)
+                if self.closed:  # meanwhile
+                    return
                 self.commit(acquired_ns)
                 self._answer(waiting)
 
@@ -191,11 +209,10 @@ class ServiceWriter:
         """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
 
         Raises:
-            Closed: this writer was closed.
+            Closed: this writer was closed, or belongs to the process before a fork.
             NamespaceError: the socket cannot be made.
         """
-        if self.closed:
-            raise Closed(f"the writer of {self.name!r} was closed")
+        self._require_open()
         if self._server is None:
             described = {name: _first_line(function) for name, function in self._operations.items()}
             self._server = RequestServer(self.namespace, self.name, described)
@@ -224,7 +241,9 @@ class ServiceWriter:
         Raises:
             ConfigurationError: columns that the format cannot hold; the old generation then goes on.
             NamespaceError: shared memory is full; the old generation then goes on.
+            Closed: this writer was closed, or belongs to the process before a fork.
         """
+        self._require_open()
         before = self._schema, self._static, self._period_ns
         try:
             if rate_hz is not None:
@@ -279,6 +298,7 @@ class ServiceWriter:
         return ring
 
     def _set_paused(self, paused: bool) -> None:
+        self._require_open()
         self._paused = paused
         self._ring.set_state(_layout.STATE_PAUSED if paused else 0)
         if self._server is not None:
@@ -306,18 +326,35 @@ class ServiceWriter:
         for request in waiting:
             request.reply(position=self.position)
 
-    def _keep_file(self) -> None:
-        """Notice, once a second, that somebody removed our file, and make it again."""
+    def _require_open(self) -> None:
+        if self.closed:
+            raise Closed(f"the writer of {self.name!r} was closed, or belongs to the process before a fork")
+
+    def _keep_files(self) -> None:
+        """Notice, once a second, that somebody removed our files, and make them again."""
         self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
-        fd = self._ring.segment.descriptor.fd
-        if fd >= 0 and os.fstat(fd).st_nlink == 0:
-            self.namespace.create()
+        if self.closed:
+            return  # ``begin`` says so
+        if _removed(self._name_lock.fd):
+            self.namespace.create(self._group)
+            try:
+                name_lock = _segment.take_name(self.namespace, self.name)
+            except NameInUse:
+                self.close()
+                raise
+            self._name_lock.close()
+            self._name_lock = name_lock
+            self._renew_server()
+        if _removed(self._ring.segment.descriptor.fd):
             ring = self._new_generation()
             self._ring.set_state(_layout.STATE_SUPERSEDED)
             self._ring.segment.descriptor.close()
             self._ring = ring
-            if self._server is not None:
-                self._server.renew()
+            self._renew_server()
+
+    def _renew_server(self) -> None:
+        if self._server is not None:
+            self._server.renew()
 
     def __enter__(self) -> Self:
         return self
@@ -327,6 +364,10 @@ class ServiceWriter:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r} in {self.namespace.name!r}, sequence {self.sequence}>"
+
+
+def _removed(fd: int) -> bool:
+    return os.fstat(fd).st_nlink == 0
 
 
 def _first_line(function: Callable[..., object]) -> str:

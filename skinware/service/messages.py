@@ -7,6 +7,10 @@ from typing import Any, Literal
 import msgspec
 
 MAX_PACKET = 1 << 16
+UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
+"""What decoding somebody else's packet can raise: not JSON, not UTF-8, nested too deeply."""
+UNSPEAKABLE = (TypeError, ValueError, OverflowError, RecursionError)
+"""What encoding can raise: no JSON type, half a surrogate pair, a number or a nesting without an end."""
 ACQUIRE = "acquire"
 """Operation of every service: publish a frame whose acquisition begins after the request was received."""
 OPERATIONS = "operations"

@@ -1,0 +1,253 @@
+"""Files that are wrong when they are attached are refused with a clear error, and never mapped out of range."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.driver_service import DriverReader, DriverWriter
+from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.memory import _layout
+from skinware.memory.schema import STATIC_NAME, from_file
+from skinware.service import Column
+from skinware.structure import Structure
+from tests.core.test_structure import tables
+
+FUZZ = settings(
+    max_examples=int(os.environ.get("SKINWARE_TEST_EXAMPLES") or 400),
+    deadline=None,
+    database=None,
+    print_blob=True,
+    suppress_health_check=list(HealthCheck),
+)
+
+
+def ring_file(namespace: Namespace) -> bytes:
+    with ServiceWriter("x", {"values": ("<u8", 512)}, {"table": np.arange(5, dtype="<u4")}):
+        return namespace.ring_path("x").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda d: d[:100], "shorter than a header"),
+        (lambda d: d[:-4096], "truncated"),
+        (lambda d: b"NOTARING" + d[8:], "wrong magic"),
+        (lambda d: d[:8] + b"\x09\0\0\0" + d[12:], "layout version 9"),
+        (lambda d: d[:44] + b"\xff\xff\0\0" + d[48:], "make no ring"),
+        (lambda d: d[:40] + b"\xff\xff\0\0" + d[44:], "columns do not fit"),
+        (lambda d: d[: 1152 + 32] + b"\xff" * 8 + d[1152 + 40 :], "column"),
+    ],
+)
+def test_damaged_files_are_refused(namespace: Namespace, damage: Callable[[bytes], bytes], words: str) -> None:
+    data = damage(ring_file(namespace))
+    namespace.ring_path("x").write_bytes(data)
+    with pytest.raises(BadServiceFile, match=words):
+        ServiceReader[Frame]("x")
+    namespace.ring_path("x").unlink()
+
+
+def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> None:
+    data = ring_file(namespace)
+    path = namespace.ring_path("x")
+    path.symlink_to("/etc/passwd")
+    with pytest.raises(BadServiceFile, match="cannot be opened"):
+        ServiceReader[Frame]("x")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(BadServiceFile, match="not a regular file"):
+        ServiceReader[Frame]("x")
+    path.unlink()
+    if os.geteuid() == 0:
+        path.write_bytes(data)
+        os.chown(path, 12345, -1)
+        with pytest.raises(BadServiceFile, match="owned by uid 12345"):
+            ServiceReader[Frame]("x")
+        path.unlink()
+
+
+def test_a_folder_that_cannot_be_trusted_is_refused(namespace: Namespace) -> None:
+    with pytest.raises(ServiceNotFound, match="it has none"):
+        ServiceReader[Frame]("x")
+    namespace.create()
+    namespace.path.chmod(0o2777)
+    with pytest.raises(NamespaceError, match="written by others"):
+        ServiceReader[Frame]("x")
+    if os.geteuid() == 0:
+        namespace.path.chmod(0o2750)
+        os.chown(namespace.path, 12345, -1)
+        with pytest.raises(NamespaceError, match="SKINWARE_OWNER"):
+            ServiceReader[Frame]("x")
+        with pytest.raises(ServiceNotFound):
+            ServiceReader[Frame]("x", namespace=Namespace(owner=12345))
+
+
+# -- anything may be wrong ---------------------------------------------------------------------------------------
+
+
+def attempt(namespace: Namespace, data: bytes) -> bool:
+    """Attach whatever this is and touch everything in it; False if it was refused."""
+    path = namespace.ring_path("x")
+    path.write_bytes(data)
+    try:
+        for reader_class in (ServiceReader[Frame], DriverReader):
+            try:
+                reader = reader_class("x")
+            except BadServiceFile:
+                if reader_class is not DriverReader:
+                    return False
+                continue
+            with reader:
+                touch(reader)
+    finally:
+        path.unlink()
+    return True
+
+
+def touch(reader: ServiceReader[Frame] | DriverReader) -> None:
+    size = len(reader._ring.segment.data)
+    layout = reader._ring.segment.layout
+    for array in reader.static().values():
+        array.tobytes()
+    assert layout.slot_offset + layout.slot_count * layout.slot_stride <= size
+    takes: tuple[Callable[[], Frame], ...] = (
+        partial(reader.read, timeout_s=0),
+        partial(next, reader.in_order(timeout_s=0)),
+    )
+    for take in takes:
+        try:
+            frame = take()
+        except (ServiceTimeout, Overrun):
+            continue
+        for name in reader.schema.columns:
+            frame.column(name).tobytes()
+    assert reader.rate_hz() is None or reader.writer_statistics.published >= 0
+    assert isinstance(reader.kind, str)
+    repr(reader)
+
+
+class Files(dict[str, bytes]):
+    """Contents of service files by kind."""
+
+    def __repr__(self) -> str:
+        return f"<{', '.join(self)}>"
+
+
+@pytest.fixture(scope="module")
+def services() -> Files:
+    """The bytes of a plain service, of one with a schema, and of a driver, each with frames."""
+    place = Namespace(f"files-{os.getpid()}")
+    structured = Column(np.dtype([("a", "<f4", (3,)), ("b", "<u2")]), (2, 3), "m", "a test")
+    found = Files()
+    for kind, columns in (("plain", {"values": ("<u4", 5)}), ("schema", {"values": structured})):
+        with ServiceWriter("x", columns, {"table": np.arange(5, dtype="<u4")}, namespace=place, slots=3) as writer:
+            for _ in range(4):
+                writer.begin()
+                writer.commit(1)
+            found[kind] = place.ring_path("x").read_bytes()
+    with DriverWriter(
+        "x", Structure(**tables()), driver_type="test", bus_counters=["n"], namespace=place, slots=3
+    ) as driver:
+        driver.begin()
+        driver.commit(1)
+        found["driver"] = place.ring_path("x").read_bytes()
+    place.lock_path("x").unlink()
+    place.readers_path.rmdir()
+    place.path.rmdir()
+    return found
+
+
+@pytest.mark.parametrize("kind", ["plain", "schema", "driver"])
+def test_the_undamaged_files_are_attached(services: Files, kind: str, namespace: Namespace) -> None:
+    namespace.create()
+    assert attempt(namespace, services[kind])
+
+
+@FUZZ
+@given(data=st.data())
+def test_changed_bytes_never_do_harm(services: Files, data: st.DataObject) -> None:
+    namespace = Namespace()
+    namespace.create()
+    damaged = bytearray(services[data.draw(st.sampled_from(sorted(services)))])
+    head = _layout.COLUMN_OFFSET + 30 * _layout.COLUMN.itemsize
+    for _ in range(data.draw(st.integers(1, 3))):
+        offset = data.draw(st.integers(0, min(head, len(damaged)) - 1) | st.integers(0, len(damaged) - 1))
+        if data.draw(st.booleans()):
+            damaged[offset] ^= 1 << data.draw(st.integers(0, 7))
+        else:
+            width = data.draw(st.sampled_from([1, 2, 4, 8]))
+            value = data.draw(st.integers(0, 256**width - 1)).to_bytes(width, "little")
+            damaged[offset // width * width : offset // width * width + width] = value
+    attempt(namespace, bytes(damaged))
+
+
+@FUZZ
+@given(
+    kind=st.sampled_from(["plain", "schema", "driver"]),
+    changes=st.lists(
+        st.tuples(
+            st.sampled_from(["header", "columns", "control"]),
+            st.integers(0, 1000),
+            st.integers(-4096, 4096) | st.integers(-(2**63), 2**64),
+            st.booleans(),
+        ),
+        min_size=1,
+        max_size=3,
+    ),
+)
+def test_changed_fields_never_do_harm(services: Files, kind: str, changes: list[tuple[str, int, int, bool]]) -> None:
+    """Sizes, counts and offsets that are absurd, or off by little."""
+    namespace = Namespace()
+    namespace.create()
+    damaged = bytearray(services[kind])
+    header = np.frombuffer(damaged, _layout.HEADER, 1)
+    parts = {
+        "header": header,
+        "columns": np.frombuffer(damaged, _layout.COLUMN, int(header["column_count"][0]), _layout.COLUMN_OFFSET),
+        "control": np.frombuffer(damaged, _layout.CONTROL, 1, _layout.CONTROL_OFFSET),
+    }
+    for part, which, value, relative in changes:
+        rows = parts[part]
+        names = [name for name in rows.dtype.names or () if rows.dtype[name].kind in "ui"]
+        name, index = names[which % len(names)], which // len(names) % len(rows)
+        limits = np.iinfo(rows.dtype[name])
+        wanted = value + int(rows[name][index]) if relative else value
+        rows[name][index] = min(max(wanted, int(limits.min)), int(limits.max))
+    attempt(namespace, bytes(damaged))
+
+
+@FUZZ
+@given(data=st.data())
+def test_any_length_is_refused(services: Files, data: st.DataObject) -> None:
+    namespace = Namespace()
+    namespace.create()
+    whole = services[data.draw(st.sampled_from(sorted(services)))]
+    length = data.draw(st.integers(0, len(whole) - 1) | st.integers(len(whole) + 1, len(whole) + 8192))
+    assert not attempt(namespace, whole[:length].ljust(length, b"\0"))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy's, about old names of dtypes
+@FUZZ
+@given(
+    text=st.binary(max_size=300)
+    | st.recursive(
+        st.none() | st.booleans() | st.integers() | st.sampled_from(["<f4", "<u2", "|V20", "O", "(2", "a5", "b", ""]),
+        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(["dtype", "shape", "x"]), inner),
+    ).map(lambda dtype: msgspec.json.encode({"columns": {"values": {"dtype": dtype, "shape": [5]}}, "description": ""}))
+)
+def test_no_schema_does_harm(text: bytes) -> None:
+    layout = _layout.plan({}, {"values": ("<u4", 5)})
+    try:
+        schema = from_file(layout, {STATIC_NAME: np.frombuffer(text, np.uint8)}, "x.ring")
+    except BadServiceFile:
+        return
+    values = schema.columns["values"]
+    assert values.dtype.itemsize * np.prod(values.shape) == 20

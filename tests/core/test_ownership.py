@@ -1,0 +1,152 @@
+"""A name has one owner at a time, whoever dies, forks or removes files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.errors import Closed, NameInUse, PeerGone, ServiceTimeout
+from skinware.memory.announcement import living_readers
+from tests.conftest import wait_until
+from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
+from tests.core.workers import PATIENCE_S, Board, Bomb, Crew, process_server
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _server() -> Iterator[None]:
+    with process_server():
+        yield
+
+
+def fight_for_a_name(board: Path, row: int, wins: int) -> None:
+    """Own the name again and again, each time without seeing anybody else own it."""
+    rows = Board(board).rows
+    while rows[row, WON] < wins:
+        try:
+            with ServiceWriter("x", COLUMNS):
+                rows[0, PID] = os.getpid()
+                time.sleep(0)
+                rows[row, TORN] += rows[0, PID] != os.getpid()
+                rows[row, WON] += 1
+        except NameInUse:
+            rows[row, MISSED] += 1
+
+
+def test_two_drivers_never_both_own_a_name(tmp_path: Path, namespace: Namespace) -> None:
+    board = Board(tmp_path / "board", 5)
+    with Crew() as crew:
+        fighters = [crew.start(fight_for_a_name, board.path, row, 50) for row in range(1, 5)]
+        for process in fighters:
+            crew.finish(process)
+    assert board.rows[1:, WON].tolist() == [50] * 4
+    assert board.rows[:, TORN].sum() == 0
+    assert board.rows[:, MISSED].sum() > 0  # they did meet
+
+
+def wait_forked(board: Path, until: Path) -> None:
+    victim_driver("x", board, 0, ROUTINE, 0, until)
+
+
+def test_a_forked_child_does_not_make_a_dead_driver_look_alive(tmp_path: Path, namespace: Namespace) -> None:
+    board, until = Board(tmp_path / "board", 1), tmp_path / "stop"
+    with Crew() as crew:
+        process = crew.start(wait_forked, board.path, until)
+        with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+            frame = reader.read(timeout_s=PATIENCE_S)
+            wait_until(lambda: board.rows[0, BEGUN] > 2, PATIENCE_S)
+            pending = reader.ask("acquire")
+            pending.result(PATIENCE_S)
+            crew.kill(process)
+            assert not reader.alive
+            last = reader.read()
+            assert last.stale
+            with pytest.raises(ServiceTimeout, match="dead"):
+                reader.read(newer_than=last, timeout_s=0.1)
+            with pytest.raises(PeerGone):
+                reader.request()
+            with ServiceWriter("x", COLUMNS) as again:
+                again.begin()["values"][:] = 1
+                again.commit(1)
+                assert not reader.read(newer_than=frame).stale
+        until.touch()
+
+
+def make_namespace(lines: int) -> None:
+    with Bomb("making", lines).armed("making"):
+        Namespace().create()
+
+
+def test_a_namespace_whose_maker_was_killed_at_any_line_is_made_whole_by_the_next(namespace: Namespace) -> None:
+    with Crew() as crew:
+        for lines in range(1, 60):
+            crew.finish(crew.start(make_namespace, lines), -signal.SIGKILL)
+            namespace.create()
+            modes = {path: path.stat().st_mode & 0o7777 for path in (namespace.path, namespace.readers_path)}
+            assert modes == {namespace.path: 0o2750, namespace.readers_path: 0o3770}, lines
+            assert os.listdir(namespace.path) == ["readers"]
+            assert not namespace.path.with_name(f".{namespace.path.name}").exists()
+            shutil.rmtree(namespace.path)
+
+
+def test_a_driver_whose_namespace_was_removed_gives_way_to_one_that_took_its_name(namespace: Namespace) -> None:
+    with ServiceWriter("x", COLUMNS) as first, ServiceWriter("y", COLUMNS) as other:
+        first.request_server()
+        shutil.rmtree(namespace.path)
+        with ServiceWriter("x", COLUMNS) as second, ServiceReader[Frame]("x") as reader:
+            second.request_server()
+            first._next_file_check_ns = other._next_file_check_ns = 0  # now instead of within a second
+            with pytest.raises(NameInUse):
+                first.begin()
+            assert first.closed
+            other.begin()
+            other.commit(1)
+            second.begin()["values"][:] = 7
+            second.commit(1)
+            assert reader.read().column("values")[0] == 7
+            assert namespace.socket_path("x").exists()
+            with pytest.raises(NameInUse):
+                ServiceWriter("y", COLUMNS)
+
+
+def test_a_forked_child_changes_nothing(namespace: Namespace) -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        writer.begin()
+        writer.commit(1)
+        generation = writer.generation
+        writer.begin()
+        answer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            refused = 0
+            for change in (
+                lambda: writer.commit(2),
+                writer.begin,
+                writer.pause,
+                writer.requests,
+                lambda: writer.restructure(COLUMNS),
+                reader.read,
+            ):
+                try:
+                    change()
+                except Closed:
+                    refused += 1
+            writer.close()
+            reader.close()
+            os.write(answer[1], bytes([refused]))
+            os._exit(0)
+        os.waitpid(child, 0)
+        assert os.read(answer[0], 1) == b"\x06"
+        for fd in answer:
+            os.close(fd)
+        assert not reader.paused
+        assert reader.read().position == (generation, 1)
+        assert len(list(living_readers(namespace))) == 1
+        writer.commit(2)
+        assert reader.read().sequence == 2

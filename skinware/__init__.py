@@ -11,6 +11,7 @@ Read a skin without knowing its hardware::
 
 import os
 
+from skinware import realtime, threads
 from skinware.driver_service import DriverFrame, DriverReader, DriverWriter
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -37,6 +38,8 @@ __all__ = [
     "Status",
     "Structure",
     "get_include",
+    "realtime",
+    "threads",
 ]
 
 

@@ -90,7 +90,7 @@ class DriverWriter:
         driver_type: str = "",
         bus_counters: Sequence[str] = (),
         patch_counters: Sequence[str] = (),
-        namespace: Namespace | None = None,
+        namespace: Namespace | str | None = None,
         slots: int = DEFAULT_SLOTS,
         rate_hz: float | None = None,
         group: str | None = None,

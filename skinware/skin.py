@@ -183,13 +183,13 @@ class Skin:
 
     def __init__(
         self,
-        namespace: Namespace | None = None,
+        namespace: Namespace | str | None = None,
         *,
         on_attach: Told | None = None,
         on_detach: Told | None = None,
         on_structure: Told | None = None,
     ) -> None:
-        self.namespace = namespace or Namespace()
+        self.namespace = Namespace.of(namespace)
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._readers: dict[str, DriverReader] = {}
         self._layout = SkinLayout((), ())

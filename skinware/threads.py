@@ -103,7 +103,7 @@ class Worker(Generic[T]):
             if self._profile is not None:
                 self._profile.apply()
             for item in self._items():
-                if self.paused:
+                if not self._running.is_set():
                     self._running.wait()
                     continue
                 self._function(item)
@@ -181,7 +181,10 @@ def write(
 
 
 class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
-    """While it is paused, readers and requesters are told so."""
+    """While it is paused, readers and requesters are told so.
+
+    The writer itself yields nothing then; what it has begun before is filled, and not published.
+    """
 
     _owned: ServiceWriter
 

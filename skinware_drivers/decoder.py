@@ -77,11 +77,11 @@ class Decoder:
             self._carried = None
 
     def decode(self, batch: FrameBatch) -> tuple[Updates, Indices]:
-        """Find the updates of a batch; count everything else.
+        """Find the updates of a batch; count what is wrong with the frames of our modules.
 
         Returns:
-            The updates in order of their time, to be shown by ``state.show``; and the rows that belong to no declared
-            frame.
+            The updates in order of their time, to be shown by ``state.show``; and the rows that belong to no module:
+            whoever knows that nobody waits for them has them counted (``count_unknown``).
         """
         first, last = batch.start, batch.stop
         wire, bus = batch.wire[first:last], batch.bus[first:last]
@@ -97,8 +97,6 @@ class Decoder:
                 entry[rows] = compiled.name_modules(entry[rows], payload[rows])
         is_module = entry < self._n_modules
         foreign = np.flatnonzero(~is_module)
-        if len(foreign):
-            self._count_foreign(foreign, identifier, bus)
         parts = []
         for number in self._alone:
             rows = np.flatnonzero((kind == number) & is_module)
@@ -116,6 +114,13 @@ class Decoder:
         elif (newest_ns[1:] < newest_ns[:-1]).any():
             updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
+
+    def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
+        """Count frames of a batch as unknown identifiers."""
+        bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]
+        self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
+        standard = identifier < _IDENTIFIERS
+        np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
     # -- compiling ----------------------------------------------------------------------------------------------
 
@@ -219,11 +224,6 @@ class Decoder:
         if check_length:
             kind[~self._length_ok[kind, length]] = _NO_KIND
         return kind
-
-    def _count_foreign(self, rows: Indices, identifier: npt.NDArray[np.uint32], bus: npt.NDArray[np.uint16]) -> None:
-        self.state.bus_counters[:, 0] += np.bincount(bus[rows], minlength=len(self.state.bus_counters))
-        standard = rows[identifier[rows] < _IDENTIFIERS]
-        np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
     def _pair(
         self, batch: FrameBatch, pairing: Pairing, entry: Indices, is_module: Flags, kind: Bytes

@@ -128,10 +128,11 @@ class Link:
         """Let time pass; the bus keeps being read."""
         await asyncio.sleep(duration_s)
 
-    def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> None:
-        """Show frames of this bus to those who wait (called by the runner)."""
+    def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for."""
         if not len(rows) or (not self._waiters and self._heard is None):
-            return
+            return rows
+        expected = np.zeros(len(rows), bool)
         identifier = batch.wire["identifier"][rows]
         if self._heard is not None:
             first, length = batch.wire["payload"][rows, 0], batch.wire["length"][rows]
@@ -139,11 +140,14 @@ class Link:
                 Heard(*row) for row in zip(identifier.tolist(), first.tolist(), length.tolist(), strict=True)
             )
         for match, queue in self._waiters:
-            for row in rows[(identifier & match.mask) == match.value].tolist():
+            for number in np.flatnonzero((identifier & match.mask) == match.value).tolist():
+                row = rows[number]
                 wire = batch.wire[row]
                 payload = wire["payload"][: min(int(wire["length"]), batch.payload_size)].tobytes()
                 if payload.startswith(match.prefix):
+                    expected[number] = True
                     queue.put_nowait(Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload))
+        return rows[~expected]
 
 
 def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:

@@ -295,7 +295,7 @@ class Runner:
         found, foreign = self.decoder.decode(batch)
         if len(foreign):
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
-                line.link.offer(batch, own)
+                self.decoder.count_unknown(batch, line.link.offer(batch, own))
         self._update_bus_states()
         self.publisher.take(found)
         self._arm_timer()

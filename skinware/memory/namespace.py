@@ -51,6 +51,11 @@ class Namespace:
         self.readers_path = self.path / "readers"
         self._extra_owner = _user_id(owner if owner is not None else os.environ.get("SKINWARE_OWNER"))
 
+    @classmethod
+    def of(cls, namespace: Namespace | str | None) -> Namespace:
+        """A namespace itself, or the one of a name; None: the environment's."""
+        return namespace if isinstance(namespace, Namespace) else cls(namespace)
+
     def create(self, group: str | None = None) -> None:
         """Make the folder if it is not there, and check that this user may write services into it.
 

@@ -29,7 +29,7 @@ class Column:
     """One named array of a frame.
 
     Attributes:
-        dtype: numbers, fixed-length bytes, or a structure of them.
+        dtype: numbers, fixed-length bytes, or a structure of them; anything that ``np.dtype`` takes.
         shape: of the array in every frame.
         unit: of the numbers, for people.
         description: for people.
@@ -39,6 +39,10 @@ class Column:
     shape: tuple[int, ...]
     unit: str = ""
     description: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dtype", np.dtype(self.dtype))
+        object.__setattr__(self, "shape", _shape(self.shape))
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Schema:
         """
         made: dict[str, Column] = {}
         for name, given in columns.items():
-            column = given if isinstance(given, Column) else _column(*given)
+            column = given if isinstance(given, Column) else Column(np.dtype(given[0]), _shape(given[1]))
             if column.dtype.hasobject or column.dtype.itemsize == 0 or any(n < 0 for n in column.shape):
                 raise ConfigurationError(
                     f"column {name!r} of {column.dtype} and shape {column.shape}: give numbers, fixed-length bytes or"
@@ -133,8 +137,8 @@ def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str)
     return Schema({**columns, **told}, text.description)
 
 
-def _column(dtype: npt.DTypeLike, shape: int | tuple[int, ...]) -> Column:
-    return Column(np.dtype(dtype), (shape,) if isinstance(shape, int) else tuple(shape))
+def _shape(given: int | tuple[int, ...]) -> tuple[int, ...]:
+    return (given,) if isinstance(given, int) else tuple(given)
 
 
 def _table_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -53,12 +53,12 @@ class ServiceReader(Generic[F]):
         self,
         name: str,
         *,
-        namespace: Namespace | None = None,
+        namespace: Namespace | str | None = None,
         timeout_s: float | None = 0.0,
         announce: bool = True,
     ) -> None:
         self.name = check_name(name, "service")
-        self.namespace = namespace or Namespace()
+        self.namespace = Namespace.of(namespace)
         self._client = RequestClient(self.namespace, name)
         self._last: Position | None = None
         self._closed = False
@@ -222,7 +222,10 @@ class ServiceReader(Generic[F]):
         while timer.wait(lambda: self._closed):
             self._accounts.record.lateness.add(now_ns() - timer.deadline_ns + timer.period_ns)
             self._accounts.record.missed_periods = timer.missed
-            yield self.read(timeout_s=timeout_s)
+            frame = self.read(timeout_s=timeout_s)
+            if self._moved:
+                raise self._structure_changed()
+            yield frame
 
     def __iter__(self) -> Iterator[F]:
         return self.frames()
@@ -280,10 +283,11 @@ class ServiceReader(Generic[F]):
         """Like ``call``, without waiting: the answer is picked up, or the request cancelled, later.
 
         Raises:
+            RequestTimeout: so many requests wait already that this one cannot be sent.
             RequestRefused, PeerGone, Closed: as ``call``.
         """
         self._keep_up()
-        if not self.alive:
+        if not self.alive and not self._moved:  # else it lives, with another structure
             raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
         return self._client.send(operation, arguments)
 
@@ -347,7 +351,7 @@ class ServiceReader(Generic[F]):
         self._moved = False
 
     def _require_open(self) -> None:
-        if self._ring.segment.descriptor.fd < 0:
+        if self._closed or self._ring.segment.descriptor.fd < 0:
             raise Closed(f"the reader of {self.name!r} was closed, or belongs to the process before a fork")
 
     def _keep_up(self) -> bool:
@@ -396,9 +400,7 @@ class ServiceReader(Generic[F]):
                 self._accounts.settle()
                 return self.alive
             if self._moved:
-                raise StructureChanged(
-                    f"service {self.name!r} came back with another structure; call reattach() and read it anew"
-                )
+                raise self._structure_changed()
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came())
@@ -406,6 +408,11 @@ class ServiceReader(Generic[F]):
             if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
                 return True
             look_around = True
+
+    def _structure_changed(self) -> StructureChanged:
+        return StructureChanged(
+            f"service {self.name!r} came back with another structure; call reattach() and read it anew"
+        )
 
     def _why_nothing_came(self) -> str:
         if not self.alive:

@@ -55,7 +55,7 @@ class ServiceWriter:
         columns: Columns,
         static: Mapping[str, npt.NDArray[Any]] | None = None,
         *,
-        namespace: Namespace | None = None,
+        namespace: Namespace | str | None = None,
         kind: str = "data",
         slots: int = DEFAULT_SLOTS,
         rate_hz: float | None = None,
@@ -64,7 +64,7 @@ class ServiceWriter:
         operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
         self.name = check_name(name, "service")
-        self.namespace = namespace or Namespace()
+        self.namespace = Namespace.of(namespace)
         self.missed_periods = 0
         self._paused = self._stopping = False
         self._kind = kind
@@ -168,13 +168,8 @@ class ServiceWriter:
             waiting = self._carry_out(self.requests())
             if self._paused:
                 continue
-            acquired_ns = now_ns()
-            self._ring.count_lateness(acquired_ns - (timer.deadline_ns - timer.period_ns))
-            yield self.begin(from_last=from_last)
-            if self.closed:  # meanwhile
-                return
-            self.commit(acquired_ns)
-            self._answer(waiting)
+            self._ring.count_lateness(now_ns() - (timer.deadline_ns - timer.period_ns))
+            yield from self._one_frame(waiting, from_last)
 
     def on_request(self, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
         """Yield the arrays of one frame whenever a program asks for one; publish when the loop comes back.
@@ -187,12 +182,7 @@ class ServiceWriter:
         while not self._must_end():
             waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
             if waiting and not self._paused:
-                acquired_ns = now_ns()
-                yield self.begin(from_last=from_last)
-                if self.closed:  # meanwhile
-                    return
-                self.commit(acquired_ns)
-                self._answer(waiting)
+                yield from self._one_frame(waiting, from_last)
 
     def requests(self, timeout_s: float = 0.0) -> list[Request]:
         """What programs ask for, for writers with a loop of their own; each wants its ``reply`` or ``fail``.
@@ -304,6 +294,28 @@ class ServiceWriter:
         if self._server is not None:
             self._server.paused = paused
 
+    def _one_frame(self, waiting: list[Request], from_last: bool) -> Iterator[dict[str, npt.NDArray[Any]]]:
+        """A frame of a loop, which may be paused or closed from another thread at any moment."""
+        acquired_ns = now_ns()
+        try:
+            columns = self.begin(from_last=from_last)
+        except Paused:
+            self._refuse(waiting)
+            return
+        yield columns
+        if self.closed:
+            return
+        if self._paused:
+            self._refuse(waiting)
+            return
+        self.commit(acquired_ns)
+        for request in waiting:
+            request.reply(position=self.position)
+
+    def _refuse(self, waiting: list[Request]) -> None:
+        for request in waiting:
+            request.fail("the service is paused", "paused")
+
     def _carry_out(self, requests: list[Request]) -> list[Request]:
         """Do what is asked for; returns those that want a frame."""
         waiting = []
@@ -318,13 +330,8 @@ class ServiceWriter:
             else:
                 request.reply(result, self.position)
         if self._paused:
-            for request in waiting:
-                request.fail("the service is paused", "paused")
+            self._refuse(waiting)
         return waiting
-
-    def _answer(self, waiting: list[Request]) -> None:
-        for request in waiting:
-            request.reply(position=self.position)
 
     def _require_open(self) -> None:
         if self.closed:

@@ -7,9 +7,10 @@ import threading
 import time
 from typing import Any
 
+import numpy as np
 import pytest
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import (
     Closed,
     ConfigurationError,
@@ -22,6 +23,7 @@ from skinware.memory import ring as ring_module
 from skinware.memory.announcement import living_readers
 from skinware.memory.ring import RingReader, RingWriter
 from skinware.memory.schema import Schema
+from skinware.realtime import now_ns
 from tests.conftest import wait_until
 
 SPAWN = multiprocessing.get_context("spawn")
@@ -390,3 +392,58 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.ring_path("x").unlink()
     for descriptor in (lock, segment.descriptor, reader.segment.descriptor):
         descriptor.close()
+
+
+def test_a_periodic_reader_is_told_of_another_structure() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish_one(writer)
+        frames = reader.frames(200, timeout_s=10)
+        assert next(frames).sequence == 1
+        writer.restructure({"values": ("<u2", 9)})
+        publish_one(writer)
+        with pytest.raises(StructureChanged, match=r"call reattach\(\)"):
+            for _ in frames:
+                pass
+        assert reader.read().stale  # the old one stays readable
+        reader.reattach()
+        assert len(reader.read().column("values")) == 9
+
+
+def publish_one(writer: ServiceWriter) -> None:
+    writer.begin()
+    writer.commit(now_ns())
+
+
+def test_requests_reach_a_writer_with_another_structure() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish_one(writer)
+        reader.read()
+        writer.restructure({"values": ("<u2", 9)})
+        writer.request_server()
+        pending = reader.ask("acquire")
+        (request,) = writer.requests(10.0)
+        publish_one(writer)
+        request.reply(position=writer.position)
+        assert pending.result(10.0).sequence == 1
+
+
+def test_a_pause_in_the_middle_of_a_frame_does_not_publish_it() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        for count, _ in enumerate(writer.periodic(500)):
+            if count == 1:
+                writer.pause()
+                threading.Timer(0.05, writer.resume).start()
+            if count == 2:
+                break
+        assert writer.sequence == 1  # the first; the second was paused, the third is not yet published
+        assert reader.read().sequence == 1
+
+
+def test_a_namespace_by_name_and_a_dtype_by_code() -> None:
+    name = os.environ["SKINWARE_NAMESPACE"]
+    with (
+        ServiceWriter("x", {"values": Column("<f8", 7)}, namespace=name) as writer,  # type: ignore[arg-type]
+        ServiceReader[Frame]("x", namespace=name) as reader,
+    ):
+        publish_one(writer)
+        assert reader.read().column("values").dtype == np.float64

@@ -43,7 +43,9 @@ def decode(
     decoder.put_back(batch)
     for number, (identifier, payload) in enumerate(frames):
         batch.append(0, 1 + number * gap_ns, identifier, payload)
-    decoder.state.show(decoder.decode(batch)[0])
+    updates, foreign = decoder.decode(batch)
+    decoder.count_unknown(batch, foreign)
+    decoder.state.show(updates)
     return decoder
 
 

@@ -40,7 +40,9 @@ class Desk:
         decoder.put_back(batch)
         for time_ns, identifier, payload in frames:
             batch.append(0, time_ns, identifier, payload)
-        self.publisher.take(decoder.decode(batch)[0])
+        updates, foreign = decoder.decode(batch)
+        decoder.count_unknown(batch, foreign)
+        self.publisher.take(updates)
 
     def burst(self, value: int, triangles: range = range(16), board: int = 7) -> list[Wire]:
         frames = []

@@ -37,7 +37,8 @@ class Rig:
         self.decoder.put_back(self.batch)
         for time_ns, identifier, payload in frames:
             self.batch.append(bus, time_ns, identifier, payload)
-        updates = self.decoder.decode(self.batch)[0]
+        updates, foreign = self.decoder.decode(self.batch)
+        self.decoder.count_unknown(self.batch, foreign)
         self.decoder.state.show(updates)
         return list(updates.module[updates.whole].tolist())
 

@@ -143,6 +143,7 @@ def test_a_restarted_board_is_set_up_alone() -> None:
         read_until(reader, lambda f: f.patch_state[1] == PatchState.RESTARTED)
         frame = read_until(reader, lambda f: f.patch_state[1] == PatchState.LIVE)
         assert frame.patch_state[0] == PatchState.LIVE
+        assert reader.bus_counters(frame)[0]["unknown"] == 0  # the answers to its own questions are none
         sent = {(i, p.replace(" ", "").lower()) for _, i, p in commands(log)[before:]}
     assert {identifier for identifier, payload in sent if not payload.startswith("0701")} == {0x208}
     assert {"4d0032f0", "50000f02010022", "0700"} <= {payload for _, payload in sent}

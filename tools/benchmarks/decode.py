@@ -92,7 +92,8 @@ class Ours:
                 total += count
             if len(self.batch) == self.batch.headroom - self.batch.start:
                 return total
-            found, _ = self.decoder.decode(self.batch)
+            found, foreign = self.decoder.decode(self.batch)
+            self.decoder.count_unknown(self.batch, foreign)
             self.publisher.take(found)
 
     def close(self) -> None:

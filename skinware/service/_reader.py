@@ -243,7 +243,11 @@ class ServiceReader(Generic[F]):
         timeout_ns = None if timeout_s is None else round(timeout_s * NS_PER_S)
         while True:
             deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
-            alive = self.alive if self._lags() else self._wait_for_newer(self._last, deadline_ns)
+            if self._lags():
+                self._accounts.settle()
+                alive = self.alive
+            else:
+                alive = self._wait_for_newer(self._last, deadline_ns)
             yield self._taken(self._whole(self._next_in_order), alive)
 
     def request(self, *, timeout_s: float = 5.0) -> F:

@@ -8,7 +8,7 @@ from typing import Any, Generic, Self, TypeVar
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, Overrun, PeerGone, ServiceNotFound, ServiceTimeout, StructureChanged
+from skinware.errors import BadServiceFile, Closed, Overrun, PeerGone, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory import _layout, _segment
 from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
@@ -291,7 +291,7 @@ class ServiceReader(Generic[F]):
             RequestRefused, PeerGone, Closed: as ``call``.
         """
         self._keep_up()
-        if not self.alive and not self._moved:  # else it lives, with another structure
+        if not self.alive and not self._successor_lives():
             raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
         return self._client.send(operation, arguments)
 
@@ -381,6 +381,19 @@ class ServiceReader(Generic[F]):
         else:
             ring.segment.descriptor.close()
             self._moved = True
+
+    def _successor_lives(self) -> bool:
+        """Whether the writer of a generation with another structure lives."""
+        if not self._moved:
+            return False
+        try:
+            segment = _segment.attach(self.namespace, self.name)
+        except (ServiceNotFound, BadServiceFile):
+            return False
+        try:
+            return segment.writer_lives()
+        finally:
+            segment.descriptor.close()
 
     # -- waiting ------------------------------------------------------------------------------------------------
 

@@ -280,7 +280,7 @@ class Lifecycle(RuleBasedStateMachine):
         service = self.services[reading.name]
         reading.follow(service)
         listens = service.writer is not None and service.writer._server is not None
-        with pytest.raises(PeerGone if reading.life.ended else RequestTimeout if listens else RequestRefused):
+        with pytest.raises(PeerGone if service.writer is None else RequestTimeout if listens else RequestRefused):
             reading.reader.request(timeout_s=0)
 
     @rule(reading=readers)

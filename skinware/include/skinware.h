@@ -526,6 +526,8 @@ static int skinware__parse_dtype(const char code[9], char *kind, uint32_t *items
     }
     *kind = code[1];
     *itemsize = size;
+    if (code[0] != (is_text || size == 1 ? '|' : '<')) /* as a writer writes it, and not otherwise */
+        return 0;
     if (is_text)
         return size > 0;
     if (*kind == 'f')
@@ -562,12 +564,16 @@ static skinware_result skinware__check_column(const skinware__header *header, co
 /* Everything that is read later lies inside the file if this says OK. */
 static skinware_result skinware__check_header(const skinware__header *header, uint64_t file_size) {
     uint64_t table_end;
+    size_t i;
     if (memcmp(header->magic, "SKINRING", 8) != 0)
         return skinware__fail(SKINWARE_BAD_FILE, "not a Skinware service file (wrong magic)");
     if (header->version_major != SKINWARE_FORMAT_MAJOR)
         return skinware__fail(SKINWARE_BAD_FILE, "its layout version is not 1.x; use the header of that version");
     if (header->file_size != file_size || file_size > (uint64_t)1 << 32 || file_size % SKINWARE__PAGE != 0)
         return skinware__fail(SKINWARE_BAD_FILE, "truncated or absurd: the header says another size than the file has");
+    for (i = 0; i < sizeof header->kind; i++)
+        if ((unsigned char)header->kind[i] > 127)
+            return skinware__fail(SKINWARE_BAD_FILE, "its kind is no text");
     if (header->column_count > SKINWARE__MAX_COLUMNS)
         return skinware__fail(SKINWARE_BAD_FILE, "its columns do not fit");
     table_end = SKINWARE__COLUMN_OFFSET + sizeof(skinware__row) * (uint64_t)header->column_count;

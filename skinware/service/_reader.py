@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, Self, TypeVar
+from typing import Self, TypeVar
 
-import numpy.typing as npt
-
-from skinware.errors import BadServiceFile, Closed, Overrun, PeerGone, ServiceNotFound, ServiceTimeout, StructureChanged
-from skinware.memory import _layout, _segment
+from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
-from skinware.memory.namespace import Namespace, check_name
+from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Frame, RingReader
-from skinware.memory.schema import Schema
-from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.service._accounts import Accounts
-from skinware.service._client import PendingRequest, RequestClient
-from skinware.service.messages import ACQUIRE, OPERATIONS
-
-_MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
+from skinware.service._attachment import MOVED_ON, Attachment
+from skinware.service.messages import ACQUIRE
 
 Position = tuple[int, int]
 """(generation, sequence) of a frame."""
@@ -29,7 +22,7 @@ Position = tuple[int, int]
 F = TypeVar("F", bound=Frame)
 
 
-class ServiceReader(Generic[F]):
+class ServiceReader(Attachment[F]):
     """A reader of one service: it re-attaches by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
@@ -47,8 +40,6 @@ class ServiceReader(Generic[F]):
         NamespaceError: the namespace cannot be trusted or read.
     """
 
-    frame_class: type[Any] = Frame
-
     def __init__(
         self,
         name: str,
@@ -57,13 +48,8 @@ class ServiceReader(Generic[F]):
         timeout_s: float | None = 0.0,
         announce: bool = True,
     ) -> None:
-        self.name = check_name(name, "service")
-        self.namespace = Namespace.of(namespace)
-        self._client = RequestClient(self.namespace, name)
+        super().__init__(name, namespace, timeout_s)
         self._last: Position | None = None
-        self._closed = False
-        self._moved = False
-        self._ring: RingReader[F] = self._attach_within(timeout_s)
         self._accounts = Accounts(self.namespace, name, announce)
 
     @property
@@ -77,58 +63,6 @@ class ServiceReader(Generic[F]):
         return self._accounts.record
 
     @property
-    def writer_statistics(self) -> WriterStatistics:
-        """What the writer of the generation that is being read tells of itself."""
-        return read_statistics(self._ring.segment.data)
-
-    @property
-    def schema(self) -> Schema:
-        """dtype, shape, unit and description of every column, and the service's own description."""
-        return self._ring.segment.schema
-
-    @property
-    def generation(self) -> int:
-        """The generation that is being read."""
-        return self._ring.generation
-
-    @property
-    def alive(self) -> bool:
-        """Whether the writer of the generation that is being read lives (it may still be silent)."""
-        return self._ring.segment.writer_lives()
-
-    @property
-    def paused(self) -> bool:
-        """Whether the writer says that it publishes nothing for now."""
-        return bool(self._ring.state & _layout.STATE_PAUSED)
-
-    @property
-    def structure_changed(self) -> bool:
-        """Whether the service came back with other columns, so that ``reattach`` is due."""
-        return self._moved
-
-    @property
-    def kind(self) -> str:
-        """What the service's columns mean: ``driver``, ``data``."""
-        return bytes(self._ring.segment.header["kind"]).decode()
-
-    @property
-    def writer_pid(self) -> int:
-        """Process id of the writer, in the writer's own pid namespace."""
-        return int(self._ring.segment.header["writer_pid"])
-
-    @property
-    def missed_periods(self) -> int:
-        """Periods that the writer missed."""
-        return self._ring.missed_periods
-
-    def rate_hz(self) -> float | None:
-        """How often the writer publishes, from the times of the frames that the ring holds; None for fewer than two."""
-        times = self._ring.publication_times_ns()
-        if len(times) < 2 or times[-1] == times[0]:
-            return None
-        return round((len(times) - 1) * NS_PER_S / (times[-1] - times[0]), 3)
-
-    @property
     def latest(self) -> Position | None:
         """Position of the newest frame, None before the first; goes over to a new generation if there is one."""
         self._keep_up()
@@ -140,7 +74,7 @@ class ServiceReader(Generic[F]):
 
         Unlike ``latest`` it neither looks for a new generation nor asks whether the writer lives.
         """
-        if self._ring.state & _MOVED_ON:
+        if self._ring.state & MOVED_ON:
             return None
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
@@ -159,10 +93,6 @@ class ServiceReader(Generic[F]):
     def wake_word(self) -> tuple[Word, int]:
         """The futex that every publication wakes, and its present value; take it before ``latest``."""
         return self._ring.wake_word, self._ring.wake_count
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """The static columns of the generation that is being read, read-only."""
-        return self._ring.segment.static_columns()
 
     def read(self, *, newer_than: Frame | Position | None = None, timeout_s: float | None = 5.0) -> F:
         """The newest frame, as a private copy.
@@ -265,44 +195,6 @@ class ServiceReader(Generic[F]):
         left_s = max(0.0, (deadline_ns - now_ns()) / NS_PER_S)
         return self.read(newer_than=(answer.generation, answer.sequence - 1), timeout_s=left_s)
 
-    def call(self, operation: str, /, *, timeout_s: float = 5.0, **arguments: Any) -> Any:
-        """Have the writer do something that it declares (see ``operations``), and wait for the result.
-
-        Args:
-            operation: which.
-            timeout_s: longest wait.
-            arguments: of the operation, by name; anything that JSON can hold.
-
-        Raises:
-            RequestTimeout: no answer in time; the request is cancelled, but may have been carried out.
-            RequestRefused: unknown operation, or the service takes no requests.
-            RequestFailed: it went wrong; the message is the writer's.
-            Paused: the service is paused.
-            PeerGone: its writer is dead, or died or was restarted meanwhile.
-            Closed: this reader was closed.
-        """
-        return self.ask(operation, **arguments).result(timeout_s).result
-
-    def ask(self, operation: str, /, **arguments: Any) -> PendingRequest:
-        """Like ``call``, without waiting: the answer is picked up, or the request cancelled, later.
-
-        Raises:
-            RequestTimeout: so many requests wait already that this one cannot be sent.
-            RequestRefused, PeerGone, Closed: as ``call``.
-        """
-        self._keep_up()
-        if not self.alive and not self._successor_lives():
-            raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
-        return self._client.send(operation, arguments)
-
-    def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
-        """What ``call`` can ask for: descriptions by name.
-
-        Raises:
-            RequestTimeout, RequestRefused, PeerGone, Closed: as ``call``.
-        """
-        return dict(self.call(OPERATIONS, timeout_s=timeout_s))
-
     def reattach(self) -> None:
         """Go over to the present generation of the service, whatever its structure.
 
@@ -323,77 +215,11 @@ class ServiceReader(Generic[F]):
         self._client.close()
         self._ring.segment.descriptor.close()
 
-    # -- attaching ----------------------------------------------------------------------------------------------
-
-    def _attach(self, known: RingReader[F] | None = None) -> RingReader[F]:
-        segment = _segment.attach(self.namespace, self.name)
-        if known is not None and _digest(segment) == _digest(known.segment):
-            return RingReader(segment, self.frame_class, known.context)
-        return RingReader(segment, self.frame_class, self._describe(segment))
-
-    def _describe(self, _attached: _segment.Segment) -> object:
-        """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
-        return None
-
-    def _attach_within(self, timeout_s: float | None) -> RingReader[F]:
-        timer = Periodic(10)
-        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-        while True:
-            try:
-                return self._attach()
-            except ServiceNotFound:
-                if deadline_ns is not None and now_ns() >= deadline_ns:
-                    raise
-            timer.wait()
-
     def _adopt(self, ring: RingReader[F]) -> None:
         if self._last is not None and self._last[0] == self._ring.generation != ring.generation:
             self._accounts.record.lost += self._ring.latest - self._last[1]
             self._last = (ring.generation, 0)
-        self._ring.segment.descriptor.close()
-        self._ring = ring
-        self._moved = False
-
-    def _require_open(self) -> None:
-        if self._closed or self._ring.segment.descriptor.fd < 0:
-            raise Closed(f"the reader of {self.name!r} was closed, or belongs to the process before a fork")
-
-    def _keep_up(self) -> bool:
-        """Go over to a new generation if there may be one; whether the writer of the present one lives."""
-        self._require_open()
-        alive = self.alive
-        if (self._ring.state & _MOVED_ON or not alive) and not self._moved:
-            self._follow()
-            alive = self.alive
-        return alive
-
-    def _follow(self) -> None:
-        """Go over to a newer generation if there is one of the same structure; remember if it has another."""
-        inode = _segment.current_inode(self.namespace, self.name)
-        if inode is None or inode == self._ring.segment.inode:
-            return
-        try:
-            ring = self._attach(self._ring)
-        except ServiceNotFound:
-            return
-        if _digest(ring.segment) == _digest(self._ring.segment):
-            self._adopt(ring)
-        else:
-            ring.segment.descriptor.close()
-            self._moved = True
-
-    def _successor_lives(self) -> bool:
-        """Whether the writer of a generation with another structure lives."""
-        if not self._moved:
-            return False
-        try:
-            segment = _segment.attach(self.namespace, self.name)
-        except (ServiceNotFound, BadServiceFile):
-            return False
-        try:
-            return segment.writer_lives()
-        finally:
-            segment.descriptor.close()
+        super()._adopt(ring)
 
     # -- waiting ------------------------------------------------------------------------------------------------
 
@@ -408,7 +234,7 @@ class ServiceReader(Generic[F]):
             self._require_open()
             ring = self._ring
             wake_count = ring.wake_count
-            if (look_around or ring.state & _MOVED_ON) and not self._moved:
+            if (look_around or ring.state & MOVED_ON) and not self._moved:
                 self._follow()
                 ring = self._ring
                 wake_count = ring.wake_count
@@ -490,7 +316,3 @@ class ServiceReader(Generic[F]):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.name!r} in {self.namespace.name!r}>"
-
-
-def _digest(segment: _segment.Segment) -> bytes:
-    return bytes(segment.header["digest"])

@@ -14,7 +14,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import Closed, Overrun
+from skinware.errors import Closed, Overrun, ServiceError
 from skinware.memory import _futex, _layout
 from skinware.memory._fences import fence
 from skinware.memory._segment import Segment
@@ -285,9 +285,12 @@ class RingWriter:
 
         Raises:
             Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
+            ServiceError: there was no ``begin`` before it: the slot holds an old frame.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
+        if not self._begun_ns:
+            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old frame as a new one")
         sequence = self.sequence + 1
         words = self._slot_words[sequence % self._count]
         published_ns = now_ns()
@@ -324,7 +327,8 @@ class RingWriter:
         cpu_ns = time.thread_time_ns()
         passed_ns = max(0, cpu_ns - self._cpu_ns)  # below 0 if another thread publishes now
         self._cpu_ns = cpu_ns
-        for first, value_ns in ((_WALL, published_ns - self._begun_ns), (_CPU, passed_ns)):
+        wall_ns, self._begun_ns = published_ns - self._begun_ns, 0
+        for first, value_ns in ((_WALL, wall_ns), (_CPU, passed_ns)):
             if value_ns < words[first] or timed == 1:
                 words[first] = value_ns
             if value_ns > words[first + 1]:

@@ -147,6 +147,7 @@ class ServiceWriter:
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
+            ServiceError: there was no ``begin`` before it, or the service was restructured since.
         """
         return self._ring.commit(acquired_ns, flags)
 
@@ -302,11 +303,16 @@ class ServiceWriter:
         except Paused:
             self._refuse(waiting)
             return
+        ring = self._ring
         yield columns
         if self.closed:
             return
         if self._paused:
             self._refuse(waiting)
+            return
+        if self._ring is not ring:  # restructured: what was filled belongs to the generation before
+            for request in waiting:
+                request.fail("the service changed its structure meanwhile; ask again")
             return
         self.commit(acquired_ns)
         for request in waiting:

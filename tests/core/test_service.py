@@ -15,6 +15,7 @@ from skinware.errors import (
     Closed,
     ConfigurationError,
     PlatformError,
+    ServiceError,
     ServiceTimeout,
     StructureChanged,
 )
@@ -447,3 +448,28 @@ def test_a_namespace_by_name_and_a_dtype_by_code() -> None:
     ):
         publish_one(writer)
         assert reader.read().column("values").dtype == np.float64
+
+
+def test_commit_without_begin_is_refused() -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        with pytest.raises(ServiceError, match="commit without begin"):
+            writer.commit(1)
+        publish_one(writer)
+        with pytest.raises(ServiceError, match="would publish an old frame"):
+            writer.commit(1)
+        assert writer.sequence == 1
+
+
+def test_a_loop_may_restructure_its_service() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        sizes = []
+        for count, columns in enumerate(writer.periodic(500)):
+            sizes.append(len(columns["values"]))
+            if count == 1:
+                writer.restructure({"values": ("<u8", 9)})
+            if count == 3:
+                break
+        assert sizes == [512, 512, 9, 9]
+        assert writer.sequence == 1  # of the new generation: the third; the second was of the old one
+        reader.reattach()
+        assert len(reader.read().column("values")) == 9

@@ -50,7 +50,10 @@ def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
         totals = emulator.stop()
     (shown,) = stopped["buses"]
     assert shown["lost"] == shown["bad_length"] == shown["unknown"] == shown["bad_content"] == 0
-    assert sum(patch["orphans"] for patch in stopped["patches"]) <= 4  # a pair cut in two when the driver stopped
+    # a pair of each board is cut in two when the driver stops it; and when a board that an emulation without processor
+    # time kept silent for too long is set up anew
+    cuts = 4 + driver.errors.count("it has restarted")
+    assert sum(patch["orphans"] for patch in stopped["patches"]) <= cuts
     assert shown["frames"] > MINUTE_FRAMES * 128 * 0.9
     assert totals["send_failures"] == 0
 
@@ -103,13 +106,14 @@ def test_link_down_and_up_and_interface_deleted_and_made_again(vcan: Callable[[]
                 read_until(reader, lambda f: f.bus_state[0] == BusState.DOWN)
                 ip("link", "set", bus, "up")
                 read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.status.any())
+                wait_until(lambda: "is back" in driver.errors)
+                assert driver.errors.count("went down") == 1  # to delete it will take it down again
                 ip("link", "del", bus)
                 read_until(reader, lambda f: f.bus_state[0] == BusState.GONE)
                 ip("link", "add", "dev", bus, "type", "vcan")
                 ip("link", "set", bus, "up")
                 back = read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.status.any())
                 assert back.generation == frame.generation
-            assert driver.errors.count("went down") == 1
 
 
 def test_a_killed_driver_and_its_restart_with_the_reader_kept(vcan: Callable[[], str]) -> None:

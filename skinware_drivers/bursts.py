@@ -62,12 +62,9 @@ class Bursts:
         """
         parts = [part for part in (self._held, updates) if part is not None]
         self._held = None
-        while parts:
-            waiting = Updates.join(parts)
-            rest = self._take_in_order(waiting, living, publish)
-            if rest is None or self._held is not None:
-                return
-            parts = [rest]
+        rest = Updates.join(parts) if parts else None
+        while rest is not None:
+            rest = self._take_in_order(rest, living, publish)
 
     def in_the_middle(self, living: Flags, time_ns: int) -> Flags:
         """(n_patches,) bool: patches whose burst has begun in this frame, is not whole, and not too old to go on."""
@@ -76,16 +73,20 @@ class Bursts:
         if not missing.any():
             return lacks
         lacks[self._module_patch[missing]] = True
-        begun = np.zeros(self._n_patches, bool)
-        begun[self._module_patch[self._state.updated]] = True
-        return begun & lacks & (time_ns - self._state.patch_time_ns <= self._pause_ns)
+        return self._begun() & lacks & (time_ns - self._state.patch_time_ns <= self._pause_ns)
 
     def pause_ends_ns(self, patches: Flags) -> int:
         """When the last of these patches will have said nothing for long enough to have ended its burst."""
         return int((self._state.patch_time_ns + self._pause_ns)[patches].max()) + 1
 
+    def _begun(self) -> Flags:
+        """(n_patches,) bool: patches of which this frame shows something."""
+        begun = np.zeros(self._n_patches, bool)
+        begun[self._module_patch[self._state.updated]] = True
+        return begun
+
     def _take_in_order(self, updates: Updates, living: Flags, publish: Callable[[], None]) -> Updates | None:
-        """Cut where bursts begin; returns what is left after a burst was drawn forward, None if nothing."""
+        """Cut where bursts begin; returns what is left to be cut anew after a burst was drawn forward."""
         before = self._previous(updates)
         reach = np.maximum.accumulate(before)
         begin, threshold = 0, _BEFORE
@@ -106,8 +107,12 @@ class Bursts:
 
     def _finish(
         self, rest: Updates, begins: Flags, open_patches: Flags, living: Flags, publish: Callable[[], None]
-    ) -> Updates:
-        """Draw forward what belongs to the open bursts. If that ends them, publish; else hold the rest back."""
+    ) -> Updates | None:
+        """Draw forward what belongs to the open bursts. If that ends them, publish; else hold the rest back.
+
+        Returns:
+            The rest, unless it is held back.
+        """
         patch = self._module_patch[rest.module]
         early = np.zeros(len(rest), bool)
         for number in np.flatnonzero(open_patches).tolist():
@@ -121,8 +126,8 @@ class Bursts:
         rest = rest.take(~early)
         if (open_patches & self.in_the_middle(living, int(rest.newest_ns[-1]))).any():
             self._held = rest
-        else:
-            publish()
+            return None
+        publish()
         return rest
 
     def _previous(self, updates: Updates) -> Indices:
@@ -146,9 +151,7 @@ class Bursts:
         self._learn_pauses(module, patch, gap_ns)
         pause = gap_ns > self._pause_ns[patch]
         if pause.any():
-            begun = np.zeros(self._n_patches, bool)
-            begun[self._module_patch[self._state.updated]] = True
-            pause &= ~first | begun[patch]
+            pause &= ~first | self._begun()[patch]
             found[pause] = np.maximum(found[pause], of_patch[pause] + 1)
         return found
 

@@ -61,11 +61,10 @@ class RequestDesk:
             oldest_ns: of the data that is new in it, CLOCK_MONOTONIC ns.
             position: of the frame.
         """
-        if self._waiting:
-            answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
-            self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
-            for request in answered:
-                request.reply(position=position)
+        answered = [request for time_ns, request in self._waiting if time_ns <= oldest_ns]
+        self._waiting = [(t, r) for t, r in self._waiting if t > oldest_ns and not r.cancelled]
+        for request in answered:
+            request.reply(position=position)
 
     async def close(self) -> None:
         """Give up what is under way; those who asked see the driver hang up."""

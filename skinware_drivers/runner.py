@@ -258,7 +258,7 @@ class Runner:
         if self._period_s != self._built_period_s:  # which layout and publisher depend on
             self._go_over_to(self.decoder.tables, self.lines[0].adapter)
         elif set_up:
-            first = int(np.argmax(self.decoder.tables.structure.patch_bus == line.ordinal))
+            first = _first_patch(self.decoder, line)
             for patch in patches:
                 self._watch.forget(first + list(line.patches).index(patch))
 
@@ -363,8 +363,7 @@ class Runner:
     def _patch_of(self, line: BusLine, patch: int) -> Patch:
         if self.decoder is None or line.patches is None:
             raise LookupError("no structure yet")
-        first = int(np.argmax(self.decoder.tables.structure.patch_bus == line.ordinal))
-        return line.patches[patch - first]
+        return line.patches[patch - _first_patch(self.decoder, line)]
 
     def _patch_name(self, patch: int) -> str:
         return bytes(self.decoder.tables.structure.patch_name[patch]).decode() if self.decoder else str(patch)
@@ -385,3 +384,8 @@ class Runner:
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
         return figures(self.lines, self.writer, self.decoder, self.publisher)
+
+
+def _first_patch(decoder: Decoder, line: BusLine) -> int:
+    """Number of the first patch of a bus, in the order of all buses."""
+    return int(np.argmax(decoder.tables.structure.patch_bus == line.ordinal))

@@ -126,8 +126,7 @@ class Attachment(Generic[F]):
             RequestTimeout: so many requests wait already that this one cannot be sent.
             RequestRefused, PeerGone, Closed: as ``call``.
         """
-        self._keep_up()
-        if not self.alive and not self._successor_lives():
+        if not self._keep_up() and not self._successor_lives():
             raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
         return self._client.send(operation, arguments)
 

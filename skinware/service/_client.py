@@ -22,7 +22,7 @@ from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._server import short_path
-from skinware.service.messages import CANCEL, MAX_PACKET, UNREADABLE, UNSPEAKABLE, Answer, Ask
+from skinware.service.messages import CANCEL, MAX_PACKET, UNSPEAKABLE, Answer, Ask, receive
 
 _ERRORS: dict[str, type[Exception]] = {
     "refused": RequestRefused,
@@ -60,18 +60,19 @@ class PendingRequest:
             PeerGone: the service died, was closed or restarted meanwhile.
         """
         deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
-        while not self.done():
+        answer = self._answer
+        while answer is None:
             remaining_ns = deadline_ns - now_ns()
             self._client.listen(max(0, min(remaining_ns, WAIT_SLICE_NS)) / NS_PER_S)
-            if remaining_ns <= 0 and not self.done():
+            answer = self._answer
+            if answer is None and remaining_ns <= 0:
                 self.cancel()
                 raise RequestTimeout(
                     f"{self._client.name}: no answer to {self.operation!r} within {timeout_s:g} s; its writer lives"
                     " but does not take requests now (busy, hung or stopped)"
                 )
-        answer = self._answer
-        if answer is None or isinstance(answer, RequestError):
-            raise answer or RequestError("no answer")
+        if isinstance(answer, RequestError):
+            raise answer
         if answer.error is not None:
             raise _ERRORS.get(answer.why, RequestFailed)(f"{self._client.name}: {answer.error}")
         return answer
@@ -141,15 +142,9 @@ class RequestClient(ForkGuard):
         while poll.poll(timeout_s * 1000):
             timeout_s = 0.0
             try:
-                packet = connection.recv(MAX_PACKET)
+                answer = receive(connection, Answer)
             except BlockingIOError:
                 return
-            except OSError:
-                packet = b""
-            try:
-                answer = msgspec.json.decode(packet, type=Answer) if packet else None
-            except UNREADABLE:
-                answer = None
             if answer is None:
                 self._lose()
                 return

@@ -66,18 +66,14 @@ class ServiceReader(Attachment[F]):
     def latest(self) -> Position | None:
         """Position of the newest frame, None before the first; goes over to a new generation if there is one."""
         self._keep_up()
-        sequence = self._ring.latest
-        return (self._ring.generation, sequence) if sequence else None
+        return self._newest_position()
 
     def peek(self) -> Position | None:
         """Position of the newest frame of the generation at hand, None before the first or if that has ended.
 
         Unlike ``latest`` it neither looks for a new generation nor asks whether the writer lives.
         """
-        if self._ring.state & MOVED_ON:
-            return None
-        sequence = self._ring.latest
-        return (self._ring.generation, sequence) if sequence else None
+        return None if self._ring.state & MOVED_ON else self._newest_position()
 
     def take_newest(self) -> F:
         """A copy of the newest frame of the generation at hand, as lightly as ``peek``.
@@ -86,9 +82,7 @@ class ServiceReader(Attachment[F]):
             ServiceTimeout: nothing was published yet.
             Overrun: the writer is too fast for this number of slots.
         """
-        frame = self._taken(self._whole(self._ring.copy), True)
-        self._accounts.settle()
-        return frame
+        return self._newest_now(self._ring.copy, True)
 
     def wake_word(self) -> tuple[Word, int]:
         """The futex that every publication wakes, and its present value; take it before ``latest``."""
@@ -113,9 +107,7 @@ class ServiceReader(Attachment[F]):
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
-                frame = self._taken(self._whole(self._ring.copy), alive)
-                self._accounts.settle()
-                return frame
+                return self._newest_now(self._ring.copy, alive)
         alive = self._wait_for_newer(known, deadline_ns)
         return self._taken(self._whole(self._ring.copy), alive)
 
@@ -127,10 +119,7 @@ class ServiceReader(Attachment[F]):
             ServiceTimeout: nothing was published yet.
             Overrun, Closed: as ``read``.
         """
-        alive = self._keep_up()
-        frame = self._taken(self._whole(self._ring.view), alive)
-        self._accounts.settle()
-        yield frame
+        yield self._newest_now(self._ring.view, self._keep_up())
 
     def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
         """Newest frames, for ever.
@@ -288,6 +277,16 @@ class ServiceReader(Attachment[F]):
             f"no slot of {self.name!r} could be read, {COPY_ATTEMPTS} times in a row: give it more slots, publish less"
             " often, or start it again if it died while it filled one"
         )
+
+    def _newest_position(self) -> Position | None:
+        sequence = self._ring.latest
+        return (self._ring.generation, sequence) if sequence else None
+
+    def _newest_now(self, take: Callable[[], F | None], alive: bool) -> F:
+        """The newest frame without a wait, so that this is the moment to count it."""
+        frame = self._taken(self._whole(take), alive)
+        self._accounts.settle()
+        return frame
 
     def _whole(self, take: Callable[[], F | None]) -> F | None:
         try:

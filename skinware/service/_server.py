@@ -21,10 +21,10 @@ from skinware.service.messages import (
     CANCEL,
     MAX_PACKET,
     OPERATIONS,
-    UNREADABLE,
     UNSPEAKABLE,
     Answer,
     Ask,
+    receive,
 )
 
 _MAX_PEERS = 64
@@ -197,16 +197,10 @@ class RequestServer(ForkGuard):
         found: list[Request] = []
         for _ in range(limit):  # one peer that never stops asking must not hold up the others
             try:
-                packet = peer.recv(MAX_PACKET)
+                ask = receive(peer, Ask)
             except BlockingIOError:
                 return found
-            except OSError:
-                packet = b""
-            try:
-                ask = msgspec.json.decode(packet, type=Ask) if packet else None
-            except UNREADABLE:
-                ask = None
-            if ask is None:  # it hung up, or speaks nonsense
+            if ask is None:
                 self._drop(peer)
                 return found
             request = self._received(peer, ask)

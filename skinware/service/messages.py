@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import socket
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
 MAX_PACKET = 1 << 16
-UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
+_UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError)
 """What decoding somebody else's packet can raise: not JSON, not UTF-8, nested too deeply."""
 UNSPEAKABLE = (TypeError, ValueError, OverflowError, RecursionError)
 """What encoding can raise: no JSON type, half a surrogate pair, a number or a nesting without an end."""
@@ -17,6 +18,9 @@ OPERATIONS = "operations"
 """Operation of every service: the operations that it declares, by name, with a description each."""
 CANCEL = "cancel"
 """Not an operation: takes the request of the same id back."""
+
+
+MessageT = TypeVar("MessageT", bound=msgspec.Struct)
 
 
 class Ask(msgspec.Struct):
@@ -50,3 +54,18 @@ class Answer(msgspec.Struct):
     result: Any = None
     error: str | None = None
     why: Literal["", "refused", "failed", "paused", "cancelled"] = ""
+
+
+def receive(connection: socket.socket, message: type[MessageT]) -> MessageT | None:
+    """The next message of a connection; None if the other end hung up or speaks nonsense.
+
+    Raises:
+        BlockingIOError: there is none yet.
+    """
+    try:
+        packet = connection.recv(MAX_PACKET)
+        return msgspec.json.decode(packet, type=message) if packet else None
+    except BlockingIOError:
+        raise
+    except (OSError, *_UNREADABLE):
+        return None

@@ -11,7 +11,7 @@ import os
 import random
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,23 +36,13 @@ from tests.core.users import (
     Users,
     become,
     own,
-    running_driver,
 )
-from tests.core.workers import PATIENCE_S, Board, process_server, seeded
+from tests.core.workers import PATIENCE_S, Board, seeded
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be several users")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _server() -> Iterator[None]:
-    with process_server():
-        yield
-
-
-@pytest.fixture
-def users(tmp_path: Path, namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> Iterator[Users]:
-    with running_driver(tmp_path, monkeypatch) as made:
-        yield made
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="only root can be several users"),
+    pytest.mark.usefixtures("process_server"),
+]
 
 
 def reads_on(users: Users, work: Callable[..., Any], *arguments: Any) -> tuple[Any, int, int]:

@@ -8,7 +8,6 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import RequestError
 from skinware.memory.announcement import living_readers
 from tests.conftest import wait_until
-from tests.core.workers import PATIENCE_S, Board, Bomb, Crew, process_server, seeded
+from tests.core.workers import PATIENCE_S, Board, Bomb, Crew, seeded
 
 KILLS = int(os.environ.get("SKINWARE_TEST_KILLS") or 500)
 LIVE_AGAIN_S = 10.0
@@ -34,11 +33,7 @@ STATES = {
 }
 GENERATION, SEQUENCE, MISSED, BEGUN, TORN, STOP, PID, WON = range(8)
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _server() -> Iterator[None]:
-    with process_server():
-        yield
+pytestmark = pytest.mark.usefixtures("process_server")
 
 
 # -- those who are killed ----------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from skinware.errors import Overrun
 from skinware.memory.ring import COPY_ATTEMPTS
 from skinware.service import Columns
 from tests.conftest import wait_until
-from tests.core.workers import PATIENCE_S, Board, Crew, process_server
+from tests.core.workers import PATIENCE_S, Board, Crew
 
 COLUMNS: Columns = {"values": ("<u8", 509), "small": ("<u2", (7, 11)), "one": ("u1", 1)}
 """Odd lengths, so that columns and slots end anywhere."""
@@ -28,11 +28,7 @@ slots; who reads at its own time may compare one more than once, and requests ta
 N_ANSWERS = 400
 COMPARED, OVERRUNS, TORN, READY, LAST, FIRST, TAKEN, LOST = range(8)
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _server() -> Iterator[None]:
-    with process_server():
-        yield
+pytestmark = pytest.mark.usefixtures("process_server")
 
 
 def fill(columns: dict[str, npt.NDArray[Any]], sequence: int) -> None:

@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,13 +15,9 @@ from skinware.errors import Closed, NameInUse, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
 from tests.conftest import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
-from tests.core.workers import PATIENCE_S, Board, Bomb, Crew, process_server
+from tests.core.workers import PATIENCE_S, Board, Bomb, Crew
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _server() -> Iterator[None]:
-    with process_server():
-        yield
+pytestmark = pytest.mark.usefixtures("process_server")
 
 
 def fight_for_a_name(board: Path, row: int, wins: int) -> None:

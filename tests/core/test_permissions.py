@@ -9,8 +9,7 @@ import mmap
 import os
 import signal
 import socket
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
@@ -25,23 +24,13 @@ from tests.core.users import (
     MEMBER,
     STRANGER,
     Users,
-    running_driver,
 )
-from tests.core.workers import PATIENCE_S, process_server
+from tests.core.workers import PATIENCE_S
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be several users")
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _server() -> Iterator[None]:
-    with process_server():
-        yield
-
-
-@pytest.fixture
-def users(tmp_path: Path, namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> Iterator[Users]:
-    with running_driver(tmp_path, monkeypatch) as made:
-        yield made
+pytestmark = [
+    pytest.mark.skipif(os.geteuid() != 0, reason="only root can be several users"),
+    pytest.mark.usefixtures("process_server"),
+]
 
 
 def refusals(attempts: dict[str, Callable[[], object]]) -> dict[str, str]:

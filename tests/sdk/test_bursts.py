@@ -99,10 +99,11 @@ def senders(longest_burst_ms: float) -> st.SearchStrategy[Sender]:
 batches = st.lists(st.integers(0, 10_000), min_size=60, max_size=200)
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(clocks=st.tuples(*[senders(40)] * 3), cuts=batches)
-def test_a_frame_holds_whole_bursts_of_drifting_boards(
-    monkeypatch: pytest.MonkeyPatch, clocks: tuple[Sender, Sender, Sender], cuts: list[int]
+Missing = dict[int, set[tuple[int, int]]]
+
+
+def check_bursts(
+    monkeypatch: pytest.MonkeyPatch, clocks: tuple[Sender, ...], cuts: list[int], missing: Missing
 ) -> None:
     with monkeypatch.context() as patch:
         desk = Desk(patch, boards=BOARDS)
@@ -110,11 +111,19 @@ def test_a_frame_holds_whole_bursts_of_drifting_boards(
             recorder = Recorder(desk)
             stream: list[Wire] = []
             for board, sender in zip(BOARDS, clocks, strict=True):
-                stream += sender.frames(board, desk.clock.now_ns + 10 * MS, set())
+                stream += sender.frames(board, desk.clock.now_ns + 10 * MS, missing.get(board, set()))
             recorder.play(stream, cuts)
-            recorder.check({})
+            recorder.check(missing)
         finally:
             desk.close()
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(clocks=st.tuples(*[senders(40)] * 3), cuts=batches)
+def test_a_frame_holds_whole_bursts_of_drifting_boards(
+    monkeypatch: pytest.MonkeyPatch, clocks: tuple[Sender, Sender, Sender], cuts: list[int]
+) -> None:
+    check_bursts(monkeypatch, clocks, cuts, {})
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -130,17 +139,7 @@ def test_lost_modules_mix_no_bursts(
     lost: set[tuple[int, int, int]],
 ) -> None:
     missing = {board: {(burst, triangle) for b, burst, triangle in lost if b == board} for board in BOARDS}
-    with monkeypatch.context() as patch:
-        desk = Desk(patch, boards=BOARDS)
-        try:
-            recorder = Recorder(desk)
-            stream: list[Wire] = []
-            for board, sender in zip(BOARDS, clocks, strict=True):
-                stream += sender.frames(board, desk.clock.now_ns + 10 * MS, missing[board])
-            recorder.play(stream, cuts)
-            recorder.check(missing)
-        finally:
-            desk.close()
+    check_bursts(monkeypatch, clocks, cuts, missing)
 
 
 def test_one_board_begins_in_the_middle_of_the_other(monkeypatch: pytest.MonkeyPatch) -> None:

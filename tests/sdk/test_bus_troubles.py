@@ -76,7 +76,7 @@ def test_boards_that_lost_power_while_their_bus_was_away_are_set_up() -> None:
         read_until(reader, lambda f: f.bus_state[0] == BusState.DOWN)
         running.do(lambda: hardware_of(bus).restart(7, bus._clock()))
         bus.down = False
-        read_until(reader, lambda f: f.patch_state[0] == PatchState.STALE)
+        read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
         read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE)
         assert sent(log)[before:] == [(0x207, "1c0200"), *SET_UP]
 

@@ -139,7 +139,6 @@ def test_a_restarted_board_is_set_up_alone() -> None:
         read_until(reader, lambda f: not f.status.any())
         before = len(commands(log))
         running.do(lambda: hardware_of(bus).restart(8, bus._clock()))
-        read_until(reader, lambda f: f.patch_state[1] == PatchState.STALE)
         read_until(reader, lambda f: f.patch_state[1] == PatchState.RESTARTED)
         frame = read_until(reader, lambda f: f.patch_state[1] == PatchState.LIVE)
         assert frame.patch_state[0] == PatchState.LIVE

@@ -55,6 +55,10 @@ class Adapter(ABC, Generic[OptionsT]):
 
     What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
 
+    ``types``, ``dtype`` and ``layout`` can be set anew for an object of the class, in ``__init__`` or, for hardware
+    that describes itself, in ``describe``. The types of all buses are put together, and the values of all have the
+    smallest dtype that holds each bus' own.
+
     Attributes:
         medium: kind of bus: ``can``.
         Options: struct of the options; becomes command-line options and TOML keys.
@@ -81,6 +85,11 @@ class Adapter(ABC, Generic[OptionsT]):
     def period_s(self) -> float:
         """Nominal time between two updates of a module, s."""
         return 0.02
+
+    @property
+    def payload_size(self) -> int:
+        """Longest payload that a bus must be able to receive. To be overridden where ``describe`` makes the layout."""
+        return self.layout.payload_size
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""

@@ -20,12 +20,19 @@ ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
 
 
+_CAN_PAYLOAD = 64
+
+
 def wire_dtype(payload_size: int) -> np.dtype[np.void]:
     """Row of a batch: the layout of ``struct can_frame`` (payload 8) and ``struct canfd_frame`` (64).
+
+    Frames of serial devices can be longer; their rows have a wider ``length``.
 
     Args:
         payload_size: bytes of payload a row can hold, a multiple of 8.
     """
+    if payload_size > _CAN_PAYLOAD:
+        return np.dtype([("identifier", np.uint32), ("length", np.uint32), ("payload", np.uint8, (payload_size,))])
     return np.dtype(
         [
             ("identifier", np.uint32),

@@ -1,6 +1,6 @@
 """Frames in, updates out: a layout compiled to lookup tables, applied to whole batches.
 
-Every identifier is looked up in one table (bus and identifier together), the kinds of frame are told apart, the
+Every identifier is looked up for all buses at once (``addresses``), the kinds of frame are told apart, the
 members of a cycle are paired (``pairing``), and their payloads read (``frame_kind``). The updates are then shown
 (``skin_state``) when the publisher finds it right.
 
@@ -9,19 +9,22 @@ Nothing on the wire raises here. What cannot be used is counted.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import ConfigurationError
+from skinware_drivers.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import SkinTables
-from skinware_drivers.frame_kind import Assembly, FrameKind, bits_of
-from skinware_drivers.layout import Byte, Frame, Identifier, Layout
+from skinware_drivers.frame_kind import Assembly, FrameKind
+from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
 from skinware_drivers.pairing import Pairing
 from skinware_drivers.skin_state import SkinState, Updates
 
-_IDENTIFIERS = 1 << 11
 _NO_KIND = 255
 
 Indices = npt.NDArray[np.int64]
@@ -29,42 +32,75 @@ Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 
 
-class Decoder:
-    """A compiled layout for one set of tables.
+@dataclass(frozen=True, slots=True)
+class _CompiledCycle:
+    """A layout's cycle.
 
-    Args:
-        layout: what frames mean.
-        tables: what hangs on the buses.
+    Attributes:
+        members: numbers of its kinds of frame, in order.
+        pairing: finds it.
+        assembly: reads it.
+        group_of_entry: what its frames must follow each other in.
     """
 
-    def __init__(self, layout: Layout, tables: SkinTables) -> None:
-        self.layout = layout
+    members: list[int]
+    pairing: Pairing
+    assembly: Assembly
+    group_of_entry: npt.NDArray[np.uint16]
+
+
+class Decoder:
+    """Compiled layouts for one set of tables.
+
+    Args:
+        layouts: what frames mean, for each bus; None for a bus of which that is not known yet.
+        tables: what hangs on the buses.
+
+    Raises:
+        ConfigurationError: the buses have more kinds of frame than can be told apart.
+    """
+
+    def __init__(self, layouts: Sequence[Layout | None], tables: SkinTables) -> None:
+        self.layouts = list(layouts)
         self.tables = tables
         self.state = SkinState(tables)
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
-        self._nobody = self._n_modules + self._n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
-        self._frames = list(layout.frames)
-        names = [frame.name for frame in self._frames]
-        self._members = [names.index(name) for name in layout.cycle.members] if layout.cycle else []
-        self._alone = [number for number in range(len(names)) if number not in self._members]
+        self._frames: list[Frame] = []
+        first_of: list[tuple[Layout, int]] = []  # different layouts, and the number of the first kind of each
+        kinds_of_bus = []
+        for layout in layouts:
+            if layout is None:
+                kinds_of_bus.append(range(0))
+                continue
+            first = next((first for known, first in first_of if known == layout), None)
+            if first is None:
+                first = len(self._frames)
+                first_of.append((layout, first))
+                self._frames += layout.frames
+            kinds_of_bus.append(range(first, first + len(layout.frames)))
+        if len(self._frames) > MOST_FRAMES:
+            raise ConfigurationError(
+                f"the buses have {len(self._frames)} kinds of frame, a driver takes {MOST_FRAMES}: run several drivers"
+            )
+        self._addresses = Addresses(self._frames, kinds_of_bus, tables)
         self._kinds = [FrameKind(frame, tables) for frame in self._frames]
-        self._compile_assemblies()
-        self._compile_pairing()
-        self._entry, self._kinds_of = self._compile_identifiers()
-        self._length_ok = np.zeros((256, 256), bool)  # by kind; the last row: right for any frame
+        self._compile_assemblies(first_of)
+        longest = max(max(frame.length) for frame in self._frames)
+        self._length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
         for kind, frame in enumerate(self._frames):
             self._length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
-        self.unknown_identifiers = np.zeros((len(structure.buses), _IDENTIFIERS), np.int64)
+        self.unknown_identifiers = np.zeros((len(structure.buses), STANDARD_IDENTIFIERS), np.int64)
 
     @property
     def headroom(self) -> int:
         """Rows that a batch must keep free in front for frames that wait for their partners."""
-        return max(self._n_modules, self._n_patches) * max(0, len(self._members) - 1)
+        longest = max((len(cycle.members) for cycle in self._cycles), default=1)
+        return max(self._n_modules, self._n_patches) * (longest - 1)
 
     def put_back(self, batch: FrameBatch) -> None:
         """Empty a batch, except for the frames that still wait for their partners, which come first."""
@@ -85,12 +121,10 @@ class Decoder:
         """
         first, last = batch.start, batch.stop
         wire, bus = batch.wire[first:last], batch.bus[first:last]
-        payload, identifier = wire["payload"], wire["identifier"]
-        key = bus * np.int64(_IDENTIFIERS) + identifier
-        if len(identifier) and identifier.max() >= _IDENTIFIERS:
-            key[identifier >= _IDENTIFIERS] = len(self._entry) - 1
-        entry = self._entry[key]
-        kind = self._tell_kinds(key, entry, wire["length"], payload, bus)
+        payload = wire["payload"]
+        slots = self._addresses.slots(bus, wire["identifier"])
+        entry = self._addresses.entry[slots]
+        kind = self._tell_kinds(slots, entry, wire["length"], payload, bus)
         for number, compiled in enumerate(self._kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
@@ -98,13 +132,13 @@ class Decoder:
         is_module = entry < self._n_modules
         foreign = np.flatnonzero(~is_module)
         parts = []
-        for number in self._alone:
+        for number, assembly in self._alone.items():
             rows = np.flatnonzero((kind == number) & is_module)
             if len(rows):
-                parts.append(self._read(self._assemblies[number], batch, rows[:, None], entry[rows]))
+                parts.append(self._read(assembly, batch, rows[:, None], entry[rows]))
                 self._check_sequence(number, payload[rows], entry[rows])
-        if self._pairing is not None:
-            parts += self._pair(batch, self._pairing, entry, is_module, kind)
+        for cycle in self._cycles:
+            parts += self._pair(batch, cycle, entry, is_module, kind)
         if not parts:
             return self._no_updates, foreign + first
         updates = Updates.join([part for part, _ in parts])
@@ -119,57 +153,44 @@ class Decoder:
         """Count frames of a batch as unknown identifiers."""
         bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]
         self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
-        standard = identifier < _IDENTIFIERS
+        standard = identifier < STANDARD_IDENTIFIERS
         np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
     # -- compiling ----------------------------------------------------------------------------------------------
 
-    def _compile_assemblies(self) -> None:
-        groups = [[number] for number in self._alone] + ([self._members] if self._members else [])
+    def _compile_assemblies(self, layouts: Sequence[tuple[Layout, int]]) -> None:
+        members_of: list[list[int]] = []
+        for layout, first in layouts:
+            names = [frame.name for frame in layout.frames]
+            members_of.append([first + names.index(name) for name in layout.cycle.members] if layout.cycle else [])
+        in_cycles = {number for members in members_of for number in members}
+        alone = [number for number in range(len(self._frames)) if number not in in_cycles]
+        groups = [[number] for number in alone] + [members for members in members_of if members]
         width = max(sum(len(self._kinds[number].channels) for number in group) for group in groups)
         made = [Assembly([self._kinds[n] for n in group], self.tables, width) for group in groups]
-        self._assemblies = dict(zip(self._alone, made, strict=False))
-        self._cycle_assembly = made[-1]
+        self._alone = dict(zip(alone, made, strict=False))
+        of_cycles = iter(made[len(alone) :])
+        self._cycles = [
+            self._compile_cycle(layout, members, next(of_cycles))
+            for (layout, _), members in zip(layouts, members_of, strict=True)
+            if members
+        ]
         self._width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
         self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
 
-    def _compile_pairing(self) -> None:
-        structure = self.tables.structure
-        self._pairing: Pairing | None = None
-        if self.layout.cycle is None:
-            return
-        places = np.full(256, len(self._members), np.uint8)
-        places[self._members] = np.arange(len(self._members))
-        self._pairing = Pairing(self.layout.cycle, places)
-        if self.layout.cycle.within == "patch":
+    def _compile_cycle(self, layout: Layout, members: list[int], assembly: Assembly) -> _CompiledCycle:
+        structure, cycle = self.tables.structure, layout.cycle
+        if cycle is None:
+            raise ValueError("no cycle")
+        places = np.full(256, len(members), np.uint8)
+        places[members] = np.arange(len(members))
+        n_entries = self._n_modules + self._n_patches + 1
+        if cycle.within == "patch":
             groups = np.concatenate([structure.module_patch, np.arange(self._n_patches), [self._n_patches]])
         else:
-            groups = np.minimum(np.arange(self._nobody + 1), 0xFFFF)
-        self._group_of_entry = groups.astype(np.uint16)
-
-    def _compile_identifiers(self) -> tuple[Indices, npt.NDArray[np.uint16]]:
-        """Tables over bus * 2048 + identifier: what it names, and which kinds of frame it can be.
-
-        Entries 0 to n_modules - 1 are modules, then n_patches entries for "some module of this patch", then one
-        for "none of ours".
-        """
-        n_buses = len(self.tables.structure.buses)
-        entry = np.full(n_buses * _IDENTIFIERS + 1, self._nobody, np.int64)
-        kinds = np.zeros(n_buses * _IDENTIFIERS + 1, np.uint16)
-        for bus in range(n_buses):
-            for number, frame in enumerate(self._frames):
-                for identifier in _matching_identifiers(frame):
-                    patch = self.tables.patch_key.get((bus, bits_of(identifier, frame.patch)))
-                    if patch is None:
-                        continue
-                    at = bus * _IDENTIFIERS + identifier
-                    found = self._n_modules + patch
-                    if frame.module is None or frame.module.byte is None:
-                        found = self.tables.module_key.get((patch, bits_of(identifier, frame.module)), found)
-                    entry[at] = found
-                    kinds[at] |= 1 << number
-        return entry, kinds
+            groups = np.minimum(np.arange(n_entries), 0xFFFF)
+        return _CompiledCycle(members, Pairing(cycle, places), assembly, groups.astype(np.uint16))
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
@@ -178,10 +199,10 @@ class Decoder:
             return None
         if len({(c[0].offset) for c in conditions}) > 1 or len({c[0].value for c in conditions}) < len(conditions):
             return None
-        if len({tuple(c for c in frame.when if isinstance(c, Identifier)) for frame in self._frames}) > 1:
-            return None
+        if not self._addresses.sets[1:].all():
+            return None  # which kinds it can be depends on bus and identifier
         offset = conditions[0][0].offset
-        table = np.full((256, 256), _NO_KIND, np.uint8)
+        table = np.full((256, self._length_ok.shape[1]), _NO_KIND, np.uint8)
         for number, (frame, condition) in enumerate(zip(self._frames, conditions, strict=True)):
             # what lies behind the end of a payload means nothing
             table[condition[0].value, [length for length in frame.length if length > offset]] = number
@@ -190,32 +211,33 @@ class Decoder:
     # -- decoding -----------------------------------------------------------------------------------------------
 
     def _tell_kinds(
-        self, key: Indices, entry: Indices, length: Bytes, payload: Bytes, bus: npt.NDArray[np.uint16]
+        self, slots: Indices, entry: Indices, length: Bytes, payload: Bytes, bus: npt.NDArray[np.uint16]
     ) -> Bytes:
         """(n,) kind of each frame; 255 for those of no kind, or of a wrong length (which are counted)."""
         n_buses = len(self.state.bus_counters)
-        ours = entry < self._nobody
+        ours = entry < self._n_modules + self._n_patches
         if self._header is not None:
             at, table = self._header
             kind = table[payload[:, at], length]
             kind[~ours] = _NO_KIND
         else:
-            kind = self._match_kinds(key, payload, length)
+            kind = self._match_kinds(slots, payload, length)
         wrong = kind == _NO_KIND
         wrong &= ours
         if wrong.any():
             rows = np.flatnonzero(wrong)
-            is_length = ~self._length_ok[self._match_kinds(key[rows], payload[rows], length[rows], False), length[rows]]
+            likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
+            is_length = ~self._length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
         return kind
 
-    def _match_kinds(self, key: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
+    def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
         """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
-        kind = np.full(len(key), _NO_KIND, np.uint8)
-        possible = self._kinds_of[key]
+        kind = np.full(len(slots), _NO_KIND, np.uint8)
+        candidates = self._addresses.candidates[slots]
         for number, frame in enumerate(self._frames):
-            match = (possible & (1 << number)) != 0
+            match = self._addresses.sets[:, number][candidates]
             for condition in frame.when:
                 if isinstance(condition, Byte):
                     match &= payload[:, condition.offset] & condition.mask == condition.value
@@ -226,24 +248,30 @@ class Decoder:
         return kind
 
     def _pair(
-        self, batch: FrameBatch, pairing: Pairing, entry: Indices, is_module: Flags, kind: Bytes
+        self, batch: FrameBatch, cycle: _CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes
     ) -> list[tuple[Updates, Indices]]:
         """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        pairs = pairing.find(entry, self._group_of_entry[entry], kind, time_ns, is_module)
+        pairs = cycle.pairing.find(entry, cycle.group_of_entry[entry], kind, time_ns, is_module)
         if len(pairs.waiting):
-            rows = pairs.waiting + batch.start
-            self._carried = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]
+            self._carry(batch, pairs.waiting + batch.start)
         if not len(pairs.rows):
             return []
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
         self._count_patches(1, module[~whole])
         self._count_patches(2, entry[pairs.late])
-        for member, number in enumerate(self._members):
+        for member, number in enumerate(cycle.members):
             if self._frames[number].stamp is not None:
                 rows = pairs.rows[whole, member]
                 self._check_sequence(number, wire["payload"][rows], module[whole])
-        return [self._read(self._cycle_assembly, batch, pairs.rows, module, whole)]
+        return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
+
+    def _carry(self, batch: FrameBatch, rows: Indices) -> None:
+        kept = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]
+        if self._carried is not None:  # of another layout's cycle, that is to say of another bus
+            wire, time_ns, bus = self._carried
+            kept = np.concatenate([wire, kept[0]]), np.concatenate([time_ns, kept[1]]), np.concatenate([bus, kept[2]])
+        self._carried = kept
 
     def _read(
         self, assembly: Assembly, batch: FrameBatch, rows: Indices, module: Indices, whole: Flags | None = None
@@ -275,23 +303,18 @@ class Decoder:
             return
         dtype = np.dtype(stamp.dtype)
         modulo = stamp.modulo or 1 << 8 * dtype.itemsize
-        raw = np.ascontiguousarray(payload[:, stamp.offset : stamp.offset + dtype.itemsize]).view(dtype)[:, 0]
-        patches = self.tables.structure.module_patch[module].tolist()
-        for m, patch, number in zip(module.tolist(), patches, raw.tolist(), strict=True):
-            step = (number - int(self._last_sequence[m])) % modulo
-            if self._last_sequence[m] >= 0:
-                if step == 0:
-                    self.state.patch_counters[patch, 4] += 1
-                else:
-                    self.state.patch_counters[patch, 3] += step - 1
-            self._last_sequence[m] = number
-
-
-def _matching_identifiers(frame: Frame) -> list[int]:
-    everything = np.arange(_IDENTIFIERS)
-    match = np.ones(_IDENTIFIERS, bool)
-    for condition in frame.when:
-        if isinstance(condition, Identifier):
-            match &= everything & condition.mask == condition.value
-    found: list[int] = np.flatnonzero(match).tolist()
-    return found
+        number = np.ascontiguousarray(payload[:, stamp.offset : stamp.offset + dtype.itemsize]).view(dtype)[:, 0]
+        order = np.argsort(module, kind="stable")
+        module, number = module[order], number[order].astype(np.int64)
+        before = np.empty_like(number)
+        before[1:] = number[:-1]
+        first = np.flatnonzero(np.append(True, module[1:] != module[:-1]))
+        before[first] = self._last_sequence[module[first]]
+        step = (number - before) % modulo
+        step[before < 0] = 1
+        self._last_sequence[module] = number
+        is_back = step > modulo // 2
+        patch = self._module_patch[module]
+        for counter, count in ((3, np.where(is_back, 0, np.maximum(step - 1, 0))), (4, step == 0), (5, is_back)):
+            found = np.bincount(patch, weights=count, minlength=self._n_patches)
+            self.state.patch_counters[:, counter] += found.astype(np.int64)

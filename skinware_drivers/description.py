@@ -80,6 +80,24 @@ class SkinTables:
     channel_to_sensor: npt.NDArray[np.int64] = field(repr=False)
 
 
+def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorType]:
+    """The types of all buses, each once.
+
+    Raises:
+        StructureError: two buses mean different things by one type.
+    """
+    known: dict[int, SensorType] = {}
+    for types in types_of_buses:
+        for sensor_type in types:
+            other = known.setdefault(sensor_type.id, sensor_type)
+            if other != sensor_type:
+                raise StructureError(
+                    f"the buses disagree on the type {sensor_type.name!r}: {other} and {sensor_type};"
+                    " run a driver for each"
+                )
+    return list(known.values())
+
+
 def assemble(
     buses: Sequence[tuple[str, Sequence[Patch]]], types: Sequence[SensorType], dtype: npt.DTypeLike
 ) -> SkinTables:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Expand, Flag, Frame, Packed, Sentinel
+from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
@@ -193,8 +193,3 @@ class Assembly:
         sensors[orphans] = self._sink
         status[orphans] = 0
         return sensors
-
-
-def bits_of(identifier: int, bits: Bits | None) -> int:
-    """A bit field of an identifier, 0 without one."""
-    return 0 if bits is None else identifier >> bits.shift & ((1 << bits.width) - 1)

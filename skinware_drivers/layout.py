@@ -17,13 +17,27 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 
+MOST_FRAMES = 200
+"""Kinds of frame that a driver can tell apart, over all its buses."""
+
 
 @dataclass(frozen=True)
 class Identifier:
-    """Condition: ``identifier & mask == value``."""
+    """Condition: ``identifier & mask == value``.
+
+    Attributes:
+        value: what the masked bits are.
+        mask: bits that count; default: all.
+        extended: the identifier has 29 bits, not 11.
+    """
 
     value: int
-    mask: int = 0x7FF
+    mask: int = -1
+    extended: bool = False
+
+    def __post_init__(self) -> None:
+        if self.mask == -1:
+            object.__setattr__(self, "mask", 0x1FFF_FFFF if self.extended else 0x7FF)
 
 
 @dataclass(frozen=True)
@@ -179,6 +193,11 @@ class Frame:
     flags: Sequence[Flag | Sentinel] = ()
     stamp: Stamp | None = None
 
+    @property
+    def extended(self) -> bool:
+        """Whether its identifiers have 29 bits."""
+        return any(isinstance(c, Identifier) and c.extended for c in self.when)
+
 
 @dataclass(frozen=True)
 class Cycle:
@@ -212,8 +231,8 @@ class Layout:
 
     def __post_init__(self) -> None:
         names = [frame.name for frame in self.frames]
-        if len(set(names)) < len(names) or not 1 <= len(names) <= 16:
-            raise ConfigurationError(f"a layout has 1 to 16 frames of different names, not {names}")
+        if len(set(names)) < len(names) or not 1 <= len(names) <= MOST_FRAMES:
+            raise ConfigurationError(f"a layout has 1 to {MOST_FRAMES} frames of different names, not {names}")
         for frame in self.frames:
             _check_frame(frame)
         if self.cycle is not None:
@@ -248,7 +267,11 @@ def _check_frame(frame: Frame) -> None:
         raise refuse("a patch is named by bits of the identifier, not of the payload")
     if frame.module is not None and frame.module.byte is not None and not 1 <= frame.module.width <= 8:
         raise refuse("a module's key in the payload has 1 to 8 bits")
+    if frame.extended and not all(c.extended for c in frame.when if isinstance(c, Identifier)):
+        raise refuse("its identifiers have either 11 bits or 29: say extended=True in all conditions or in none")
     for condition in frame.when:
+        if isinstance(condition, Identifier) and condition.value & ~condition.mask:
+            raise refuse(f"identifier {condition.value:X} has bits outside its mask {condition.mask:X}: none matches")
         if isinstance(condition, Byte) and condition.offset >= min(frame.length):
             raise refuse(f"byte {condition.offset} is not in every right payload")
     if frame.stamp is not None and frame.stamp.offset + np.dtype(frame.stamp.dtype).itemsize > min(frame.length):

@@ -21,16 +21,17 @@ from skinware_drivers.adapter import AnyAdapter, Watch
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
-from skinware_drivers.description import Patch, SkinTables, assemble
+from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.desk import RequestDesk
 from skinware_drivers.figures import figures
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log = logging.getLogger("skinware.driver")
 
-_BATCH_FRAMES = 2048
+_BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
 _TURNS = 8  # batches per wake-up before handshakes and timers get their turn
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
@@ -83,7 +84,7 @@ class Runner:
         self._group = group
         self._on_ready = on_ready
         self._watch: Watch | None = None
-        self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size)
+        self._batch = self._make_batch(headroom=0)
         self._stopping = asyncio.Event()
         self._built = asyncio.Condition()
         self._timer: asyncio.TimerHandle | None = None
@@ -93,8 +94,16 @@ class Runner:
         self._built_period_s = 0.0
 
     @property
+    def _layouts(self) -> list[Layout | None]:
+        return [line.adapter.layout if line.patches else None for line in self.lines]
+
+    def _make_batch(self, headroom: int) -> FrameBatch:
+        """Room for what arrives at once; of long frames, fewer do."""
+        return FrameBatch(max(64, min(_BATCH_FRAMES, _BATCH_BYTES // self._payload_size)), self._payload_size, headroom)
+
+    @property
     def _payload_size(self) -> int:
-        return self.lines[0].adapter.layout.payload_size
+        return max(line.adapter.payload_size for line in self.lines)
 
     # -- life -----------------------------------------------------------------------------------------------------
 
@@ -203,20 +212,24 @@ class Runner:
         async with self._built:
             if any(line.patches is None for line in self.lines) or not any(line.patches for line in self.lines):
                 return
-            adapter = self.lines[0].adapter
+            adapters = [line.adapter for line in self.lines]
             try:
                 tables = assemble(
-                    [(line.name, line.patches or ()) for line in self.lines], adapter.types, adapter.dtype
+                    [(line.name, line.patches or ()) for line in self.lines],
+                    join_types([adapter.types for adapter in adapters]),
+                    np.result_type(*(adapter.dtype for adapter in adapters)),
                 )
             except StructureError as error:
                 log.error("what was found makes no skin: %s", error)
                 return
-            if self.decoder is not None and tables.structure == self.decoder.tables.structure:
+            known = self.decoder
+            if known is not None and tables.structure == known.tables.structure and self._layouts == known.layouts:
                 return
-            self._go_over_to(tables, adapter)
+            self._go_over_to(tables)
             self._built.notify_all()
 
-    def _go_over_to(self, tables: SkinTables, adapter: AnyAdapter) -> None:
+    def _go_over_to(self, tables: SkinTables) -> None:
+        adapter = self.lines[0].adapter
         if self.writer is None:
             self.writer = writer = DriverWriter(
                 self.name,
@@ -236,9 +249,9 @@ class Runner:
             writer = self.writer
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
-        self.decoder = Decoder(adapter.layout, tables)
+        self.decoder = Decoder(self._layouts, tables)
         self._watch = adapter.watch(tables)
-        self._batch = FrameBatch(_BATCH_FRAMES, self._payload_size, self.decoder.headroom)
+        self._batch = self._make_batch(self.decoder.headroom)
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
         self.publisher = Publisher(writer, self.decoder, self._watch, self._period_s, by_cycle, self._desk, on_request)
@@ -256,7 +269,7 @@ class Runner:
         if self.decoder is None or self._watch is None or line.patches is None:
             return
         if self._period_s != self._built_period_s:  # which layout and publisher depend on
-            self._go_over_to(self.decoder.tables, self.lines[0].adapter)
+            self._go_over_to(self.decoder.tables)
         elif set_up:
             first = _first_patch(self.decoder, line)
             for patch in patches:

@@ -38,7 +38,7 @@ ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
 def decode(
     layout: Layout, modules: Sequence[Module], dtype: str, frames: Sequence[tuple[int, bytes]], gap_ns: int = 1000
 ) -> Decoder:
-    decoder = Decoder(layout, assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
+    decoder = Decoder([layout], assemble([("bus", [Patch("patch", modules)])], TYPES, dtype))
     batch = FrameBatch(256, layout.payload_size, decoder.headroom)
     decoder.put_back(batch)
     for number, (identifier, payload) in enumerate(frames):
@@ -156,7 +156,7 @@ def test_sequence_numbers_tell_losses_and_repeats() -> None:
     layout = one(Values(1, "u1", 1), stamp=Stamp(0, "u1"))
     numbers = [254, 255, 0, 3, 3]
     frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
-    decoder = Decoder(layout, assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
+    decoder = Decoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
     batch = FrameBatch(16, 8, decoder.headroom)
     for identifier, payload in frames:
         decoder.put_back(batch)
@@ -190,7 +190,7 @@ def test_expand_is_the_escape() -> None:
     [
         (lambda: one(Values(6, "<u2", 2)), "values end at byte 10"),
         (lambda: one(Values(0, "u1", 2, to=(0,))), "`to` names 1 channels"),
-        (lambda: Layout([]), "1 to 16 frames"),
+        (lambda: Layout([]), "1 to 200 frames"),
         (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
         (lambda: one(Values(0, "u1", 1), stamp=Stamp(7, "<u2")), "sequence number is not in every"),

@@ -29,7 +29,7 @@ class Rig:
         self.driver = RoboskinDriver(RoboskinOptions(**options))  # type: ignore[arg-type]
         patches = [self.driver._patch(board, range(16)) for board in boards]
         buses = [(f"bus{i}", patches) for i in range(n_buses)]
-        self.decoder = Decoder(self.driver.layout, assemble(buses, self.driver.types, self.driver.dtype))
+        self.decoder = Decoder([self.driver.layout] * len(buses), assemble(buses, self.driver.types, self.driver.dtype))
         self.batch = FrameBatch(4096, 8, self.decoder.headroom)
 
     def feed(self, frames: Sequence[Wire], bus: int = 0) -> list[int]:

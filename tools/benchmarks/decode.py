@@ -71,7 +71,7 @@ class Ours:
         driver = RoboskinDriver(RoboskinOptions())
         patches = [driver._patch(board, range(16)) for board in BOARDS]
         tables = assemble([("bench", patches)], driver.types, driver.dtype)
-        self.decoder = Decoder(driver.layout, tables)
+        self.decoder = Decoder([driver.layout], tables)
         self.writer = DriverWriter(
             "bench",
             tables.structure,

@@ -1,0 +1,172 @@
+"""Whose frame is it: from bus and identifier to a module, and to the kinds of frame that it can be.
+
+Identifiers of 11 bits are looked up in one table for all buses. Those of 29 bits are too many for a table: the bit
+fields that name patch and module are taken out of them and searched for among the known ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.description import SkinTables
+from skinware_drivers.layout import Bits, Frame, Identifier
+
+STANDARD_IDENTIFIERS = 1 << 11
+_FIELD_BITS = 16  # of a patch's or module's key
+
+Indices = npt.NDArray[np.int64]
+
+
+class Addresses:
+    """The address book of all buses of a driver.
+
+    A *slot* stands for all identifiers of a bus that mean the same; ``nobody`` is that of all others.
+
+    Args:
+        frames: all kinds of frame.
+        kinds_of_bus: for each bus, the numbers of those that it carries.
+        tables: what hangs on the buses.
+
+    Attributes:
+        entry: (n_slots,) int64: 0 to n_modules - 1: a module; then n_patches entries for "some module of this patch";
+            then one for "none of ours".
+        candidates: (n_slots,) uint16, row of ``sets``.
+        sets: (n_sets, n_kinds) bool: kinds that a frame can be.
+    """
+
+    def __init__(self, frames: Sequence[Frame], kinds_of_bus: Sequence[Sequence[int]], tables: SkinTables) -> None:
+        self._tables = tables
+        self._n_modules = tables.structure.n_modules
+        self.nobody = len(kinds_of_bus) * STANDARD_IDENTIFIERS
+        entries = [self._n_modules + tables.structure.n_patches] * (self.nobody + 1)
+        possible: list[tuple[int, ...]] = [()] * (self.nobody + 1)
+        self._forms: list[_Form] = []
+        for bus, kinds in enumerate(kinds_of_bus):
+            for number in kinds:
+                frame = frames[number]
+                if frame.extended:
+                    continue
+                for identifier in _standard_identifiers(frame):
+                    entry = self._find(bus, frame, identifier)
+                    if entry is not None:
+                        slot = bus * STANDARD_IDENTIFIERS + identifier
+                        entries[slot] = entry
+                        possible[slot] = (*possible[slot], number)
+            for same in _of_one_address(frames, (number for number in kinds if frames[number].extended)):
+                self._forms.append(_Form(bus, frames[same[0]], tables, len(entries)))
+                entries += self._forms[-1].entries
+                possible += [same] * len(self._forms[-1].entries)
+        self.entry = np.array(entries, np.int64)
+        sets = {kinds: row for row, kinds in enumerate(dict.fromkeys(possible))}
+        self.candidates = np.array([sets[kinds] for kinds in possible], np.uint16)
+        self.sets = np.zeros((len(sets), len(frames)), bool)
+        for kinds, row in sets.items():
+            self.sets[row, list(kinds)] = True
+
+    def slots(self, bus: npt.NDArray[np.uint16], identifier: npt.NDArray[np.uint32]) -> Indices:
+        """(n,) slot of each frame."""
+        slots: Indices = bus * np.int64(STANDARD_IDENTIFIERS) + identifier
+        if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
+            rows = np.flatnonzero(identifier >= STANDARD_IDENTIFIERS)
+            slots[rows] = self.nobody
+            for form in self._forms:
+                form.look_up(bus[rows], identifier[rows].astype(np.int64), slots, rows)
+        return slots
+
+    def _find(self, bus: int, frame: Frame, identifier: int) -> int | None:
+        patch = self._tables.patch_key.get((bus, bits_of(identifier, frame.patch)))
+        if patch is None:
+            return None
+        anyone = self._n_modules + patch
+        if frame.module is not None and frame.module.byte is not None:
+            return anyone
+        return self._tables.module_key.get((patch, bits_of(identifier, frame.module)), anyone)
+
+
+@dataclass(frozen=True)
+class _Field:
+    shift: int
+    mask: int
+
+    @staticmethod
+    def of(bits: Bits | None) -> _Field:
+        return _Field(0, 0) if bits is None or bits.byte is not None else _Field(bits.shift, (1 << bits.width) - 1)
+
+    def take(self, identifier: Indices) -> Indices:
+        return identifier >> self.shift & self.mask
+
+
+class _Form:
+    """29-bit identifiers of one bus that are built alike."""
+
+    def __init__(self, bus: int, frame: Frame, tables: SkinTables, first_slot: int) -> None:
+        self._bus = bus
+        self._conditions = [c for c in frame.when if isinstance(c, Identifier)]
+        self._patch, self._module = _Field.of(frame.patch), _Field.of(frame.module)
+        by_byte = frame.module is not None and frame.module.byte is not None
+        known: dict[int, int] = {}
+        self._anyone: dict[int, int] = {}  # patch key -> slot of "some module of this patch"
+        self.entries: list[int] = []
+        for (of_bus, patch_key), patch in tables.patch_key.items():
+            if of_bus != bus:
+                continue
+            self._anyone[patch_key] = first_slot + len(self.entries)
+            self.entries.append(tables.structure.n_modules + patch)
+            for (of_patch, module_key), module in tables.module_key.items():
+                if of_patch == patch and not by_byte:
+                    known[patch_key << _FIELD_BITS | module_key] = first_slot + len(self.entries)
+                    self.entries.append(module)
+        self._codes, self._slots = _sorted(known)
+        self._patch_codes, self._patch_slots = _sorted(self._anyone)
+
+    def look_up(self, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
+        """Fill in the slots of those of ``rows`` whose identifiers are of this form."""
+        match = bus == self._bus
+        match &= (identifier & EXTENDED_FLAG) != 0
+        for condition in self._conditions:
+            match &= identifier & condition.mask == condition.value
+        hits = np.flatnonzero(match)
+        if not len(hits):
+            return
+        patch_key = self._patch.take(identifier[hits])
+        code = patch_key << _FIELD_BITS | self._module.take(identifier[hits])
+        for codes, found, key in ((self._patch_codes, self._patch_slots, patch_key), (self._codes, self._slots, code)):
+            if len(codes):
+                at = np.minimum(np.searchsorted(codes, key), len(codes) - 1)
+                known = codes[at] == key
+                slots[rows[hits[known]]] = found[at[known]]
+
+
+def bits_of(identifier: int, bits: Bits | None) -> int:
+    """A bit field of an identifier, 0 without one."""
+    return 0 if bits is None else identifier >> bits.shift & ((1 << bits.width) - 1)
+
+
+def _sorted(slots: dict[int, int]) -> tuple[Indices, Indices]:
+    codes = np.array(sorted(slots), np.int64)
+    return codes, np.array([slots[code] for code in codes.tolist()], np.int64)
+
+
+def _of_one_address(frames: Sequence[Frame], numbers: Iterable[int]) -> list[tuple[int, ...]]:
+    """Kinds of frame, those together whose identifiers are built alike."""
+    alike: dict[tuple[object, ...], list[int]] = {}
+    for number in numbers:
+        frame = frames[number]
+        conditions = frozenset(c for c in frame.when if isinstance(c, Identifier))
+        alike.setdefault((conditions, frame.patch, frame.module), []).append(number)
+    return [tuple(same) for same in alike.values()]
+
+
+def _standard_identifiers(frame: Frame) -> list[int]:
+    everything = np.arange(STANDARD_IDENTIFIERS)
+    match = np.ones(STANDARD_IDENTIFIERS, bool)
+    for condition in frame.when:
+        if isinstance(condition, Identifier):
+            match &= everything & condition.mask == condition.value
+    found: list[int] = np.flatnonzero(match).tolist()
+    return found

@@ -14,6 +14,7 @@ from skinware.sensor_types import SensorType
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
+from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
 
@@ -68,6 +69,7 @@ class Adapter(ABC, Generic[OptionsT]):
         patches: what hangs on each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+        polls: what devices that only answer are asked, again and again, from ``start`` to ``stop``; may be a property.
     """
 
     medium: ClassVar[str]
@@ -77,6 +79,7 @@ class Adapter(ABC, Generic[OptionsT]):
     layout: Layout
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
+    polls: Sequence[Poll] = ()
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options

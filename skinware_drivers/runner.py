@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import select
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ from skinware_drivers.figures import figures
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
+from skinware_drivers.polling import Poller
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log = logging.getLogger("skinware.driver")
@@ -86,6 +87,7 @@ class Runner:
         self._watch: Watch | None = None
         self._batch = self._make_batch(headroom=0)
         self._stopping = asyncio.Event()
+        self._failure: BaseException | None = None
         self._built = asyncio.Condition()
         self._timer: asyncio.TimerHandle | None = None
         self._known_patch_state = np.zeros(0, np.uint8)
@@ -127,6 +129,8 @@ class Runner:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
+            if self._failure is not None:
+                raise self._failure
         finally:
             for task in tasks:
                 task.cancel()
@@ -162,10 +166,12 @@ class Runner:
     async def _serve(self, line: BusLine) -> None:
         """One bus from discovery to the end: describe, set up, then look after it."""
         await line.describe(self._build)
-        joining = asyncio.create_task(self._join_on_request(line))
+        beside = [self._beside(self._join_on_request(line))]
         try:
             if not self._listen_only:
                 await line.set_up()
+                poller = Poller(line.link, line.bus.counters)
+                beside.append(self._beside(poller.run(lambda: line.adapter.polls, line.lost.is_set)))
             await self._check_data(line)
             while True:
                 if line.lost.is_set():
@@ -174,7 +180,21 @@ class Runner:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
         finally:
-            joining.cancel()
+            for task in beside:
+                task.cancel()
+            await asyncio.gather(*beside, return_exceptions=True)
+
+    def _beside(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Start what goes on beside serving a bus; should it fail, the driver does."""
+
+        def look(done: asyncio.Task[None]) -> None:
+            if not done.cancelled() and done.exception() is not None:
+                self._failure = done.exception()
+                self._stopping.set()
+
+        task = asyncio.get_running_loop().create_task(work)
+        task.add_done_callback(look)
+        return task
 
     async def _check_data(self, line: BusLine) -> None:
         """Wait for the first data of every patch, and name those that send none."""

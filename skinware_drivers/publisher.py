@@ -174,6 +174,11 @@ class Publisher:
         if self._desk is not None and self._desk.waited_for:
             self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)
 
+    def lose(self, patch: int, state: PatchState) -> None:
+        """Take a patch as silent from here on, until its next data."""
+        self._patch_updated_ns[patch] = 0
+        self.patch_state[patch] = state
+
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         for row, c in zip(self._counts, self.bus_counters, strict=True):

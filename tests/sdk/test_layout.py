@@ -177,6 +177,22 @@ def test_a_module_named_in_the_payload() -> None:
     assert decoder.state.bus_counters[0, 0] == 1
 
 
+@pytest.mark.parametrize(
+    ("layout", "frame", "counted"),
+    [
+        (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(4)), (1, 0, 0)),
+        (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(3)), (1, 0, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(4)), (1, 0, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(3)), (1, 1, 0)),
+    ],
+)
+def test_frames_of_unknown_modules_are_unknown_whatever_their_length(
+    layout: Layout, frame: tuple[int, bytes], counted: tuple[int, int, int]
+) -> None:
+    decoder = decode(layout, [Module(taxels(1), key=7)], "u1", [frame])
+    assert tuple(decoder.state.bus_counters[0].tolist()) == counted
+
+
 def test_sentinels_and_flags() -> None:
     flags = [
         Sentinel(Status.NOT_CONNECTED, 0xFFFF),

@@ -72,7 +72,8 @@ class FrameKind:
         data = payload[:, layout.offset : layout.end]
         if isinstance(layout.dtype, Packed):
             return _unpack(data, layout.count, layout.dtype), None
-        return np.ascontiguousarray(data).view(layout.dtype), None
+        dtype = np.dtype(layout.dtype)
+        return (data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)), None
 
     def flag(
         self, payload: Bytes, length: Bytes, raw: npt.NDArray[Any], status: Bytes, columns: slice, channels: Indices

@@ -132,12 +132,12 @@ def test_the_first_view_after_a_restart_shows_the_new_life() -> None:
         publish(writer, 1)
         reader = ServiceReader[Frame]("a")
         with reader.view() as frame:
-            assert frame.values[0] == 1
+            assert frame.column("values")[0] == 1
     with ServiceWriter("a", SMALL) as writer, reader:
         publish(writer, 2)
         with reader.view() as frame:
             assert frame.position == (writer.generation, 1)
-            assert frame.values[0] == 2
+            assert frame.column("values")[0] == 2
 
 
 def test_losses_over_a_restart_are_counted() -> None:

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Skinware"
 author = "the Skinware authors"
-copyright = "the Skinware authors, Apache-2.0"
+project_copyright = "the Skinware authors, Apache-2.0"
 version = release = version_of("skinware")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_click"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import enum
 from abc import ABC
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
 import msgspec
@@ -11,9 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import SensorType
+from skinware.status import Status
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
+from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
 
@@ -22,6 +25,19 @@ class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+
+
+class Notice(enum.Enum):
+    """What a device says of itself beside its data."""
+
+    RESTARTED = "restarted"
+    """It lost its configuration: ``revive`` is called for it, and for it alone."""
+    LOST = "lost"
+    """It is not there, or not in a state to send: stale, until data comes."""
+    SUSPECT = "suspect"
+    """It reports an error: all its values are suspect, until it is sound or was set up anew."""
+    SOUND = "sound"
+    """The error is over."""
 
 
 class Watch:
@@ -38,8 +54,12 @@ class Watch:
     def look(self, updates: Updates) -> None:
         """Called with updates that were just shown, if the wire may have flagged one of them."""
 
+    def suspect(self, patch: int) -> None:
+        """Called when a patch reports an error."""
+        self.module_status[self.tables.structure.module_patch == patch] |= np.uint8(Status.SUSPECT)
+
     def forget(self, patch: int) -> None:
-        """Called when a patch was set up anew: what was held against it no longer counts."""
+        """Called when a patch was set up anew, or reports no error any more: what was held against it is over."""
         self.module_status[self.tables.structure.module_patch == patch] = 0
 
 
@@ -51,7 +71,7 @@ class Adapter(ABC, Generic[OptionsT]):
     of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went
     down); the runner then says so and tries again later.
 
-    In listen-only mode only ``describe`` and ``join`` are called, and every send is refused.
+    In listen-only mode only ``describe``, ``attend`` and ``join`` are called, and every send is refused.
 
     What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
 
@@ -68,6 +88,7 @@ class Adapter(ABC, Generic[OptionsT]):
         patches: what hangs on each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+        polls: what devices that only answer are asked, again and again, from ``start`` to ``stop``; may be a property.
     """
 
     medium: ClassVar[str]
@@ -77,6 +98,7 @@ class Adapter(ABC, Generic[OptionsT]):
     layout: Layout
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
+    polls: Sequence[Poll] = ()
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options
@@ -114,6 +136,16 @@ class Adapter(ABC, Generic[OptionsT]):
 
     async def revive(self, link: Link, patch: Patch) -> None:
         """Set one patch up anew and start it, without disturbing the others."""
+
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        """Runs beside the data from ``describe`` to the end: for devices that speak of their own state.
+
+        What belongs to no module can be heard with ``link.follow``. A ``BusError`` ends it, and it is called again.
+
+        Args:
+            link: the bus.
+            tell: to be called with what a patch says of itself.
+        """
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
         """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""

@@ -83,7 +83,7 @@ class Addresses:
         if patch is None:
             return None
         anyone = self._n_modules + patch
-        if frame.module is not None and frame.module.byte is not None:
+        if frame.module_byte is not None:
             return anyone
         return self._tables.module_key.get((patch, bits_of(identifier, frame.module)), anyone)
 
@@ -92,13 +92,16 @@ class Addresses:
 class _Field:
     shift: int
     mask: int
+    constant: int = 0
 
     @staticmethod
-    def of(bits: Bits | None) -> _Field:
+    def of(bits: Bits | int | None) -> _Field:
+        if isinstance(bits, int):
+            return _Field(0, 0, bits)
         return _Field(0, 0) if bits is None or bits.byte is not None else _Field(bits.shift, (1 << bits.width) - 1)
 
     def take(self, identifier: Indices) -> Indices:
-        return identifier >> self.shift & self.mask
+        return identifier >> self.shift & self.mask | self.constant
 
 
 class _Form:
@@ -108,7 +111,7 @@ class _Form:
         self._bus = bus
         self._conditions = [c for c in frame.when if isinstance(c, Identifier)]
         self._patch, self._module = _Field.of(frame.patch), _Field.of(frame.module)
-        by_byte = frame.module is not None and frame.module.byte is not None
+        by_byte = frame.module_byte is not None
         known: dict[int, int] = {}
         self._anyone: dict[int, int] = {}  # patch key -> slot of "some module of this patch"
         self.entries: list[int] = []
@@ -142,8 +145,10 @@ class _Form:
                 slots[rows[hits[known]]] = found[at[known]]
 
 
-def bits_of(identifier: int, bits: Bits | None) -> int:
-    """A bit field of an identifier, 0 without one."""
+def bits_of(identifier: int, bits: Bits | int | None) -> int:
+    """A bit field of an identifier, 0 without one; or the constant that stands for it."""
+    if isinstance(bits, int):
+        return bits
     return 0 if bits is None else identifier >> bits.shift & ((1 << bits.width) - 1)
 
 

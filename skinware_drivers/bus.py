@@ -111,6 +111,8 @@ class BusCounters:
     """Frames handed to the wire."""
     send_failures: int = 0
     """Sends that the interface refused."""
+    polls_missed: int = 0
+    """Polls of devices that only answer which could not be sent in time."""
 
 
 class Bus(ABC):

@@ -40,6 +40,8 @@ class BusLine:
         opened_ns: when it was last opened.
         started: its devices have been told to send.
         lost: set while it is away.
+        suspects: keys of the patches that report errors.
+        revived_ns: when one of its patches was last set up anew.
         busy: held while its devices are being set up or asked to do something, and may be silent for it.
     """
 
@@ -56,6 +58,8 @@ class BusLine:
         self.started = False
         self.lost = asyncio.Event()
         self.busy = asyncio.Lock()
+        self.suspects: set[int] = set()
+        self.revived_ns = 0
         self._epoll = epoll
 
     def open(self) -> None:

@@ -86,6 +86,9 @@ class Decoder:
             )
         self._addresses = Addresses(self._frames, kinds_of_bus, tables)
         self._kinds = [FrameKind(frame, tables) for frame in self._frames]
+        # frames whose payload may name the module; if the identifier does, to no avail, it is just unknown
+        by_payload = np.array([kind.module_by_byte is not None for kind in self._kinds])
+        self._payload_names: Flags = self._addresses.sets @ by_payload
         self._compile_assemblies(first_of)
         longest = max(max(frame.length) for frame in self._frames)
         self._length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
@@ -226,6 +229,7 @@ class Decoder:
         wrong &= ours
         if wrong.any():
             rows = np.flatnonzero(wrong)
+            rows = rows[(entry[rows] < self._n_modules) | self._payload_names[self._addresses.candidates[slots[rows]]]]
             likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
             is_length = ~self._length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel
+from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, Values
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
@@ -28,20 +28,21 @@ class FrameKind:
         n_channels = tables.channel_to_sensor.shape[1]
         self._n_modules = tables.structure.n_modules
         self.module_by_byte: Indices | None = None
-        if frame.module is not None and frame.module.byte is not None:
-            self.module_by_byte = np.full((tables.structure.n_patches, 1 << frame.module.width), -1, np.int64)
+        if frame.module_byte is not None:
+            self.module_by_byte = np.full((tables.structure.n_patches, 1 << frame.module_byte.width), -1, np.int64)
             for (patch, key), module in tables.module_key.items():
                 if key < self.module_by_byte.shape[1]:
                     self.module_by_byte[patch, key] = module
         if isinstance(frame.values, Expand):
             self.channels = np.arange(n_channels)
         else:
-            self.channels = np.array([-1 if c is None else c for c in frame.values.channels], np.int64)
+            channels = [channel for run in frame.runs for channel in run.channels]
+            self.channels = np.array([-1 if c is None else c for c in channels], np.int64)
             self.channels[self.channels >= n_channels] = -1
 
     def name_modules(self, entry: Indices, payload: Bytes) -> Indices:
         """(n,) entries in which "some module of this patch" became the module that the payload names."""
-        bits = self.frame.module
+        bits = self.frame.module_byte
         if self.module_by_byte is None or bits is None or bits.byte is None:
             return entry
         key = payload[:, bits.byte] >> bits.shift & ((1 << bits.width) - 1)
@@ -69,11 +70,8 @@ class FrameKind:
             missing = np.ones(raw.shape, bool)
             missing[row, channel] = False
             return raw, missing
-        data = payload[:, layout.offset : layout.end]
-        if isinstance(layout.dtype, Packed):
-            return _unpack(data, layout.count, layout.dtype), None
-        dtype = np.dtype(layout.dtype)
-        return (data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)), None
+        runs = [_read_run(run, payload) for run in self.frame.runs]
+        return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1), None
 
     def flag(
         self, payload: Bytes, length: Bytes, raw: npt.NDArray[Any], status: Bytes, columns: slice, channels: Indices
@@ -102,6 +100,14 @@ class FrameKind:
                 _flag_bits(flag, flagged, word, status, channels)
 
 
+def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
+    data = payload[:, run.offset : run.end]
+    if isinstance(run.dtype, Packed):
+        return _unpack(data, run.count, run.dtype)
+    dtype = np.dtype(run.dtype)
+    return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
+
+
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, npt.NDArray[np.uint32]]:
     """The frames in which a flag's word is there and not 0 (few, as a rule), and the word of each."""
     dtype = np.dtype(flag.dtype)
@@ -124,7 +130,8 @@ def _flag_bits(flag: Flag, flagged: Indices, word: npt.NDArray[np.uint32], statu
 
 
 def _unpack(data: Bytes, count: int, packed: Packed) -> Indices:
-    bits = np.unpackbits(np.ascontiguousarray(data), axis=1, bitorder=packed.order)[:, : count * packed.bits]
+    end = packed.skip + count * packed.bits
+    bits = np.unpackbits(np.ascontiguousarray(data), axis=1, bitorder=packed.order)[:, packed.skip : end]
     weights = 1 << np.arange(packed.bits, dtype=np.int64)
     if packed.order == "big":
         weights = weights[::-1]

@@ -75,11 +75,13 @@ class Packed:
         bits: bits of a value, 1 to 32.
         order: ``big``: the first value begins at the highest bit of the first byte; ``little``: at its lowest.
         signed: two's complement.
+        skip: bits of the first byte that come before the first value, 0 to 7.
     """
 
     bits: int
     order: Literal["big", "little"] = "big"
     signed: bool = False
+    skip: int = 0
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Values:
     def end(self) -> int:
         """One past the last byte."""
         if isinstance(self.dtype, Packed):
-            return self.offset + -(-self.count * self.dtype.bits // 8)
+            return self.offset + -(-(self.dtype.skip + self.count * self.dtype.bits) // 8)
         return self.offset + self.count * np.dtype(self.dtype).itemsize
 
 
@@ -177,9 +179,11 @@ class Frame:
         name: for the cycle and for messages.
         when: all of these hold.
         length: payload lengths that are right; others are counted as bad and not shown.
-        patch: bit field of the identifier that names the patch; None: the bus has one patch.
-        module: bit field that names the module within the patch; None: the patch has one module.
-        values: where the values are.
+        values: where the values are, in one run or in several.
+        patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
+            None: the bus has one patch.
+        module: bit field that names the module within the patch; or the key of the only module that it is of; None:
+            the patch has one module.
         flags: what sets status bits.
         stamp: sequence number, if there is one.
     """
@@ -187,11 +191,23 @@ class Frame:
     name: str
     when: Sequence[Condition]
     length: Sequence[int]
-    values: Values | Expand
-    patch: Bits | None = None
-    module: Bits | None = None
+    values: Values | Sequence[Values] | Expand
+    patch: Bits | int | None = None
+    module: Bits | int | None = None
     flags: Sequence[Flag | Sentinel] = ()
     stamp: Stamp | None = None
+
+    @property
+    def runs(self) -> Sequence[Values]:
+        """The runs of values; none of a frame that is expanded."""
+        if isinstance(self.values, Expand):
+            return ()
+        return (self.values,) if isinstance(self.values, Values) else self.values
+
+    @property
+    def module_byte(self) -> Bits | None:
+        """The field of the payload that names the module, if it is not the identifier that does."""
+        return self.module if isinstance(self.module, Bits) and self.module.byte is not None else None
 
     @property
     def extended(self) -> bool:
@@ -258,14 +274,18 @@ def _check_frame(frame: Frame) -> None:
 
     if not frame.length:
         raise refuse("say which payload lengths are right")
-    if isinstance(frame.values, Values):
-        if len(frame.values.channels) != frame.values.count:
-            raise refuse(f"{frame.values.count} values, but `to` names {len(frame.values.channels)} channels")
-        if frame.values.end > min(frame.length):
-            raise refuse(f"values end at byte {frame.values.end}, the shortest right payload has {min(frame.length)}")
-    if frame.patch is not None and frame.patch.byte is not None:
+    if not isinstance(frame.values, Expand) and not frame.runs:
+        raise refuse("it has no values")
+    for values in frame.runs:
+        if len(values.channels) != values.count:
+            raise refuse(f"{values.count} values, but `to` names {len(values.channels)} channels")
+        if values.end > min(frame.length):
+            raise refuse(f"values end at byte {values.end}, the shortest right payload has {min(frame.length)}")
+        if isinstance(values.dtype, Packed) and not 0 <= values.dtype.skip < 8:
+            raise refuse(f"{values.dtype.skip} bits before the first value: give 0 to 7, and the first byte as offset")
+    if isinstance(frame.patch, Bits) and frame.patch.byte is not None:
         raise refuse("a patch is named by bits of the identifier, not of the payload")
-    if frame.module is not None and frame.module.byte is not None and not 1 <= frame.module.width <= 8:
+    if frame.module_byte is not None and not 1 <= frame.module_byte.width <= 8:
         raise refuse("a module's key in the payload has 1 to 8 bits")
     if frame.extended and not all(c.extended for c in frame.when if isinstance(c, Identifier)):
         raise refuse("its identifiers have either 11 bits or 29: say extended=True in all conditions or in none")

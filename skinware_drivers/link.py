@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -123,6 +124,18 @@ class Link:
         finally:
             self._heard = None
         return heard
+
+    @contextmanager
+    def follow(self, *matches: Match) -> Iterator[asyncio.Queue[Reply]]:
+        """Hear every frame that matches, in order of arrival, in a queue."""
+        queue: asyncio.Queue[Reply] = asyncio.Queue()
+        entries = [(match, queue) for match in matches]
+        self._waiters += entries
+        try:
+            yield queue
+        finally:
+            for entry in entries:
+                self._waiters.remove(entry)
 
     async def sleep(self, duration_s: float) -> None:
         """Let time pass; the bus keeps being read."""

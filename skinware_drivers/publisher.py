@@ -17,7 +17,7 @@ from skinware_drivers.bus import BusCounters
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures")
+OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed")
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
@@ -174,10 +174,16 @@ class Publisher:
         if self._desk is not None and self._desk.waited_for:
             self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)
 
+    def lose(self, patch: int, state: PatchState) -> None:
+        """Take a patch as silent from here on, until its next data."""
+        self._patch_updated_ns[patch] = 0
+        self.patch_state[patch] = state
+
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         for row, c in zip(self._counts, self.bus_counters, strict=True):
-            row[: len(OWN_BUS_COUNTERS)] = c.frames, c.lost, c.error_frames, c.refused, c.sent, c.send_failures
+            own = c.frames, c.lost, c.error_frames, c.refused, c.sent, c.send_failures, c.polls_missed
+            row[: len(OWN_BUS_COUNTERS)] = own
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 

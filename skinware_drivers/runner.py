@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import select
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import PatchState
-from skinware_drivers.adapter import AnyAdapter, Watch
+from skinware_drivers.adapter import AnyAdapter, Notice, Watch
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
@@ -27,6 +27,7 @@ from skinware_drivers.figures import figures
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
+from skinware_drivers.polling import Poller
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log = logging.getLogger("skinware.driver")
@@ -86,6 +87,7 @@ class Runner:
         self._watch: Watch | None = None
         self._batch = self._make_batch(headroom=0)
         self._stopping = asyncio.Event()
+        self._failure: BaseException | None = None
         self._built = asyncio.Condition()
         self._timer: asyncio.TimerHandle | None = None
         self._known_patch_state = np.zeros(0, np.uint8)
@@ -127,6 +129,8 @@ class Runner:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
+            if self._failure is not None:
+                raise self._failure
         finally:
             for task in tasks:
                 task.cancel()
@@ -162,10 +166,12 @@ class Runner:
     async def _serve(self, line: BusLine) -> None:
         """One bus from discovery to the end: describe, set up, then look after it."""
         await line.describe(self._build)
-        joining = asyncio.create_task(self._join_on_request(line))
+        beside = [self._beside(self._join_on_request(line)), self._beside(self._attend(line))]
         try:
             if not self._listen_only:
                 await line.set_up()
+                poller = Poller(line.link, line.bus.counters)
+                beside.append(self._beside(poller.run(lambda: line.adapter.polls, line.lost.is_set)))
             await self._check_data(line)
             while True:
                 if line.lost.is_set():
@@ -174,7 +180,21 @@ class Runner:
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
         finally:
-            joining.cancel()
+            for task in beside:
+                task.cancel()
+            await asyncio.gather(*beside, return_exceptions=True)
+
+    def _beside(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Start what goes on beside serving a bus; should it fail, the driver does."""
+
+        def look(done: asyncio.Task[None]) -> None:
+            if not done.cancelled() and done.exception() is not None:
+                self._failure = done.exception()
+                self._stopping.set()
+
+        task = asyncio.get_running_loop().create_task(work)
+        task.add_done_callback(look)
+        return task
 
     async def _check_data(self, line: BusLine) -> None:
         """Wait for the first data of every patch, and name those that send none."""
@@ -251,6 +271,10 @@ class Runner:
             log.info("new generation: %r", tables.structure)
         self.decoder = Decoder(self._layouts, tables)
         self._watch = adapter.watch(tables)
+        for line in self.lines:
+            for key in line.suspects:
+                if (line.ordinal, key) in tables.patch_key:
+                    self._watch.suspect(tables.patch_key[line.ordinal, key])
         self._batch = self._make_batch(self.decoder.headroom)
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
@@ -350,21 +374,68 @@ class Runner:
             return
         if now_ns() - max(line.opened_ns, self._begun_ns) < 2 * self._silence_ns:
             return  # nobody listened, the boards may send: to set them up again would move their baseline
-        for patch in [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]:
-            publisher, watch = self.publisher, self._watch
-            if publisher is None or watch is None:
-                return
+        silent = [*self._patches_in(line, PatchState.STALE), *self._patches_in(line, PatchState.EXPECTED)]
+        if now_ns() - line.revived_ns > 2 * self._silence_ns:  # set up anew, and no data came of it
+            silent += self._patches_in(line, PatchState.RESTARTED)
+        for patch in silent:
             try:
                 if not await line.adapter.probe(line.link, self._patch_of(line, patch)):
                     continue
                 log.warning("%s: %s is silent but answers: it has restarted", line.name, self._patch_name(patch))
-                publisher.patch_state[patch] = PatchState.RESTARTED
-                async with line.busy:
-                    await line.adapter.revive(line.link, self._patch_of(line, patch))
-                watch.forget(patch)
             except BusError as error:
                 log.debug("%s: %s", line.name, str(error))
-                publisher.patch_state[patch] = PatchState.STALE
+                continue
+            await self._revive(line, self._patch_of(line, patch))
+
+    async def _revive(self, line: BusLine, patch: Patch) -> None:
+        """Set one patch up anew."""
+        async with line.busy:
+            number = self._number_of(line, patch)
+            if self.publisher is None or self._watch is None or number is None:
+                return
+            self.publisher.lose(number, PatchState.RESTARTED)
+            try:
+                await line.adapter.revive(line.link, patch)
+            except BusError as error:
+                log.debug("%s: %s", line.name, str(error))
+                self.publisher.lose(number, PatchState.STALE)
+                return
+            line.revived_ns = now_ns()
+            line.suspects.discard(patch.key)
+            self._watch.forget(number)
+
+    async def _attend(self, line: BusLine) -> None:
+        """Hear what devices say of themselves."""
+        reviving: dict[int, asyncio.Task[None]] = {}
+
+        def tell(patch: Patch, notice: Notice) -> None:
+            number = self._number_of(line, patch)
+            if self.publisher is None or self._watch is None or number is None:
+                return
+            if notice is Notice.SUSPECT:
+                line.suspects.add(patch.key)
+                self._watch.suspect(number)
+            elif notice is Notice.SOUND:
+                line.suspects.discard(patch.key)
+                self._watch.forget(number)
+            elif notice is Notice.LOST or self._listen_only:
+                self.publisher.lose(number, PatchState.STALE)
+            elif patch.key not in reviving or reviving[patch.key].done():
+                log.warning("%s: %s has restarted", line.name, patch.name)
+                self.publisher.lose(number, PatchState.RESTARTED)
+                reviving[patch.key] = self._beside(self._revive(line, patch))
+
+        try:
+            while True:
+                try:
+                    await line.adapter.attend(line.link, tell)
+                    return
+                except BusError as error:
+                    log.debug("%s: %s", line.name, str(error))
+                await asyncio.sleep(self._silence_ns / NS_PER_S)
+        finally:
+            for task in reviving.values():
+                task.cancel()
 
     def _patches_in(self, line: BusLine, state: PatchState) -> list[int]:
         if self.publisher is None or self.decoder is None:
@@ -377,6 +448,10 @@ class Runner:
         if self.decoder is None or line.patches is None:
             raise LookupError("no structure yet")
         return line.patches[patch - _first_patch(self.decoder, line)]
+
+    def _number_of(self, line: BusLine, patch: Patch) -> int | None:
+        """Number of a patch in the present structure, None if it is not in it (any more)."""
+        return None if self.decoder is None else self.decoder.tables.patch_key.get((line.ordinal, patch.key))
 
     def _patch_name(self, patch: int) -> str:
         return bytes(self.decoder.tables.structure.patch_name[patch]).decode() if self.decoder else str(patch)

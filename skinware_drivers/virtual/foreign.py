@@ -10,20 +10,14 @@ from skinware_drivers.virtual import events
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.wire import Transmission, Transmitter
 
-_EXTENDED_FLAG = 0x8000_0000
-
 
 class ForeignTraffic:
     """Devices that send at random moments, ``rate_hz`` frames a second on average.
 
-    Motor boards (class 1), strain gauges (class 3, which is also the old class of skin data), a skin board that
-    nobody configured (class 4), inertial sensors (class 5), and 29-bit frames that end in the bits of a skin frame
-    (classes: icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h).
-
     Args:
-        boards: addresses of the emulated boards; no 11-bit frame comes from one of these.
+        identifiers: of their frames.
         rate_hz: more than 0.
-        seed: of the patch.
+        random: all chance comes from here.
         transmitter: place on the wire.
         log: takes the events.
         counts: totals, of which ``foreign`` is counted.
@@ -32,23 +26,18 @@ class ForeignTraffic:
 
     def __init__(
         self,
-        boards: Sequence[int],
+        identifiers: Sequence[int],
         rate_hz: float,
-        seed: int,
+        random: np.random.Generator,
         transmitter: Transmitter,
         log: EventLog,
         counts: dict[str, int],
         now_ns: int,
     ) -> None:
-        self._random = np.random.default_rng([seed, len(boards), 2])
+        self._random = random
         self._pause_ns = 1e9 / rate_hz
         self._transmitter, self._log, self._counts = transmitter, log, counts
-        others = [address for address in range(1, 15) if address not in boards]
-        self._identifiers = [
-            message_class << 8 | address << 4 | low
-            for message_class, low in ((1, 0), (1, 3), (3, 10), (3, 11), (4, 2), (5, 3))
-            for address in others
-        ] + [_EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in boards]
+        self._identifiers = identifiers
         self._next_ns = now_ns
         self._wait()
 

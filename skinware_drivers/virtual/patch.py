@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.virtual.boards import Board, BoardParts
 from skinware_drivers.virtual.faults import BoardFaults
 from skinware_drivers.virtual.foreign import ForeignTraffic
@@ -47,10 +48,23 @@ def make_boards(
 def make_foreign_traffic(
     options: RoboskinOptions, wire: Wire, log: EventLog, counts: dict[str, int], now_ns: int
 ) -> list[ForeignTraffic]:
-    """The other devices on the bus, where the options want any."""
+    """The other devices on the bus, where the options want any.
+
+    Motor boards (class 1), strain gauges (class 3, which is also the old class of skin data), a skin board that
+    nobody configured (class 4), inertial sensors (class 5), and 29-bit frames that end in the bits of a skin frame
+    (classes: icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h). No 11-bit frame comes from the address
+    of an emulated board.
+    """
     if not options.foreign_hz:
         return []
-    return [ForeignTraffic(options.boards, options.foreign_hz, options.seed, wire.attach(), log, counts, now_ns)]
+    identifiers = [
+        message_class << 8 | address << 4 | low
+        for message_class, low in ((1, 0), (1, 3), (3, 10), (3, 11), (4, 2), (5, 3))
+        for address in range(1, 15)
+        if address not in options.boards
+    ] + [EXTENDED_FLAG | 0x1234_0000 | 0x400 | address << 4 | 3 for address in options.boards]
+    random = np.random.default_rng([options.seed, len(options.boards), 2])
+    return [ForeignTraffic(identifiers, options.foreign_hz, random, wire.attach(), log, counts, now_ns)]
 
 
 __all__ = ["make_boards", "make_foreign_traffic"]

@@ -13,6 +13,8 @@ import msgspec
 
 from skinware import DriverFrame, DriverReader
 from skinware.errors import BusNotAvailable, BusSendError
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import Bus
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.runner import PublishMode, Runner
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -27,17 +29,15 @@ class Driving:
 
     def __init__(
         self,
-        buses: Sequence[VirtualCanBus],
-        options: dict[str, Any],
+        lines: Sequence[tuple[AnyAdapter, Bus]],
+        name: str,
         listen_only: bool,
-        driver: type[RoboskinDriver] = RoboskinDriver,
         publish: PublishMode | None = None,
     ) -> None:
-        self.buses = buses
         self.ready = threading.Event()
         self.failure: BaseException | None = None
-        lines = [(f"bus{i}", driver(RoboskinOptions(**options)), bus) for i, bus in enumerate(buses)]
-        self._lines = lines
+        self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]
+        self._name = name
         self._listen_only = listen_only
         self._publish = publish
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -48,9 +48,9 @@ class Driving:
         async def run() -> None:
             self._loop = asyncio.get_running_loop()
             self.runner = Runner(
-                "roboskin",
+                self._name,
                 self._lines,
-                name="roboskin",
+                name=self._name,
                 listen_only=self._listen_only,
                 publish=self._publish,
                 slots=64,
@@ -227,11 +227,28 @@ def driving(
     publish: PublishMode | None = None,
     **options: Any,
 ) -> Iterator[Driving]:
-    running = Driving(buses, options, listen_only, driver, publish)
+    lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
+    with driving_lines(lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish) as running:
+        yield running
+
+
+@contextmanager
+def driving_lines(
+    lines: Sequence[tuple[AnyAdapter, Bus]],
+    name: str,
+    *,
+    listen_only: bool = False,
+    wait: bool = True,
+    publish: PublishMode | None = None,
+) -> Iterator[Driving]:
+    """Any driver on any buses."""
+    running = Driving(lines, name, listen_only, publish)
     running.start()
     try:
         if wait:
             assert running.ready.wait(30)
+            if running.failure is not None:
+                raise running.failure
         yield running
     finally:
         running.stop()

@@ -49,7 +49,7 @@ def decode(
     return decoder
 
 
-def one(values: Values | Expand, length: int = 8, **more: Any) -> Layout:
+def one(values: Values | Sequence[Values] | Expand, length: int = 8, **more: Any) -> Layout:
     return Layout([Frame("data", [Identifier(0x100)], (length,), values, **more)])
 
 
@@ -120,6 +120,48 @@ def test_values_at_their_extremes(dtype: str | Packed, payload: str, expected: l
     assert decoder.state.values.tolist() == expected
 
 
+@pytest.mark.parametrize(
+    ("packed", "payload", "expected"),
+    [
+        (Packed(12, skip=4), "3abc123def456789", [0xABC, 0x123, 0xDEF, 0x456, 0x789]),
+        (Packed(3, order="little", skip=2), "a4d1000000000000", [1, 5, 1, 2, 3]),
+    ],
+)
+def test_values_that_begin_within_a_byte(packed: Packed, payload: str, expected: list[int]) -> None:
+    decoder = decode(one(Values(0, packed, 5)), [Module(taxels(5))], "<u2", [(0x100, bytes.fromhex(payload))])
+    assert decoder.state.values.tolist() == expected
+
+
+def test_several_runs_of_values_in_one_frame() -> None:
+    runs = (Values(0, "<i2", 2, to=(3, None)), Values(4, "u1", 2, to=(0, 1)), Values(6, ">u2", 1, to=(2,)))
+    layout = Layout([Frame("data", [Identifier(0x100)], (8,), runs)])
+    frame = bytes.fromhex("feff 0900 07 08 0102".replace(" ", ""))
+    decoder = decode(layout, [Module(taxels(4))], "<i4", [(0x100, frame)])
+    assert decoder.state.values.tolist() == [7, 8, 0x102, -2]
+    assert decoder.state.status.tolist() == [0] * 4
+
+
+def test_frames_of_one_patch_and_one_module_alone() -> None:
+    layout = Layout(
+        [
+            Frame(f"{patch} {module}", [Identifier(identifier)], (1,), Values(0, "u1", 1), patch=patch, module=module)
+            for identifier, patch, module in ((0x181, 1, 5), (0x345, 1, 6), (0x7FF, 2, 5))
+        ]
+    )
+    patches = [
+        Patch("first", [Module(taxels(1, first_uid=key), key=key) for key in (5, 6)], key=1),
+        Patch("second", [Module(taxels(1, first_uid=7), key=5)], key=2),
+    ]
+    decoder = Decoder([layout], assemble([("bus", patches)], TYPES, "u1"))
+    batch = FrameBatch(8, 8, decoder.headroom)
+    for identifier, value in ((0x345, 20), (0x7FF, 30), (0x181, 10), (0x182, 99)):
+        batch.append(0, 1, identifier, bytes([value]))
+    updates, foreign = decoder.decode(batch)
+    decoder.state.show(updates)
+    assert decoder.state.values.tolist() == [10, 20, 30]
+    assert foreign.tolist() == [3]
+
+
 def test_dropped_values_go_nowhere() -> None:
     layout = one(Values(0, "u1", 8, to=(0, None, 1, None, 2, None, 3, None)))
     decoder = decode(layout, [Module(taxels(4))], "u1", [(0x100, bytes(range(1, 9)))])
@@ -133,6 +175,22 @@ def test_a_module_named_in_the_payload() -> None:
     decoder = decode(layout, modules, "u1", frames)
     assert decoder.state.values.tolist() == [0, 0, 0, 0, 5, 6, 7, 8]
     assert decoder.state.bus_counters[0, 0] == 1
+
+
+@pytest.mark.parametrize(
+    ("layout", "frame", "counted"),
+    [
+        (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(4)), (1, 0, 0)),
+        (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(3)), (1, 0, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(4)), (1, 0, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(3)), (1, 1, 0)),
+    ],
+)
+def test_frames_of_unknown_modules_are_unknown_whatever_their_length(
+    layout: Layout, frame: tuple[int, bytes], counted: tuple[int, int, int]
+) -> None:
+    decoder = decode(layout, [Module(taxels(1), key=7)], "u1", [frame])
+    assert tuple(decoder.state.bus_counters[0].tolist()) == counted
 
 
 def test_sentinels_and_flags() -> None:
@@ -190,6 +248,10 @@ def test_expand_is_the_escape() -> None:
     [
         (lambda: one(Values(6, "<u2", 2)), "values end at byte 10"),
         (lambda: one(Values(0, "u1", 2, to=(0,))), "`to` names 1 channels"),
+        (lambda: one(()), "it has no values"),
+        (lambda: one((Values(0, "u1", 1), Values(7, "<u2", 1))), "values end at byte 9"),
+        (lambda: one(Values(0, Packed(12, skip=8), 1)), "8 bits before the first value"),
+        (lambda: one(Values(0, Packed(12, skip=5), 5)), "values end at byte 9"),
         (lambda: Layout([]), "1 to 200 frames"),
         (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),

@@ -1,0 +1,200 @@
+"""What devices say of themselves beside their data: restarted, lost, suspect, sound."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader, PatchState, Status
+from skinware.errors import HandshakeTimeout
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.adapter import NoOptions, Notice
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.hardware import WireFrame
+from tests.conftest import wait_until
+from tests.sdk.driving import Driving, driving_lines, read_until
+
+MS = 1_000_000
+
+
+class Speaking(CanAdapter[NoOptions]):
+    """Two patches of which each says with a byte what it has to say."""
+
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint8
+    patches = (Patch("one", [Module(taxels(2))], key=1), Patch("two", [Module(taxels(2, first_uid=2))], key=2))
+    layout = Layout([Frame("data", [Identifier(0x180, mask=0x7F0)], (2,), Values(0, "u1", 2), patch=Bits(0, 4))])
+
+    def __init__(self, options: NoOptions) -> None:
+        super().__init__(options)
+        self.revived: list[str] = []
+        self.failures = 0
+
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        with link.follow(Match(0x700, mask=0x7F0), Match(0x600, mask=0x7F0)) as heard:
+            while True:
+                frame = await heard.get()
+                tell(self.patches[(frame.identifier & 0xF) - 1], list(Notice)[frame.payload[0]])
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        return True
+
+    async def revive(self, link: Link, patch: Patch) -> None:
+        self.revived.append(patch.name)
+        if self.failures:
+            self.failures -= 1
+            raise HandshakeTimeout("no answer")
+        await link.send(0x200 | patch.key, b"\x00")
+
+
+class Devices:
+    """Send data every 20 ms, unless they were told to be mute until somebody sets them up."""
+
+    def __init__(self) -> None:
+        self.mute: set[int] = set()
+        self.says: list[tuple[int, bytes]] = []
+        self._due_ns = 0
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        self.mute.discard(identifier & 0xF)
+
+    def next_due_ns(self) -> int | None:
+        return self._due_ns
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        if now_ns < self._due_ns:
+            return []
+        self._due_ns = now_ns + 20 * MS
+        data = [(0x180 | key, bytes((key, key))) for key in (1, 2) if key not in self.mute]
+        frames, self.says = [*self.says, *data], []
+        return [WireFrame(now_ns, *frame) for frame in frames]
+
+    def skip(self, now_ns: int) -> int:
+        return len(self.emit(now_ns))
+
+    def totals(self) -> dict[str, int]:
+        return {}
+
+
+class Stage:
+    """The two patches, being driven."""
+
+    def __init__(self, running: Driving, devices: Devices, adapter: Speaking) -> None:
+        self._running, self._devices, self.adapter = running, devices, adapter
+
+    def say(self, key: int, notice: Notice, *, mute: bool = False) -> None:
+        def act() -> None:
+            self._devices.says.append((0x700 | key, bytes([list(Notice).index(notice)])))
+            if mute:
+                self._devices.mute.add(key)
+
+        self._running.do(act)
+
+
+@pytest.fixture
+def devices() -> Devices:
+    return Devices()
+
+
+def states(*expected: PatchState) -> Callable[..., bool]:
+    return lambda frame: frame.patch_state.tolist() == list(expected)
+
+
+def statuses(one: Sequence[int], two: Sequence[int]) -> Callable[..., bool]:
+    return lambda frame: frame.status.tolist() == [*one, *two]
+
+
+LIVE, STALE = PatchState.LIVE, PatchState.STALE
+SUSPECT = [int(Status.SUSPECT)] * 2
+GOOD = [0, 0]
+
+
+def test_a_patch_that_restarted_is_set_up_at_once_and_alone(devices: Devices, caplog: pytest.LogCaptureFixture) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with caplog.at_level(logging.WARNING), driving_lines([(adapter, bus)], "speaking") as running:
+        with DriverReader("speaking") as reader:
+            stage = Stage(running, devices, adapter)
+            read_until(reader, statuses(GOOD, GOOD))
+            stage.say(2, Notice.RESTARTED, mute=True)
+            wait_until(lambda: adapter.revived == ["two"])
+            read_until(reader, states(LIVE, LIVE))
+            assert adapter.revived == ["two"]
+    assert caplog.text.count("bus0: two has restarted") == 1
+
+
+def test_a_set_up_that_fails_is_tried_again_for_ever(devices: Devices) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    adapter.failures = 2
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        read_until(reader, statuses(GOOD, GOOD))
+        Stage(running, devices, adapter).say(1, Notice.RESTARTED, mute=True)
+        wait_until(lambda: len(adapter.revived) == 3)
+        read_until(reader, states(LIVE, LIVE))
+
+
+def test_a_lost_patch_is_stale_until_its_next_data(devices: Devices) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices, listen_only=True)
+    with driving_lines([(adapter, bus)], "speaking", listen_only=True) as running:
+        with DriverReader("speaking") as reader:
+            stage = Stage(running, devices, adapter)
+            read_until(reader, states(LIVE, LIVE))
+            stage.say(1, Notice.LOST, mute=True)
+            read_until(reader, states(STALE, LIVE))
+            running.do(devices.mute.clear)
+            read_until(reader, states(LIVE, LIVE))
+    assert adapter.revived == []
+
+
+def test_errors_make_values_suspect_until_they_are_over_or_the_patch_was_set_up(devices: Devices) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        stage = Stage(running, devices, adapter)
+        read_until(reader, statuses(GOOD, GOOD))
+        stage.say(1, Notice.SUSPECT)
+        stage.say(2, Notice.SUSPECT)
+        read_until(reader, statuses(SUSPECT, SUSPECT))
+        stage.say(1, Notice.SOUND)
+        read_until(reader, statuses(GOOD, SUSPECT))
+        stage.say(2, Notice.RESTARTED, mute=True)
+        read_until(reader, statuses(GOOD, GOOD))
+        assert adapter.revived == ["two"]
+
+
+def test_what_is_told_of_oneself_is_no_unknown_frame(devices: Devices) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        Stage(running, devices, adapter).say(1, Notice.SUSPECT)
+        read_until(reader, statuses(SUSPECT, GOOD))
+        assert running.status()["buses"][0]["unknown"] == 0
+
+
+def test_a_patch_that_restarts_again_while_it_is_set_up_is_found(devices: Devices) -> None:
+    class Hasty(Speaking):
+        async def revive(self, link: Link, patch: Patch) -> None:
+            await super().revive(link, patch)
+            if len(self.revived) == 1:
+                devices.mute.add(patch.key)  # it loses its configuration again, without a word
+
+    adapter, bus = Hasty(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        read_until(reader, statuses(GOOD, GOOD))
+        Stage(running, devices, adapter).say(1, Notice.RESTARTED, mute=True)
+        wait_until(lambda: len(adapter.revived) == 2)
+        read_until(reader, states(LIVE, LIVE))
+
+
+def test_an_adapter_that_fails_while_it_attends_ends_the_driver(devices: Devices) -> None:
+    class Broken(Speaking):
+        async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+            raise ZeroDivisionError("a bug")
+
+    lines = [(Broken(NoOptions()), VirtualCanBus.with_hardware(devices))]
+    with pytest.raises(ZeroDivisionError, match="a bug"), driving_lines(lines, "speaking", wait=False) as running:
+        wait_until(lambda: running.failure is not None)

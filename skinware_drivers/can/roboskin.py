@@ -61,6 +61,8 @@ _DISCOVERY_S = 0.3
 _REPLY_S = 0.2
 _AFTER_CONFIGURATION_S = 0.5
 _BETWEEN_SPECIALS_S = 0.01
+_OLD_CALIBRATION_PERIODS = 4
+"""For so long an MTB3 that was set up the old way sends nothing, at the most."""
 _RECALIBRATION_CYCLES = 5
 """A board re-calibrates all its triangles after this many cycles with a channel that does not acknowledge though it
 is connected (embot_app_application_theSkin.cpp)."""
@@ -184,7 +186,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
 
     async def revive(self, link: Link, patch: Patch) -> None:
         """Set up and start one board (command 50 re-baselines every triangle that it reaches)."""
-        if not is_inertial(patch):
+        if not is_inertial(patch) and not self.options.old_style:
             await self._configure(link, (board_of(patch),), inertial=False)
         await self._switch(link, patch, True)
 
@@ -247,7 +249,9 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         for number in range(2):
             for set_up in set_ups:
                 await _send(link, set_up.board, set_up.first[number : number + 1])
-        if not self.options.old_style:
+        if self.options.old_style:
+            await link.sleep(_OLD_CALIBRATION_PERIODS * self.period_s)
+        else:
             await link.sleep(_AFTER_CONFIGURATION_S)
             if any(set_up.special_board for set_up in set_ups):
                 for set_up in set_ups:
@@ -267,7 +271,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
             await _send(link, set_up.board, set_up.inertial_set_up() if on else ())
             await _send(link, set_up.board, set_up.inertial_start() if on else set_up.inertial_stop())
         elif on and self.options.old_style:
-            await _send(link, set_up.board, set_up.first)
+            await self._configure(link, [set_up.board], inertial=False)
         else:
             await _send(link, set_up.board, [START if on else STOP])
 

@@ -104,7 +104,8 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
     data = payload[:, run.offset : run.end]
     if isinstance(run.dtype, Packed):
         return _unpack(data, run.count, run.dtype)
-    return np.ascontiguousarray(data).view(run.dtype)
+    dtype = np.dtype(run.dtype)
+    return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
 
 
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, npt.NDArray[np.uint32]]:

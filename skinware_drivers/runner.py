@@ -292,7 +292,7 @@ class Runner:
     def _after_operation(self, line: BusLine, patches: Sequence[Patch], set_up: bool) -> None:
         if self.decoder is None or self._watch is None or line.patches is None:
             return
-        if self._period_s != self._built_period_s:  # which layout and publisher depend on
+        if self._period_s != self._built_period_s or self._layouts != self.decoder.layouts:
             self._go_over_to(self.decoder.tables)
         elif set_up:
             first = _first_patch(self.decoder, line)

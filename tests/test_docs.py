@@ -17,6 +17,8 @@ from tests.commands import PATIENCE_S, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+ELSEWHERE = ("c-and-cpp",)
+"""Pages whose snippets other tests run."""
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 
 
@@ -47,9 +49,11 @@ def execute(page: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("page", ["services", "skin"])
-def test_a_how_to_runs_from_its_first_snippet_to_its_last(page: str) -> None:
-    done = execute(ROOT / f"docs/how-to/{page}.md")
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES[1:] if blocks(page) and page.stem not in ELSEWHERE], ids=lambda page: page.stem
+)
+def test_a_page_runs_from_its_first_snippet_to_its_last(page: Path) -> None:
+    done = execute(page)
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
 
 

@@ -80,7 +80,7 @@ class Frame:
 
     @property
     def position(self) -> tuple[int, int]:
-        """(generation, sequence): what ``newer_than`` takes."""
+        """Generation and sequence, as ``newer_than`` takes them."""
         return self.generation, self.sequence
 
     @property

@@ -119,7 +119,8 @@ class ServiceReader(Attachment[F]):
             ServiceTimeout: nothing was published yet.
             Overrun, Closed: as ``read``.
         """
-        yield self._newest_now(self._ring.view, self._keep_up())
+        alive = self._keep_up()  # which may replace the ring
+        yield self._newest_now(self._ring.view, alive)
 
     def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
         """Newest frames, for ever.

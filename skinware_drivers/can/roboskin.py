@@ -1,130 +1,73 @@
-"""ROBOSKIN / iCub skin: MTB3 and MTB4 boards on CAN, sixteen modules of twelve channels each.
+"""ROBOSKIN / iCub skin: MTB3 and MTB4 boards on CAN, sixteen modules of twelve channels each, and inertial sensors.
 
-Wire format: robotology/icub-firmware embot_prot_can_skin_periodic.{h,cpp} and embot_app_application_theSkin.cpp;
-robotology/icub-main CanBusSkin.cpp and SkinDiagnostics.h; robotology/icub-firmware-shared iCubCanProto_classes.h.
-
-Data: class 4, identifier ``0x400 | board << 4 | triangle``, two frames a period. HEAD: ``40``, channels 0 to 6. TAIL:
-``C0``, channels 7 to 11, two bytes of diagnostics (big-endian; bit 4 + k: channel k out of range, bit 0: a channel
-did not acknowledge, bit 1: not connected; MTB3 sets one of the two, MTB4 may set both; old firmware sends none).
-Values: uint8, lower = more pressure.
+What frames mean is in ``roboskin_layout``, what boards are told in ``roboskin_setup``, what a user can say in
+``roboskin_options``. Further sources: robotology/icub-main CanBusSkin.cpp; robotology/icub-firmware
+embot_app_application_theSkin.cpp.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE, TEMPERATURE
+from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.description import Module, Patch, Sensor, SkinTables
-from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Values
+from skinware_drivers.can.roboskin_layout import (
+    HEAD_BYTE,
+    INERTIAL,
+    OLD_SKIN,
+    SKIN,
+    SKIN_TYPES,
+    TAIL_BYTE,
+    board_of,
+    inertial_patch,
+    is_inertial,
+    make_layout,
+    make_types,
+    skin_patch,
+    triangle_module,
+)
+from skinware_drivers.can.roboskin_options import (
+    FIRST_BOARD,
+    LAST_BOARD,
+    NON_TACTILE,
+    TRIANGLE_SKIN_TYPES,
+    TRIANGLES,
+    Kind,
+    RoboskinOptions,
+    SpecialBoards,
+    runs_text,
+)
+from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp
+from skinware_drivers.description import Module, Patch, SkinTables
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.skin_state import Updates
 
-FIRST_BOARD, LAST_BOARD = 1, 14
-TRIANGLES = 16
-CHANNELS = 12
-_NON_TACTILE = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
-_TRIANGLE_SKIN_TYPES = (0, 2, 8)
+log = logging.getLogger("skinware.driver")
 
 _DISCOVERY_S = 0.3
 _REPLY_S = 0.2
 _AFTER_CONFIGURATION_S = 0.5
+_BETWEEN_SPECIALS_S = 0.01
+_OLD_CALIBRATION_PERIODS = 4
+"""For so long an MTB3 that was set up the old way sends nothing, at the most."""
 _RECALIBRATION_CYCLES = 5
 """A board re-calibrates all its triangles after this many cycles with a channel that does not acknowledge though it
 is connected (embot_app_application_theSkin.cpp)."""
-
-_BOARD = Bits(shift=4, width=4)
-_MODULE = Bits(shift=0, width=4)
-HEAD = Frame(
-    "head",
-    when=(Identifier(0x400, mask=0x700), Byte(0, 0x40)),
-    length=(8,),
-    patch=_BOARD,
-    module=_MODULE,
-    values=Values(offset=1, dtype="u1", count=7, to=range(7)),
-)
-TAIL = Frame(
-    "tail",
-    when=(Identifier(0x400, mask=0x700), Byte(0, 0xC0)),
-    length=(6, 8),
-    patch=_BOARD,
-    module=_MODULE,
-    values=Values(offset=1, dtype="u1", count=5, to=range(7, 12)),
-    flags=(
-        Flag(Status.OUT_OF_RANGE, offset=6, dtype=">u2", each=[(k, 4 + k) for k in range(CHANNELS)]),
-        Flag(Status.NO_ACK, offset=6, dtype=">u2", mask=0x1),
-        Flag(Status.NOT_CONNECTED, offset=6, dtype=">u2", mask=0x2),
-    ),
-)
-
-
-class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a range of triangles of a board is.
-
-    Attributes:
-        board: address.
-        triangles: which of its triangles.
-        kind: ``triangle``, ``fingertip`` or ``palm``.
-        thermal: channels that are not tactile, if others than the kind's own.
-        enabled: False: switched off in the board.
-        shift: resolution of the board's arithmetic (SET_TRIANG_CFG).
-        cdc_offset: offset register of the capacitance converter (SET_TRIANG_CFG).
-    """
-
-    board: int
-    triangles: tuple[int, ...]
-    kind: str = "triangle"
-    thermal: tuple[int, ...] | None = None
-    enabled: bool = True
-    shift: int | None = None
-    cdc_offset: int | None = None
-
-
-class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver, for every board of a bus."""
-
-    boards: Annotated[
-        tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: whoever answers")
-    ] = ()
-    period_ms: Annotated[int, msgspec.Meta(description="time between two updates, 1-255 ms", ge=1, le=255)] = 50
-    skin_type: Annotated[
-        int, msgspec.Meta(description="type of skin that the boards are told: 0, 1, 2, 3, 7 or 8", ge=0, le=15)
-    ] = 0
-    no_load: Annotated[int, msgspec.Meta(description="value of an idle taxel", ge=0, le=255)] = 0xF0
-    shift: Annotated[int, msgspec.Meta(description="resolution shift of the boards", ge=0, le=255)] = 2
-    cdc_offset: Annotated[int, msgspec.Meta(description="converter offset register", ge=0, le=0xFFFF)] = 0x2200
-    kind: Annotated[
-        str, msgspec.Meta(description="what all modules are: triangle, fingertip or palm; default: by skin type")
-    ] = ""
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns what is there, s", gt=0)] = 1.0
-    modules: Annotated[
-        tuple[Kind, ...], msgspec.Meta(description="ranges of triangles that differ (configuration file only)")
-    ] = ()
-
-    def __post_init__(self) -> None:
-        for board in (*self.boards, *(m.board for m in self.modules)):
-            if not FIRST_BOARD <= board <= LAST_BOARD:
-                raise ConfigurationError(
-                    f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
-                )
-        if len(set(self.boards)) < len(self.boards):
-            raise ConfigurationError(f"boards {self.boards}: one address is there twice")
-        for kind in (self.kind, *(m.kind for m in self.modules)):
-            if kind and kind not in _NON_TACTILE:
-                raise ConfigurationError(f"kind {kind!r}: choose one of {', '.join(_NON_TACTILE)}")
-        for module in self.modules:
-            if any(not 0 <= t < TRIANGLES for t in module.triangles):
-                raise ConfigurationError(f"board {module.board}: triangles {module.triangles} are not all 0 to 15")
+_MTB3_TYPE = 5
+"""Board type in the answers of an MTB3; others with skin are 11 (mtb4), 16 (mtb4w) and 20 (mtb4c)."""
 
 
 class BaselineWatch(Watch):
@@ -157,28 +100,35 @@ class BaselineWatch(Watch):
 
 
 class RoboskinDriver(CanAdapter[RoboskinOptions]):
-    """MTB3 and MTB4 boards. See this module's docstring for the wire, and ``RoboskinOptions`` for the options.
+    """MTB3 and MTB4 boards. See this package's ``roboskin_layout`` for the wire, and ``RoboskinOptions``.
 
     Sensor uid = board << 16 | triangle << 8 | channel. Non-tactile channels (thermal pads) are of type temperature.
+    Triangles that the configuration leaves switched off are not part of the structure.
     """
 
     Options: ClassVar[type[msgspec.Struct]] = RoboskinOptions
-    types = (
-        PRESSURE.measured(unit="counts", scale=-1.0, offset=255.0, minimum=0.0, maximum=255.0),
-        TEMPERATURE.measured(unit="counts", minimum=0.0, maximum=255.0),
-    )
-    dtype = np.uint8
+    types: Sequence[SensorType] = SKIN_TYPES
+    dtype: npt.DTypeLike = np.uint8
 
     def __init__(self, options: RoboskinOptions) -> None:
         super().__init__(options)
         self._boards: tuple[int, ...] = options.boards
-        self._disabled: set[int] = set()
+        self._board_type: dict[int, int] = {}
+        self._disabled: set[int] = set()  # patch keys
+        self.types = make_types(options)
+        if options.all_inertial:
+            self.dtype = np.int16
         self.layout = self._layout()
+        if options.boards and not any(self.patches_set_up(options.boards)):
+            raise ConfigurationError(
+                f"boards {', '.join(map(str, options.boards))}: the configuration leaves all triangles switched off"
+            )
 
     @property
     def period_s(self) -> float:
-        """The boards' period."""
-        return self.options.period_ms / 1e3
+        """The longest period of all boards."""
+        periods = [set_up.period_ms for set_up in self._set_ups(self._boards or range(FIRST_BOARD, LAST_BOARD + 1))]
+        return max(*periods, self.options.inertial_period_ms if self.options.all_inertial else 0) / 1e3
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """The boards that were named, or else those that answer; a listener learns them from their data.
@@ -192,9 +142,12 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         else:
             answers = await link.collect(0x70F, b"\xff", Match(0x700, 0x70F, b"\xff"), duration_s=_DISCOVERY_S)
             # five bytes: the application answers; four: the boot loader, which has no skin
-            found = {a.identifier >> 4 & 0xF for a in answers if len(a.payload) >= 5}
-            self._boards = tuple(sorted(found & set(range(FIRST_BOARD, LAST_BOARD + 1))))
-        return [self._patch(board, range(TRIANGLES)) for board in sorted(self._boards)]
+            found = {a.identifier >> 4 & 0xF: a.payload[1] for a in answers if len(a.payload) >= 5}
+            self._boards = tuple(board for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in found)
+            self._board_type = {board: found[board] for board in self._boards}
+        self._tell_what_is_odd(link)
+        self.layout = self._layout()
+        return self.patches_set_up(self._boards)
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
         """A listener adds what it hears now; a driver that sends must be started again to find new boards."""
@@ -207,35 +160,45 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         await self._configure(link, self._boards)
 
     async def start(self, link: Link) -> None:
-        """SET_TXMODE 00 to every board: start (the polarity is as odd as it looks)."""
-        for board in self._boards:
-            await link.send(0x200 | board, b"\x07\x00")
+        """Make every board send (set up the old way, boards do so by themselves)."""
+        if not self.options.old_style:
+            for board in self._boards:
+                await link.send(0x200 | board, START)
+        for set_up in self._set_ups(self._boards):
+            await _send(link, set_up.board, set_up.inertial_start())
 
     async def stop(self, link: Link) -> None:
-        """SET_TXMODE 01 to every board: stop."""
+        """Make every board silent."""
         for board in self._boards:
-            await link.send(0x200 | board, b"\x07\x01")
+            await link.send(0x200 | board, STOP)
+        for set_up in self._set_ups(self._boards):
+            await _send(link, set_up.board, set_up.inertial_stop())
 
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask for the version by unicast: a silent board that answers has restarted, if it should not be silent."""
         if patch.key in self._disabled:
             return False
         try:
-            await self._version(link, patch.key)
+            await self._version(link, board_of(patch))
         except HandshakeTimeout:
             return False
         return True
 
     async def revive(self, link: Link, patch: Patch) -> None:
         """Set up and start one board (command 50 re-baselines every triangle that it reaches)."""
-        await self._configure(link, (patch.key,))
-        await link.send(0x200 | patch.key, b"\x07\x00")
+        if not is_inertial(patch) and not self.options.old_style:
+            await self._configure(link, (board_of(patch),), inertial=False)
+        await self._switch(link, patch, True)
 
     @operation(sets_up=True)
     async def rebaseline(self, link: Link, patches: Sequence[Patch]) -> None:
         """Make the boards take the present load as no load; nobody may touch the skin for about a second."""
-        await self._configure(link, [patch.key for patch in patches])
-        await self.enable(link, [patch for patch in patches if patch.key not in self._disabled])
+        skin = [patch for patch in patches if not is_inertial(patch)]
+        await self._configure(link, [board_of(patch) for patch in skin], inertial=False)
+        for patch in skin:
+            is_on = patch.key not in self._disabled
+            if is_on != self.options.old_style:  # the old set-up starts a board, the new one leaves it silent
+                await self._switch(link, patch, is_on)
 
     @operation(sets_up=True)
     async def rate(self, link: Link, patches: Sequence[Patch], hz: float) -> float:
@@ -243,9 +206,16 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         period_ms = round(1e3 / hz) if hz > 0 else 0
         if not 1 <= period_ms <= 255:
             raise ConfigurationError(f"{hz:g} Hz: boards send every 1 to 255 ms, so give 3.93 to 1000 Hz")
-        if len(patches) < len(self._boards):
+        if {p.key for p in patches} != {p.key for p in self.patches_set_up(self._boards)}:
             raise ConfigurationError("all boards of a bus have one rate: do not name a patch")
-        self.options = msgspec.structs.replace(self.options, period_ms=period_ms)
+        fixed = [board for board in self._boards if self.options.old_style and self._is_mtb4(board)]
+        if fixed:
+            raise ConfigurationError(f"board {fixed[0]} is an MTB4: set up the old way, it sends every 40 ms")
+        special = tuple(
+            s if s.period_ms is None else msgspec.structs.replace(s, period_ms=period_ms)
+            for s in self.options.special_boards
+        )
+        self.options = msgspec.structs.replace(self.options, period_ms=period_ms, special_boards=special)
         self.layout = self._layout()
         await self.rebaseline(link, patches)
         return 1e3 / period_ms
@@ -254,7 +224,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
     async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:
         """Make boards send (on=true) or be silent (on=false)."""
         for patch in patches:
-            await link.send(0x200 | patch.key, b"\x07\x00" if on else b"\x07\x01")
+            await self._switch(link, patch, on)
             (self._disabled.discard if on else self._disabled.add)(patch.key)
 
     @classmethod
@@ -262,28 +232,48 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         """Marks silent re-calibration."""
         return BaselineWatch(tables)
 
-    def _layout(self) -> Layout:
-        """A tail belongs to the very frame before it from the same board, within half a period, or to none."""
-        pair = Cycle(("head", "tail"), within="patch", maximum_age_s=self.period_s / 2)
-        return Layout(frames=(HEAD, TAIL), cycle=pair)
+    # What boards are told
 
-    async def _configure(self, link: Link, boards: Iterable[int]) -> None:
-        options = self.options
-        boards = tuple(boards)
-        for board in boards:
-            head = bytes((0x4D, options.skin_type & 0x0F, options.period_ms, options.no_load))
-            await link.send(0x200 | board, head)
-        for board in boards:
-            await link.send(0x200 | board, _triangles(0, TRIANGLES - 1, options.shift, True, options.cdc_offset))
-        await link.sleep(_AFTER_CONFIGURATION_S)
-        for module in options.modules:
-            if module.board not in boards:
-                continue
-            shift = options.shift if module.shift is None else module.shift
-            offset = options.cdc_offset if module.cdc_offset is None else module.cdc_offset
-            for first, last in _runs(module.triangles):
-                await link.send(0x200 | module.board, _triangles(first, last, shift, module.enabled, offset))
-        await link.sleep(0.01)
+    def _set_ups(self, boards: Iterable[int]) -> list[BoardSetUp]:
+        return [BoardSetUp(self.options, board, is_mtb4=self._is_mtb4(board)) for board in boards]
+
+    def _is_mtb4(self, board: int) -> bool:
+        return self._board_type.get(board, _MTB3_TYPE if self.options.old_style else 0) != _MTB3_TYPE
+
+    def _layout(self) -> Layout:
+        boards = self._boards or range(FIRST_BOARD, LAST_BOARD + 1)
+        return make_layout(self.options, min(set_up.period_ms for set_up in self._set_ups(boards)) / 1e3)
+
+    async def _configure(self, link: Link, boards: Iterable[int], *, inertial: bool = True) -> None:
+        set_ups = self._set_ups(boards)
+        for number in range(2):
+            for set_up in set_ups:
+                await _send(link, set_up.board, set_up.first[number : number + 1])
+        if self.options.old_style:
+            await link.sleep(_OLD_CALIBRATION_PERIODS * self.period_s)
+        else:
+            await link.sleep(_AFTER_CONFIGURATION_S)
+            if any(set_up.special_board for set_up in set_ups):
+                for set_up in set_ups:
+                    await _send(link, set_up.board, set_up.special_board)
+                await link.sleep(_BETWEEN_SPECIALS_S)
+            for set_up in set_ups:
+                await _send(link, set_up.board, set_up.special_triangles)
+            await link.sleep(_BETWEEN_SPECIALS_S)
+        if inertial:
+            for set_up in set_ups:
+                await _send(link, set_up.board, set_up.inertial_set_up())
+
+    async def _switch(self, link: Link, patch: Patch, on: bool) -> None:
+        """Make the sensors of one patch send or be silent."""
+        (set_up,) = self._set_ups([board_of(patch)])
+        if is_inertial(patch):
+            await _send(link, set_up.board, set_up.inertial_set_up() if on else ())
+            await _send(link, set_up.board, set_up.inertial_start() if on else set_up.inertial_stop())
+        elif on and self.options.old_style:
+            await self._configure(link, [set_up.board], inertial=False)
+        else:
+            await _send(link, set_up.board, [START if on else STOP])
 
     async def _name_missing(self, link: Link) -> None:
         answers = await asyncio.gather(*(self._version(link, board) for board in self._boards), return_exceptions=True)
@@ -293,6 +283,8 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
                 missing.append(board)
             elif isinstance(answer, BaseException):
                 raise answer
+            elif len(answer) > 1:
+                self._board_type[board] = answer[1]
         if len(missing) == len(self._boards):
             raise HandshakeTimeout(f"none of the boards {', '.join(map(str, self._boards))} answers")
 
@@ -301,47 +293,86 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         reply = Match(0x200 | board << 4, 0x7FF, b"\x1c")
         return (await link.request(0x200 | board, b"\x1c\x02\x00", reply, timeout_s=_REPLY_S)).payload
 
+    def _tell_what_is_odd(self, link: Link) -> None:
+        """Name the triangles that stay off, and boards that are not what the options say."""
+        for set_up in self._set_ups(self._boards):
+            where = f"{link.bus_name}: board {set_up.board}"
+            off = set(range(TRIANGLES)) - set_up.enabled
+            if set_up.wiped:
+                log.warning(
+                    "%s: triangles %s are off: its special configuration switched them off,"
+                    " and nothing switches them on again",
+                    where,
+                    runs_text(set_up.wiped),
+                )
+            if off - set_up.wiped:
+                log.info("%s: triangles %s are off, as configured", where, runs_text(off - set_up.wiped))
+            known = self._board_type.get(set_up.board)
+            kind = "mtb3" if known == _MTB3_TYPE else "mtb4"
+            if set_up.inertial and known is not None and kind != self.options.inertial_scale:
+                log.warning(
+                    "%s: is an %s, but its inertial data is scaled as that of an %s: set inertial_scale",
+                    where,
+                    kind.upper(),
+                    self.options.inertial_scale.upper(),
+                )
+
+    # What there is
+
+    def patches_set_up(self, boards: Iterable[int]) -> list[Patch]:
+        """What boards send once they were set up."""
+        patches = []
+        for set_up in self._set_ups(sorted(boards)):
+            is_old = self.options.old_style and not self._is_mtb4(set_up.board)
+            if set_up.enabled:
+                patches.append(self._patch(set_up, sorted(set_up.enabled), OLD_SKIN if is_old else SKIN))
+            if set_up.inertial:
+                patches.append(inertial_patch(set_up.board, set_up.inertial))
+        return patches
+
     def _patches_heard(self, heard: Counter[Heard], known: Sequence[Patch]) -> list[Patch]:
-        triangles: dict[int, set[int]] = {p.key: {m.key for m in p.modules} for p in known}
+        skin: dict[tuple[int, int], set[int]] = {
+            (board_of(p), p.key >> 4): {m.key for m in p.modules} for p in known if not is_inertial(p)
+        }
+        inertial = {board_of(p) for p in known if is_inertial(p)}
+        classes = (OLD_SKIN, SKIN) if self.options.old_style else (SKIN,)
         for frame in heard:
-            if frame.identifier & ~0xFF == 0x400 and frame.first_byte in (0x40, 0xC0) and frame.length in (6, 8):
-                triangles.setdefault(frame.identifier >> 4 & 0xF, set()).add(frame.identifier & 0xF)
-        boards = sorted(board for board in triangles if FIRST_BOARD <= board <= LAST_BOARD)
-        return [self._patch(board, sorted(triangles[board])) for board in boards]
+            message_class, board = frame.identifier >> 8, frame.identifier >> 4 & 0xF
+            if not FIRST_BOARD <= board <= LAST_BOARD:
+                continue
+            if message_class in classes and frame.first_byte in (HEAD_BYTE, TAIL_BYTE) and frame.length in (6, 8):
+                skin.setdefault((board, message_class), set()).add(frame.identifier & 0xF)
+            elif message_class == INERTIAL:
+                inertial.add(board)
+        patches = []
+        for set_up in self._set_ups(sorted({board for board, _ in skin} | inertial)):
+            # a board sends one class; strain boards may say something that looks like skin in the other
+            message_class = SKIN if (set_up.board, SKIN) in skin else OLD_SKIN
+            if triangles := skin.get((set_up.board, message_class)):
+                patches.append(self._patch(set_up, sorted(triangles), message_class))
+            if set_up.board in inertial and set_up.inertial:
+                patches.append(inertial_patch(set_up.board, set_up.inertial))
+        return patches
 
-    def _patch(self, board: int, triangles: Iterable[int]) -> Patch:
-        modules = [self._module(board, t) for t in triangles]
-        return Patch(f"board {board}", [m for m in modules if m is not None], key=board)
+    def _patch(self, set_up: BoardSetUp, triangles: Iterable[int], message_class: int) -> Patch:
+        return skin_patch(set_up.board, [self._module(set_up, t) for t in triangles], message_class)
 
-    def _module(self, board: int, triangle: int) -> Module | None:
+    def _module(self, set_up: BoardSetUp, triangle: int) -> Module:
         options = self.options
-        kind = options.kind or ("triangle" if options.skin_type in _TRIANGLE_SKIN_TYPES else "fingertip")
-        thermal: Sequence[int] = _NON_TACTILE[kind]
+        kind = options.kind or ("triangle" if set_up.skin_type in TRIANGLE_SKIN_TYPES else "fingertip")
+        thermal = NON_TACTILE[kind]
         for special in options.modules:
-            if special.board == board and triangle in special.triangles:
-                if not special.enabled:
-                    return None
-                kind = special.kind
-                thermal = _NON_TACTILE[kind] if special.thermal is None else special.thermal
-        uid = board << 16 | triangle << 8
-        return Module(
-            [Sensor("temperature" if k in thermal else "pressure", uid | k) for k in range(CHANNELS)],
-            key=triangle,
-            kind=kind,
-        )
+            if special.board != set_up.board or triangle not in special.triangles:
+                continue
+            if special.kind or special.thermal is not None:
+                kind = special.kind or kind
+                thermal = NON_TACTILE[kind] if special.thermal is None else special.thermal
+        return triangle_module(set_up.board, triangle, kind, thermal)
 
 
-def _triangles(first: int, last: int, shift: int, enabled: bool, cdc_offset: int) -> bytes:
-    """SET_TRIANG_CFG: 50, first, last, shift, enable, converter offset (little-endian)."""
-    return bytes((0x50, first, last, shift, enabled, cdc_offset & 0xFF, cdc_offset >> 8))
+async def _send(link: Link, board: int, messages: Iterable[bytes]) -> None:
+    for message in messages:
+        await link.send(0x200 | board, message)
 
 
-def _runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
-    """First and last of every run of consecutive numbers."""
-    runs: list[tuple[int, int]] = []
-    for number in sorted(set(numbers)):
-        if runs and runs[-1][1] == number - 1:
-            runs[-1] = (runs[-1][0], number)
-        else:
-            runs.append((number, number))
-    return runs
+__all__ = ["BaselineWatch", "Kind", "RoboskinDriver", "RoboskinOptions", "SpecialBoards"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import json_option, namespace_option, print_json, run
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options
 
@@ -45,7 +45,18 @@ class DriverCommand(click.Command):
         return super().parse_args(ctx, args)
 
 
-@click.command("skin-driver", cls=DriverCommand)
+@click.command(
+    "skin-driver",
+    cls=DriverCommand,
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-driver --bus vcan0                    ROBOSKIN boards on a CAN interface",
+        "skin-driver --bus virtual                  emulated ones, no hardware needed",
+        "skin-driver --bus can0 --boards 7,8,9,10   only these boards",
+        "skin-driver --bus can0 --listen-only       send nothing",
+        "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, where this user may have it",
+    ),
+)
 @click.option(
     "--bus", "buses", multiple=True, metavar="BUS", help="Bus: vcan0, virtual, slcan:/dev/ttyACM0 ...; several."
 )
@@ -81,14 +92,7 @@ def command(
     verbose: bool,
     **driver_options: str | None,
 ) -> None:
-    r"""Run a driver: skin hardware on one or more buses into one stream of frames for any program.
-
-    \b
-    skin-driver --bus vcan0                    ROBOSKIN boards on a CAN interface
-    skin-driver --bus virtual                  emulated ones, no hardware needed
-    skin-driver --bus can0 --boards 7,8,9,10   only these boards
-    skin-driver --bus can0 --listen-only       send nothing
-    skin-driver --bus can0 --realtime fifo:50  real-time scheduling, where this user may have it
+    """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
     SIGHUP makes a listener take in what it has heard since it started.
     """

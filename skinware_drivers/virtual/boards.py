@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import struct
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -15,6 +13,7 @@ from skinware_drivers.virtual.converters import Acquisition, Converters
 from skinware_drivers.virtual.faults import BoardFaults, Fate, TriangleState
 from skinware_drivers.virtual.firmware import TRIANGLES
 from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.inertial import InertialSensors, Units
 from skinware_drivers.virtual.touch import Touch, WireSource
 from skinware_drivers.virtual.wire import Transmission, Transmitter
 
@@ -27,9 +26,6 @@ LONGEST_QUEUE = 48
 
 _REPLY_NS = 200_000
 _NO_ACKS_TO_RECALIBRATE = 5
-_ACCELEROMETERS, _GYROSCOPE = 0b1011, 0b0100
-_GRAVITY = 981
-"""In units of 1/100 m/s^2."""
 
 
 @dataclass
@@ -76,6 +72,7 @@ class Board(ABC):
     board_type: ClassVar[int]
     firmware: ClassVar[tuple[int, int, int]]
     protocol: ClassVar[tuple[int, int]]
+    units: ClassVar[Units]
 
     def __init__(self, address: int, parts: BoardParts, now_ns: int) -> None:
         self.address = address
@@ -89,8 +86,7 @@ class Board(ABC):
         self._ready_ns = ready_ns
         self.parts.touch.stream_from(None)
         self.next_burst_ns: int | None = None
-        self.next_inertial_ns: int | None = None
-        self._inertial_mask = self._inertial_period_ns = 0
+        self.inertial = InertialSensors(self.units)
         self._data_class = DATA
         self._no_acks = 0
         self._recalibration_due = False
@@ -118,7 +114,8 @@ class Board(ABC):
         """Lose power: no reaction to anything, and what waits for the wire is gone."""
         self.alive = False
         self.parts.faults.last_cycle = None
-        self.next_burst_ns = self.next_inertial_ns = None
+        self.next_burst_ns = None
+        self.inertial.stop()
         for transmission in self.parts.transmitter.queue:
             for triangle, half in transmission.unsent_halves():
                 self._log_lost(now_ns, triangle, transmission.cycle, half, reason)
@@ -145,12 +142,7 @@ class Board(ABC):
         Returns:
             The number of frames left out.
         """
-        skipped = 0
-        if self.next_inertial_ns is not None and self.next_inertial_ns < now_ns:
-            times = -((self.next_inertial_ns - now_ns) // self._inertial_period_ns)
-            self.next_inertial_ns += times * self._inertial_period_ns
-            mask = self._inertial_mask
-            skipped += times * (bool(mask & _ACCELEROMETERS) + bool(mask & _GYROSCOPE))
+        skipped = self.inertial.skip_to(now_ns)
         if self.next_burst_ns is not None and self.next_burst_ns < now_ns:
             bursts = -((self.next_burst_ns - now_ns) // self._period_ns)
             self.next_burst_ns += bursts * self._period_ns
@@ -164,15 +156,17 @@ class Board(ABC):
 
     def next_event_ns(self) -> int | None:
         """When ``run`` has something to do."""
-        if self.next_burst_ns is None or self.next_inertial_ns is None:
-            return self.next_burst_ns if self.next_inertial_ns is None else self.next_inertial_ns
-        return min(self.next_burst_ns, self.next_inertial_ns)
+        inertial_ns = self.inertial.next_ns
+        if self.next_burst_ns is None or inertial_ns is None:
+            return self.next_burst_ns if inertial_ns is None else inertial_ns
+        return min(self.next_burst_ns, inertial_ns)
 
     def run(self, now_ns: int) -> None:
         """Do what is due."""
-        if self.next_inertial_ns is not None and self.next_inertial_ns <= now_ns:
-            self._send_inertial(self.next_inertial_ns)
-            self.next_inertial_ns += self._inertial_period_ns
+        inertial_ns = self.inertial.next_ns
+        if inertial_ns is not None and inertial_ns <= now_ns:
+            for low, payload in self.inertial.take():
+                self._send(inertial_ns, INERTIAL, low, payload)
         if self.next_burst_ns is not None and self.next_burst_ns <= now_ns:
             time_ns = self.next_burst_ns
             self.next_burst_ns = time_ns + self._period_ns
@@ -276,18 +270,6 @@ class Board(ABC):
                 )
             )
 
-    def _send_inertial(self, time_ns: int) -> None:
-        """Accelerations, then angular rates: class 5, three little-endian int16.
-
-        Source: icub-firmware:emBODY/eBcode/arch-arm/embot/prot/can/embot_prot_can_inertial_periodic.cpp
-        """
-        tilt = 0.1 * math.sin(time_ns * 1e-9)
-        if self._inertial_mask & _ACCELEROMETERS:
-            down = round(_GRAVITY * math.cos(tilt))
-            self._send(time_ns, INERTIAL, 1, struct.pack("<3h", round(_GRAVITY * math.sin(tilt)), 0, down))
-        if self._inertial_mask & _GYROSCOPE:
-            self._send(time_ns, INERTIAL, 0, struct.pack("<3h", 0, round(100 * math.cos(time_ns * 1e-9)), 0))
-
     # What the kinds of boards share in obeying
 
     def _set_triangles(self, payload: bytes) -> bool:
@@ -308,13 +290,6 @@ class Board(ABC):
             return False
         self.address = address
         return True
-
-    def _set_inertial(self, payload: bytes, now_ns: int) -> None:
-        """ACC_GYRO_SETUP (0x4F): which sensors, and their period in ms."""
-        self._inertial_mask = payload[1] & 0xF
-        self._inertial_period_ns = payload[2] * 1_000_000
-        wanted = self._inertial_mask and self._inertial_period_ns
-        self.next_inertial_ns = now_ns + self._inertial_period_ns if wanted else None
 
     def _begin_bursts(self, now_ns: int) -> None:
         """Stream from here on. A period of 0 is none."""

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, Board
+from skinware_drivers.virtual.inertial import MTB3_UNITS, Units
 
 _SHORTEST = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}
 """Bytes of each command. Shorter ones are ignored here; real boards read what their buffer happens to hold."""
@@ -34,6 +35,7 @@ class Mtb3(Board):
     board_type: ClassVar[int] = 5
     firmware: ClassVar[tuple[int, int, int]] = (2, 10, 14)
     protocol: ClassVar[tuple[int, int]] = (1, 0)  # assumed: no public source tells what its GET_FW_VERSION says
+    units: ClassVar[Units] = MTB3_UNITS
 
     def _power_up(self, ready_ns: int) -> None:
         super()._power_up(ready_ns)
@@ -58,7 +60,7 @@ class Mtb3(Board):
         elif command == 0x32:
             return self._set_address(payload[1])
         elif command == 0x4F:
-            self._set_inertial(payload, now_ns)
+            self.inertial.set_up(payload[1], payload[2], now_ns)
         elif command in (0x4C, 0x4E):
             return self._obey_old(command, payload, now_ns)
         else:
@@ -69,7 +71,8 @@ class Mtb3(Board):
         """Whatever it is, the timers stop until a skin command starts them again."""
         if self.next_burst_ns is not None:
             self.parts.log.append(events.BoardSilenced(time_ns=now_ns, board=self.address))
-        self.next_burst_ns = self.next_inertial_ns = None
+        self.next_burst_ns = None
+        self.inertial.stop()
         if payload[0] == 0xFF:
             self._send_discovery(host, now_ns)
         return True

@@ -11,9 +11,10 @@ from typing import ClassVar
 
 from skinware_drivers.virtual.boards import BOOTLOADER, EVERY_BOARD, POLLING, Board
 from skinware_drivers.virtual.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
+from skinware_drivers.virtual.inertial import MTB4_UNITS, Units
 from skinware_drivers.virtual.touch import DEFAULT_CDC_OFFSET
 
-_SHORTEST = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}
+_SHORTEST = {0x07: 2, 0x1C: 3, 0x32: 2, 0x33: 8, 0x35: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}
 """Bytes of each command. Shorter ones are ignored here; real boards read what their buffer happens to hold."""
 
 
@@ -25,6 +26,7 @@ class Mtb4(Board):
     # icub-firmware:emBODY/eBcode/arch-arm/board/mtb4/application/src/main-appcan.cpp
     firmware: ClassVar[tuple[int, int, int]] = (1, 25, 0)
     protocol: ClassVar[tuple[int, int]] = (2, 0)
+    units: ClassVar[Units] = MTB4_UNITS
 
     def _power_up(self, ready_ns: int) -> None:
         super()._power_up(ready_ns)
@@ -47,7 +49,11 @@ class Mtb4(Board):
         elif command == 0x32:
             return self._set_address(payload[1])
         elif command == 0x4F:
-            self._set_inertial(payload, now_ns)
+            self.inertial.set_up(payload[1], payload[2], now_ns)
+        elif command == 0x33:
+            self.inertial.configure_imu(payload[1] | payload[2] << 8)
+        elif command == 0x35:
+            self.inertial.transmit_imu(payload[1], now_ns)
         else:
             self._start_converters(now_ns)
             return self._obey_skin(command, payload, now_ns)

@@ -127,6 +127,19 @@ def test_in_order_gives_every_frame_while_it_keeps_up_and_counts_the_rest() -> N
         assert reader.lost == 13
 
 
+def test_the_first_view_after_a_restart_shows_the_new_life() -> None:
+    with ServiceWriter("a", SMALL) as writer:
+        publish(writer, 1)
+        reader = ServiceReader[Frame]("a")
+        with reader.view() as frame:
+            assert frame.column("values")[0] == 1
+    with ServiceWriter("a", SMALL) as writer, reader:
+        publish(writer, 2)
+        with reader.view() as frame:
+            assert frame.position == (writer.generation, 1)
+            assert frame.column("values")[0] == 2
+
+
 def test_losses_over_a_restart_are_counted() -> None:
     writer = ServiceWriter("x", SMALL)
     publish(writer, 1)

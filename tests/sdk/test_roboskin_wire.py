@@ -27,7 +27,7 @@ class Rig:
 
     def __init__(self, boards: Sequence[int] = (7,), n_buses: int = 1, **options: object) -> None:
         self.driver = RoboskinDriver(RoboskinOptions(**options))  # type: ignore[arg-type]
-        patches = [self.driver._patch(board, range(16)) for board in boards]
+        patches = self.driver.patches_set_up(boards)
         buses = [(f"bus{i}", patches) for i in range(n_buses)]
         self.decoder = Decoder([self.driver.layout] * len(buses), assemble(buses, self.driver.types, self.driver.dtype))
         self.batch = FrameBatch(4096, 8, self.decoder.headroom)

@@ -423,6 +423,44 @@ def test_inertial_data() -> None:
     assert rig.run_ms(500) == []
 
 
+def test_a_level_mtb3_sends_its_gravity_as_16384() -> None:
+    rig = Rig(mtb3=(7,))
+    rig.send(0x207, "4F 02 0A")
+    (frame,) = rig.run_ms(11)
+    x, y, z = (int.from_bytes(frame.payload[at : at + 2], "little", signed=True) for at in (0, 2, 4))
+    assert (frame.identifier, y) == (0x571, 0)
+    assert 16300**2 < x**2 + z**2 < 16400**2
+
+
+def test_an_imu_sends_its_sensors_with_one_number_per_round() -> None:
+    rig = Rig()
+    rig.send(0x207, "33 07 00 01 00 00 00 00")
+    assert rig.run_ms(200) == []
+    rig.send(0x207, "35 0A")
+    frames = rig.run_ms(31)
+    assert {frame.identifier for frame in frames} == {0x573}
+    assert [frame.payload[:2].hex() for frame in frames] == [f"0{n}0{sensor}" for n in (1, 2, 3) for sensor in range(3)]
+    assert {len(frame.payload) for frame in frames} == {8}
+    rig.send(0x207, "35 00")
+    assert rig.run_ms(200) == []
+
+
+def test_an_mtb3_has_no_imu() -> None:
+    rig = Rig(mtb3=(7,))
+    rig.send(0x207, "33 07 00 01 00 00 00 00")
+    rig.send(0x207, "35 0A")
+    assert rig.run_ms(200) == []
+    assert rig.hardware.totals()["commands"] == 0
+
+
+def test_skipping_counts_what_an_imu_would_have_sent() -> None:
+    rig = Rig()
+    rig.send(0x207, "33 05 00 01 00 00 00 00")
+    rig.send(0x207, "35 05")
+    rig.hardware.skip(START_NS + 60_002_000_000)  # the last ones need their time on the wire
+    assert rig.hardware.totals()["unheard"] == 2 * 200 * 60
+
+
 @pytest.mark.parametrize("identifier", [0x207, 0x707])
 def test_set_address(identifier: int) -> None:
     rig = Rig()

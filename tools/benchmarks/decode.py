@@ -69,7 +69,7 @@ class Ours:
         self.bus = SocketCanBus("bench")
         self.bus.adopt(sock)
         driver = RoboskinDriver(RoboskinOptions())
-        patches = [driver._patch(board, range(16)) for board in BOARDS]
+        patches = driver.patches_set_up(BOARDS)
         tables = assemble([("bench", patches)], driver.types, driver.dtype)
         self.decoder = Decoder([driver.layout], tables)
         self.writer = DriverWriter(

@@ -1,0 +1,196 @@
+"""What a user says of ROBOSKIN boards: options for a bus, and tables of the boards and triangles that differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Literal
+
+import msgspec
+
+from skinware.errors import ConfigurationError
+
+FIRST_BOARD, LAST_BOARD = 1, 14
+TRIANGLES = 16
+CHANNELS = 12
+NON_TACTILE = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
+"""Channels of each kind of module that feel no touch."""
+TRIANGLE_SKIN_TYPES = (0, 2, 8)
+"""Types of skin whose modules are triangles, as long as nobody says otherwise."""
+LONGEST_OLD_PERIOD_MS = 209
+"""What the timer of the old set-up can count to: 65535 ticks of 3.2 us."""
+
+InertialSensor = Literal[
+    "accelerometer", "external_accelerometer", "gyroscope", "imu_accelerometer", "imu_magnetometer", "imu_gyroscope"
+]
+"""An inertial sensor of a board; those of an ``imu`` come in other messages (MTB4 only)."""
+
+Inertial = tuple[InertialSensor, ...]
+
+
+class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a range of triangles of a board is, where it differs from the rest. Of several, the last one counts.
+
+    Attributes:
+        board: address.
+        triangles: which of its triangles.
+        kind: ``triangle``, ``fingertip`` or ``palm``; empty: by the board's type of skin.
+        thermal: channels that are not tactile, if others than the kind's own.
+        enabled: switched on or off in the board; None: as the rest of the board.
+        shift: resolution of the board's arithmetic (SET_TRIANG_CFG); None: as the rest.
+        cdc_offset: offset register of the capacitance converter (SET_TRIANG_CFG); None: as the rest.
+    """
+
+    board: int
+    triangles: tuple[int, ...]
+    kind: str = ""
+    thermal: tuple[int, ...] | None = None
+    enabled: bool | None = None
+    shift: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
+    cdc_offset: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None = None
+
+    @property
+    def sets_triangles(self) -> bool:
+        """Whether the board has to be told something, rather than only our tables."""
+        return not (self.enabled is None and self.shift is None and self.cdc_offset is None)
+
+
+class SpecialBoards(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Boards that are set up in another way than the rest of the bus. What is not given is as on the rest.
+
+    A period, type of skin or no-load value of their own is sent in a second SET_BRD_CFG, with which the firmware
+    switches all triangles of the board off: those that are wanted must be switched on again in ``modules``.
+
+    Attributes:
+        boards: their addresses.
+        period_ms: time between two updates.
+        skin_type: type of skin that they are told.
+        no_load: value of an idle taxel.
+        inertial: inertial sensors that they send.
+    """
+
+    boards: tuple[int, ...]
+    period_ms: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None
+    skin_type: Annotated[int, msgspec.Meta(ge=0, le=15)] | None = None
+    no_load: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None
+    inertial: Inertial | None = None
+
+    @property
+    def sets_board(self) -> bool:
+        """Whether the boards are told another type of skin, period or no-load value."""
+        return not (self.period_ms is None and self.skin_type is None and self.no_load is None)
+
+
+class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver, for every board of a bus."""
+
+    boards: Annotated[
+        tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: whoever answers")
+    ] = ()
+    period_ms: Annotated[int, msgspec.Meta(description="time between two updates, 1-255 ms", ge=1, le=255)] = 50
+    skin_type: Annotated[
+        int, msgspec.Meta(description="type of skin that the boards are told: 0, 1, 2, 3, 7 or 8", ge=0, le=15)
+    ] = 0
+    no_load: Annotated[int, msgspec.Meta(description="value of an idle taxel", ge=0, le=255)] = 0xF0
+    shift: Annotated[int, msgspec.Meta(description="resolution shift of the boards", ge=0, le=255)] = 2
+    cdc_offset: Annotated[int, msgspec.Meta(description="converter offset register", ge=0, le=0xFFFF)] = 0x2200
+    enabled: Annotated[
+        bool, msgspec.Meta(description="whether triangles that `modules` does not name are switched on")
+    ] = True
+    kind: Annotated[
+        str, msgspec.Meta(description="what all modules are: triangle, fingertip or palm; default: by skin type")
+    ] = ""
+    inertial: Annotated[Inertial, msgspec.Meta(description="inertial sensors that the boards send")] = ()
+    inertial_period_ms: Annotated[
+        int, msgspec.Meta(description="time between two updates of the inertial sensors, 1-255 ms", ge=1, le=255)
+    ] = 50
+    inertial_scale: Annotated[
+        Literal["mtb4", "mtb3"], msgspec.Meta(description="kind of the boards with inertial sensors: it sets the scale")
+    ] = "mtb4"
+    old_style: Annotated[
+        bool, msgspec.Meta(description="set up with the old commands 4C and 4E; skin data in message class 3")
+    ] = False
+    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns what is there, s", gt=0)] = 1.0
+    special_boards: Annotated[
+        tuple[SpecialBoards, ...], msgspec.Meta(description="boards that differ (configuration file only)")
+    ] = ()
+    modules: Annotated[
+        tuple[Kind, ...], msgspec.Meta(description="ranges of triangles that differ (configuration file only)")
+    ] = ()
+
+    def __post_init__(self) -> None:
+        _check_addresses(self)
+        for kind in (self.kind, *(m.kind for m in self.modules)):
+            if kind and kind not in NON_TACTILE:
+                raise ConfigurationError(f"kind {kind!r}: choose one of {', '.join(NON_TACTILE)}")
+        for module in self.modules:
+            if any(not 0 <= t < TRIANGLES for t in module.triangles):
+                raise ConfigurationError(f"board {module.board}: triangles {module.triangles} are not all 0 to 15")
+            if any(not 0 <= channel < CHANNELS for channel in module.thermal or ()):
+                raise ConfigurationError(f"board {module.board}: thermal channels {module.thermal} are not all 0 to 11")
+        for inertial in self.all_inertial:
+            _check_inertial(inertial, self.inertial_scale)
+        if self.old_style:
+            _check_old_style(self)
+
+    @property
+    def all_inertial(self) -> list[Inertial]:
+        """The sets of inertial sensors that some board sends."""
+        own = [special.inertial for special in self.special_boards if special.inertial is not None]
+        return [inertial for inertial in (self.inertial, *own) if inertial]
+
+
+def _check_addresses(options: RoboskinOptions) -> None:
+    special = [board for entry in options.special_boards for board in entry.boards]
+    for board in (*options.boards, *special, *(m.board for m in options.modules)):
+        if not FIRST_BOARD <= board <= LAST_BOARD:
+            raise ConfigurationError(
+                f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
+            )
+    if len(set(options.boards)) < len(options.boards):
+        raise ConfigurationError(f"boards {options.boards}: one address is there twice")
+
+
+def _check_inertial(inertial: Inertial, scale: str) -> None:
+    if len(set(inertial)) < len(inertial):
+        raise ConfigurationError(f"inertial sensors {', '.join(inertial)}: one is there twice")
+    if {"accelerometer", "external_accelerometer"} <= set(inertial):
+        raise ConfigurationError("a board's own and its external accelerometer send one message: choose one of them")
+    imu = [sensor for sensor in inertial if sensor.startswith("imu_")]
+    if imu and len(imu) < len(inertial):
+        raise ConfigurationError(
+            f"inertial sensors {', '.join(inertial)}: a board sends either those of an imu or the others"
+        )
+    if imu and scale != "mtb4":
+        raise ConfigurationError(f"{imu[0]}: only an MTB4 has it, so inertial_scale must be mtb4")
+
+
+def _check_old_style(options: RoboskinOptions) -> None:
+    if options.all_inertial:
+        raise ConfigurationError("old_style: boards that are set up the old way send no inertial data")
+    periods = [options.period_ms, *(s.period_ms for s in options.special_boards if s.period_ms is not None)]
+    if max(periods) > LONGEST_OLD_PERIOD_MS:
+        raise ConfigurationError(f"old_style: a period of {max(periods)} ms, the most is {LONGEST_OLD_PERIOD_MS}")
+    for skin_type in (options.skin_type, *(s.skin_type for s in options.special_boards)):
+        if skin_type is not None and skin_type > 3:
+            raise ConfigurationError(f"old_style: skin type {skin_type} came with the new set-up; choose 0 to 3")
+    for module in options.modules:
+        if module.shift is not None or module.cdc_offset is not None:
+            raise ConfigurationError(
+                f"old_style: board {module.board}: the old set-up has no shift or cdc_offset for single triangles"
+            )
+
+
+def runs(numbers: Iterable[int]) -> list[tuple[int, int]]:
+    """First and last of every run of consecutive numbers."""
+    found: list[tuple[int, int]] = []
+    for number in sorted(set(numbers)):
+        if found and found[-1][1] == number - 1:
+            found[-1] = (found[-1][0], number)
+        else:
+            found.append((number, number))
+    return found
+
+
+def runs_text(numbers: Iterable[int]) -> str:
+    """Numbers as people write them: ``0-4, 7``."""
+    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs(numbers))

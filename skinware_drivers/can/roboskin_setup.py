@@ -1,0 +1,175 @@
+"""What ROBOSKIN boards are told at set-up, and what is switched on in them afterwards.
+
+Order and waits: robotology/icub-main CanBusSkin.cpp. SET_BRD_CFG to each board, SET_TRIANG_CFG for all triangles of
+each, 500 ms, the boards that differ, 10 ms, the triangles that differ, 10 ms, start. What the firmware makes of it:
+robotology/icub-firmware embot_app_application_theSkin.cpp; a SET_BRD_CFG switches all triangles off.
+
+The old way: TACT_SETUP (4C) to each board, which starts it, then TACT_SETUP2 (4E) to each. An MTB4 takes nothing
+from them: it sends all triangles every 40 ms, in message class 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from skinware_drivers.can.roboskin_options import TRIANGLES, Inertial, Kind, RoboskinOptions, runs
+
+OLD_MTB4_PERIOD_MS = 40
+START, STOP = b"\x07\x00", b"\x07\x01"
+"""SET_TXMODE; the polarity is as odd as it looks."""
+
+_TICKS_PER_MS = 312.5
+_OWN_TIMER = 3
+_COMPENSATED = 0x08
+_NOT_COMPENSATED_TYPE = 2
+_INERTIAL_BITS = {"accelerometer": 0x02, "gyroscope": 0x04, "external_accelerometer": 0x08}
+_IMU_BITS = {"imu_accelerometer": 0x01, "imu_magnetometer": 0x02, "imu_gyroscope": 0x04}
+_FUSION = 1
+_AREA_SHIFTS, _LAST_OF_4E = 0x22, 0x0A
+"""What CanBusSkin.cpp always sends; of the areas that boards can average over, nothing is used here."""
+
+
+class BoardSetUp:
+    """The set-up of one board, and the state it leaves the board in.
+
+    Args:
+        options: of the bus.
+        board: address.
+        is_mtb4: matters for the old way only.
+
+    Attributes:
+        board: address.
+        first: messages that every board gets, in order; of each, all boards before the next.
+        special_board: messages after the first wait.
+        special_triangles: messages after the second wait.
+        enabled: triangles that are switched on in the end.
+        wiped: triangles that were switched on at first and are off in the end, though nobody switched them off: a
+            special board configuration did.
+        period_ms: of its skin data.
+        skin_type: what it was told.
+        inertial: its inertial sensors.
+    """
+
+    def __init__(self, options: RoboskinOptions, board: int, *, is_mtb4: bool = True) -> None:
+        self.board = board
+        self.first: list[bytes] = []
+        self.special_board: list[bytes] = []
+        self.special_triangles: list[bytes] = []
+        self.period_ms, self.skin_type = options.period_ms, options.skin_type
+        self.inertial: Inertial = options.inertial
+        self._no_load = options.no_load
+        self._inertial_period_ms = options.inertial_period_ms
+        self._on: set[int] = set()
+        self._shift = [options.shift] * TRIANGLES
+        self._cdc_offset = [options.cdc_offset] * TRIANGLES
+        modules = [module for module in options.modules if module.board == board]
+        if options.old_style:
+            self._set_up_old(options, modules, is_mtb4)
+            wanted = set(self._on)
+        else:
+            wanted = self._set_up_new(options, modules)
+        self.enabled = frozenset(self._on)
+        named_off = {t for module in modules if module.enabled is False for t in module.triangles}
+        self.wiped = frozenset(wanted - self._on - named_off)
+
+    def inertial_set_up(self) -> list[bytes]:
+        """IMU_CONFIG_SET, if the board has an IMU to configure."""
+        mask = self._imu_mask
+        return [bytes((0x33, mask, 0, _FUSION, 0, 0, 0, 0))] if mask else []
+
+    def inertial_start(self) -> list[bytes]:
+        """What makes the board send inertial data: ACC_GYRO_SETUP or IMU_TRANSMIT."""
+        if self._imu_mask:
+            return [bytes((0x35, self._inertial_period_ms))]
+        mask = sum(_INERTIAL_BITS[sensor] for sensor in self.inertial)
+        return [bytes((0x4F, mask, self._inertial_period_ms))] if mask else []
+
+    def inertial_stop(self) -> list[bytes]:
+        """What ends it."""
+        if self._imu_mask:
+            return [b"\x35\x00"]
+        return [b"\x4f\x00\x00"] if self.inertial else []
+
+    @property
+    def _imu_mask(self) -> int:
+        return sum(_IMU_BITS.get(sensor, 0) for sensor in self.inertial)
+
+    # The new way
+
+    def _set_up_new(self, options: RoboskinOptions, modules: Iterable[Kind]) -> set[int]:
+        """Returns the triangles that somebody switched on at some time."""
+        self.first.append(self._board_configuration())
+        self.first.append(self._triangles(0, TRIANGLES - 1, options.enabled))
+        wanted = set(self._on)
+        for special in options.special_boards:
+            if self.board not in special.boards:
+                continue
+            if special.inertial is not None:
+                self.inertial = special.inertial
+            if special.sets_board:
+                self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
+                self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
+                self._no_load = self._no_load if special.no_load is None else special.no_load
+                self.special_board.append(self._board_configuration())
+        for module in modules:
+            if module.sets_triangles:
+                self._set_triangles(module)
+                wanted |= self._on
+        return wanted
+
+    def _board_configuration(self) -> bytes:
+        """SET_BRD_CFG: 4D, type of skin, period, no load."""
+        self._on.clear()
+        return bytes((0x4D, self.skin_type & 0x0F, self.period_ms, self._no_load))
+
+    def _set_triangles(self, module: Kind) -> None:
+        for triangle in module.triangles:
+            if module.shift is not None:
+                self._shift[triangle] = module.shift
+            if module.cdc_offset is not None:
+                self._cdc_offset[triangle] = module.cdc_offset
+        on = {t for t in module.triangles if (t in self._on if module.enabled is None else module.enabled)}
+        for enabled, triangles in ((True, on), (False, set(module.triangles) - on)):
+            for first, last in self._alike(triangles):
+                self.special_triangles.append(self._triangles(first, last, enabled))
+
+    def _alike(self, triangles: Iterable[int]) -> list[tuple[int, int]]:
+        """First and last of runs of triangles with the same settings."""
+        settings: dict[tuple[int, int], list[int]] = {}
+        for triangle in sorted(set(triangles)):
+            settings.setdefault((self._shift[triangle], self._cdc_offset[triangle]), []).append(triangle)
+        return sorted(run for alike in settings.values() for run in runs(alike))
+
+    def _triangles(self, first: int, last: int, enabled: bool) -> bytes:
+        """SET_TRIANG_CFG: 50, first, last, shift, enable, converter offset (little-endian)."""
+        touched = range(first, last + 1)
+        (self._on.update if enabled else self._on.difference_update)(touched)
+        offset = self._cdc_offset[first]
+        return bytes((0x50, first, last, self._shift[first], enabled, offset & 0xFF, offset >> 8))
+
+    # The old way
+
+    def _set_up_old(self, options: RoboskinOptions, modules: Iterable[Kind], is_mtb4: bool) -> None:
+        for special in options.special_boards:
+            if self.board in special.boards:
+                self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
+                self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
+                self._no_load = self._no_load if special.no_load is None else special.no_load
+        self._on.update(range(TRIANGLES) if options.enabled else ())
+        for module in modules:
+            if module.enabled is not None:
+                (self._on.update if module.enabled else self._on.difference_update)(module.triangles)
+        ticks = min(round(self.period_ms * _TICKS_PER_MS), 0xFFFF)
+        offset = options.cdc_offset
+        timer = (ticks & 0xFF, ticks >> 8)
+        self.first.append(bytes((0x4C, 0x01, 0x01, _OWN_TIMER, offset & 0xFF, offset >> 8, *timer)))
+        compensated = self.skin_type != _NOT_COMPENSATED_TYPE
+        parameter = _COMPENSATED | self.skin_type if compensated else 0
+        mask = sum(1 << triangle for triangle in self._on)
+        shift = options.shift & 0x0F
+        self.first.append(
+            bytes((0x4E, shift, _AREA_SHIFTS, self._no_load, parameter, mask & 0xFF, mask >> 8, _LAST_OF_4E))
+        )
+        if is_mtb4:
+            self._on.update(range(TRIANGLES))
+            self.period_ms = OLD_MTB4_PERIOD_MS

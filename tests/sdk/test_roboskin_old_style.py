@@ -1,0 +1,133 @@
+"""Boards set up the old way: commands 4C and 4E, skin data in message class 3."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from skinware import DriverReader, PatchState
+from skinware.errors import ConfigurationError, RequestFailed
+from skinware_drivers.can.roboskin import Kind, RoboskinOptions, SpecialBoards
+from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
+from tests.sdk.test_roboskin_wire import MS, Rig, halves
+
+
+def in_class_3(frames: list[tuple[int, int, bytes]]) -> list[tuple[int, int, bytes]]:
+    return [(time_ns, identifier - 0x100, payload) for time_ns, identifier, payload in frames]
+
+
+def test_class_3_is_skin_only_where_it_was_said() -> None:
+    frames = in_class_3(halves(3, 5))
+    usual, old = Rig(), Rig(old_style=True, boards=(7,))
+    assert usual.feed(frames) == []
+    assert usual.count("unknown") == 2
+    assert old.feed(frames) == [3]
+    assert old.values(3) == [5] * 12
+    assert old.feed(halves(3, 6)) == []  # the new class, which a board set up the old way does not send
+    assert old.count("unknown") == 2
+
+
+def test_an_idle_triangle_as_on_the_wire() -> None:
+    rig = Rig(old_style=True)
+    head, tail = bytes.fromhex("40F0F0F0F0F0F0F0"), bytes.fromhex("C0F0F0F0F0F08010")
+    assert rig.feed([(MS, 0x37F, head), (2 * MS, 0x37F, tail)]) == [15]
+    assert [bool(status) for status in rig.status(15)] == [k in (0, 11) for k in range(12)]
+
+
+@pytest.mark.usefixtures("hurry")
+def test_old_boards_are_told_4c_and_4e_and_stream() -> None:
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8), mtb3=(7, 8), pattern="idle", boot_s=0.1)
+    modules = (Kind(8, tuple(range(4, 16)), enabled=False),)
+    options: dict[str, Any] = {
+        "old_style": True,
+        "period_ms": 40,
+        "boards": (7, 8),
+        "skin_type": 1,
+        "kind": "fingertip",
+    }
+    with driving(bus, modules=modules, **options) as running, DriverReader("roboskin") as reader:
+        assert reader.structure.n_modules == 16 + 4
+        read_until(reader, lambda f: not f.status.any())
+        assert reader.bus_counters(reader.read())[0]["unknown"] == 0
+        before = len(commands(log))
+        running.do(lambda: hardware_of(bus).restart(8, bus._clock()))
+        read_until(reader, lambda f: f.patch_state[1] != PatchState.LIVE)
+        read_until(reader, lambda f: not f.status.any())
+        again = [(i, p) for _, i, p in commands(log)[before:] if p != "1c0200"]
+    messages = [(i, p) for _, i, p in commands(log)[:before] if p != "1c0200"]
+    of_8 = [(0x208, "4c01010300 22 d430".replace(" ", "")), (0x208, "4e0222f0090f000a")]
+    assert messages == [
+        (0x207, "4c0101030022d430"),
+        of_8[0],
+        (0x207, "4e0222f009ffff0a"),
+        of_8[1],
+    ]
+    assert again[:2] == of_8
+    assert {identifier for identifier, _ in again} == {0x208}
+    assert [(i, p) for _, i, p in commands(log)][-2:] == [(0x207, "0701"), (0x208, "0701")]
+
+
+@pytest.mark.usefixtures("hurry")
+def test_an_mtb4_set_up_the_old_way_sends_everything_every_40_ms_in_class_4() -> None:
+    bus = emulated(boards=(7, 8), mtb3=(7,), pattern="idle")
+    modules = tuple(Kind(board, (0, 1), enabled=False) for board in (7, 8))
+    with driving(bus, old_style=True, modules=modules), DriverReader("roboskin") as reader:
+        assert reader.structure.n_modules == 14 + 16
+        frame = read_until(reader, lambda f: not f.status.any())
+        assert frame.patch_state.tolist() == [PatchState.LIVE] * 2
+        with pytest.raises(RequestFailed, match="board 8 is an MTB4: set up the old way, it sends every 40 ms"):
+            reader.call("rate", hz=10)
+
+
+@pytest.mark.usefixtures("hurry")
+def test_old_boards_are_silenced_and_woken() -> None:
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8), mtb3=(7, 8), pattern="idle")
+    with driving(bus, old_style=True), DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        before = len(commands(log))
+        reader.call("enable", patch="board 7", on=False)
+        read_until(reader, lambda f: f.patch_state[0] == PatchState.STALE)
+        reader.call("rebaseline")
+        frame = read_until(reader, lambda f: f.patch_state[1] == PatchState.LIVE)
+        later = read_until(reader, lambda f: f.sequence > frame.sequence + 10)
+        assert later.patch_state.tolist() == [PatchState.STALE, PatchState.LIVE]
+        reader.call("enable", patch="board 7")
+        read_until(reader, lambda f: not f.status.any())
+        assert [(i, p[:4]) for _, i, p in commands(log)[before:] if p != "1c0200"] == [
+            (0x207, "0701"),
+            (0x207, "4c01"),
+            (0x208, "4c01"),
+            (0x207, "4e02"),
+            (0x208, "4e02"),
+            (0x207, "0701"),
+            (0x207, "4c01"),
+            (0x207, "4e02"),
+        ]
+
+
+def test_a_listener_hears_old_boards() -> None:
+    bus = emulated(boards=(7, 8), mtb3=(7,), listen_only=True)
+    for board in (7, 8):
+        for payload in ("4C 01 01 01 00 22 00 00", "4E 02 22 F0 08 03 00 0A"):
+            bus.hardware.receive(0x200 | board, bytes.fromhex(payload), bus._clock())
+    with driving(bus, listen_only=True, old_style=True, learn_s=0.3), DriverReader("roboskin") as reader:
+        assert reader.structure.n_modules == 2 + 16
+        read_until(reader, lambda f: not f.status.any())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"period_ms": 210}, "a period of 210 ms, the most is 209"),
+        ({"special_boards": (SpecialBoards((7,), period_ms=255),)}, "a period of 255 ms"),
+        ({"skin_type": 8}, "skin type 8 came with the new set-up"),
+        ({"modules": (Kind(7, (1,), shift=3),)}, "board 7: the old set-up has no shift"),
+    ],
+)
+def test_what_the_old_way_cannot_do_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        RoboskinOptions(old_style=True, **options)

@@ -54,6 +54,7 @@ class FrameBatch:
         start: first valid row. The rows before it are headroom, into which the decoder puts frames that
             it still holds from the batch before.
         stop: one past the last valid row.
+        limit: rows before it may be filled: buses that share a batch must not crowd each other out.
     """
 
     def __init__(self, capacity: int, payload_size: int = 8, headroom: int = 0) -> None:
@@ -64,6 +65,7 @@ class FrameBatch:
         self.time_ns = np.zeros(self.capacity, np.int64)
         self.bus = np.zeros(self.capacity, np.uint16)
         self.start = self.stop = headroom
+        self.limit = self.capacity
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -71,11 +73,12 @@ class FrameBatch:
     @property
     def free(self) -> int:
         """Rows that a bus may still fill."""
-        return self.capacity - self.stop
+        return self.limit - self.stop
 
     def clear(self) -> None:
         """Forget all rows; the memory stays."""
         self.start = self.stop = self.headroom
+        self.limit = self.capacity
 
     def append(self, bus: int, time_ns: int, identifier: int, payload: bytes) -> None:
         """Add one frame: the slow path of buses that hand out frames one by one.

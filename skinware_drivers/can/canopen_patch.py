@@ -164,7 +164,8 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         with link.follow(*matches) as frames:
             while True:
                 with contextlib.suppress(TimeoutError):
-                    frame = await asyncio.wait_for(frames.get(), loss_s / 2)
+                    async with asyncio.timeout(loss_s / 2):
+                        frame = await frames.get()
                     nodes[frame.identifier & 0x7F].hear(frame)
                 if self.options.heartbeat_ms and frames.empty():  # what was heard comes before what was not
                     for node in nodes.values():

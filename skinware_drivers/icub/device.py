@@ -60,7 +60,9 @@ class DeviceReader:
         Raises:
             ConfigurationError: the file itself is no XML.
         """
-        yield from self._devices(self._read(path), [path.resolve()])
+        root = self._read(path)
+        if root.tag != "params":  # parameters are of whoever includes them
+            yield from self._devices(root, [path.resolve()])
 
     def group_of(self, device: Element) -> Group:
         """What is in a device."""

@@ -304,9 +304,7 @@ class _PartReader(Reader):
         for element in _elements_of(group):
             if not element.understood:
                 element.understood = True
-                self.note(
-                    "unknown", element, f"{element.text!r} is not understood" if element.text else "not understood"
-                )
+                self.note("unknown", element, f"not understood{f': {element.text!r}' if element.text else ''}")
 
 
 OLD_DEFAULTS = {

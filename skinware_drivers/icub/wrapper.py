@@ -73,7 +73,7 @@ class _WrapperReader(Reader):
             element.understood = True
             names += words(element.text)
         if len(names) > 1:
-            self.note("odd", networks[1], f"several devices ({', '.join(names)}): the ports are taken for the first")
+            self.note("odd", networks[0], f"several devices ({', '.join(names)}): the ports are taken for the first")
         for name, why in _UNUSED.items():
             if name in group.params:
                 group.params[name].understood = True

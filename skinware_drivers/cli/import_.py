@@ -79,9 +79,7 @@ def icub(
         raise
     if output is None and len(done.parts) > 1 and not as_json:
         names = ", ".join(part.part.name for part in done.parts)
-        raise ConfigurationError(
-            f"{len(done.parts)} parts ({names}): write them with -o DIR, or choose one with --part"
-        )
+        raise ConfigurationError(f"{len(done.parts)} parts ({names}): choose one with --part, or give -o DIR")
     written = [] if output is None else _write(done.parts, output, force)
     if as_json:
         print_json(_as_data(done, notes.all(), written))

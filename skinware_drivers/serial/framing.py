@@ -153,14 +153,6 @@ class Encoding(ABC):
         """
 
 
-class Unframed(Encoding):
-    """For commands that are sent as they are, such as single letters."""
-
-    def encode(self, identifier: int, payload: bytes) -> bytes:  # noqa: ARG002
-        """The payload itself."""
-        return payload
-
-
 class Framing(Encoding):
     """How frames lie in a stream of bytes.
 
@@ -214,6 +206,39 @@ class Framer(ABC):
     @abstractmethod
     def _find_many(self, stream: bytes) -> tuple[Framed, int]:
         """The same, all at once."""
+
+
+@dataclass(frozen=True)
+class Unframed(Framing):
+    """Bytes as they come, for consoles and emulators; and for commands that are sent as they are.
+
+    What was received at once is one frame, or several if it is longer than ``maximum_body``: here, and only here,
+    frames depend on how the stream was cut into pieces.
+    """
+
+    maximum_body: int = 64
+
+    def framer(self) -> Framer:
+        """Pieces as they come."""
+        return _Pieces(self.maximum_body)
+
+    def encode(self, identifier: int, payload: bytes) -> bytes:  # noqa: ARG002
+        """The payload itself."""
+        return payload
+
+
+class _Pieces(Framer):
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self._size = size
+
+    def _find_few(self, stream: bytes) -> tuple[Framed, int]:
+        self.counters.frame_bytes += len(stream)
+        pieces = [stream[at : at + self._size] for at in range(0, len(stream), self._size)]
+        ends = [self._before + min(at + self._size, len(stream)) for at in range(0, len(stream), self._size)]
+        return Framed.of_bodies(pieces, [0] * len(pieces), ends) if pieces else NOTHING, len(stream)
+
+    _find_many = _find_few
 
 
 def check_body(identifier: int, payload: bytes, field: Field | None, minimum: int, maximum: int) -> None:

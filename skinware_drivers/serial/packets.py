@@ -246,7 +246,6 @@ class PacketFramer(Framer):
             counters.skipped_bytes += begin - place
             place = begin
             if size - place < self._known_from or place == size:
-                self._wanted = self._known_from if place < size else 0
                 return place
             total, is_bare = self._total(stream, place)
             follows = not self._look_ahead or self._before + place == self._follows_at

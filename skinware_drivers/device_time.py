@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S
 
 Times = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating[Any]]
 
 _PART_NS = NS_PER_S
 """One point is kept for each such part of the window: the one that came with the least delay."""

@@ -1,7 +1,8 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
-Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_counters``,
-``patch_counters``. Static columns: the structure's tables, ``driver_type`` and the names of the counters.
+Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
+``bus_since_ns``, ``bus_counters``, ``patch_counters``. Static columns: the structure's tables, ``driver_type`` and the
+names of the counters.
 """
 
 from __future__ import annotations
@@ -59,6 +60,20 @@ class DriverFrame(Frame):
     def bus_state(self) -> npt.NDArray[np.uint8]:
         """(n_buses,) uint8, :class:`skinware.status.BusState`."""
         return self.column("bus_state")
+
+    @property
+    def bus_reason(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not tell."""
+        return self._of_buses("bus_reason", np.uint8)
+
+    @property
+    def bus_since_ns(self) -> npt.NDArray[np.int64]:
+        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
+        return self._of_buses("bus_since_ns", np.int64)
+
+    def _of_buses(self, name: str, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """A column that drivers of version 1.0 need not have."""
+        return self.column(name) if name in self._columns else np.zeros(len(self.structure.buses), dtype)
 
     def physical(self, type_name: str) -> npt.NDArray[np.float32]:
         """(n,) float32: values of all sensors of a type, in the type's unit, in the order of ``structure.index``."""
@@ -194,6 +209,8 @@ class DriverWriter:
             "module_time_ns": ("<i8", structure.n_modules),
             "patch_state": ("u1", structure.n_patches),
             "bus_state": ("u1", len(structure.buses)),
+            "bus_reason": ("u1", len(structure.buses)),
+            "bus_since_ns": ("<i8", len(structure.buses)),
             "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
             "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
         }
@@ -259,6 +276,8 @@ class DriverReader(ServiceReader[DriverFrame]):
                 "patch_state": structure.n_patches,
                 "bus_state": len(structure.buses),
             }
+            for name in columns.keys() & {"bus_reason", "bus_since_ns"}:
+                expected[name] = len(structure.buses)
             for name, count in expected.items():
                 if columns[name].count != count:
                     raise StructureError(f"{columns[name].count} {name} for {count} rows of the structure")

@@ -91,7 +91,8 @@ class Link:
         self._waiters.append(entry)
         try:
             await self.send(identifier, payload)
-            return await asyncio.wait_for(queue.get(), timeout_s)
+            async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
+                return await queue.get()
         except TimeoutError:
             raise HandshakeTimeout(
                 f"{self.bus_name}: no answer to {identifier:03X} [{payload.hex(' ').upper()}] within {timeout_s:g} s"

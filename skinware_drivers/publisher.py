@@ -17,7 +17,7 @@ from skinware_drivers.bus import BusCounters
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed")
+OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed", "overflows", "bus_offs")
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
@@ -93,6 +93,8 @@ class Publisher:
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
+        self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
+        self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -168,6 +170,8 @@ class Publisher:
         self._fill_status(columns["status"], time_ns)
         columns["patch_state"][:] = self.patch_state
         columns["bus_state"][:] = self.bus_state
+        columns["bus_reason"][:] = self.bus_reason
+        columns["bus_since_ns"][:] = self.bus_since_ns
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         self._writer.commit(state.newest_ns or time_ns)
@@ -182,8 +186,17 @@ class Publisher:
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         for row, c in zip(self._counts, self.bus_counters, strict=True):
-            own = c.frames, c.lost, c.error_frames, c.refused, c.sent, c.send_failures, c.polls_missed
-            row[: len(OWN_BUS_COUNTERS)] = own
+            row[: len(OWN_BUS_COUNTERS)] = (
+                c.frames,
+                c.lost,
+                c.error_frames,
+                c.refused,
+                c.sent,
+                c.send_failures,
+                c.polls_missed,
+                c.overflows,
+                c.bus_offs,
+            )
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 

@@ -180,8 +180,10 @@ class Runner:
                 if line.lost.is_set():
                     await line.reopen()
                 await self._recover_silent_patches(line)
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
+                with contextlib.suppress(TimeoutError):
+                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
+                    async with asyncio.timeout(self._silence_ns / NS_PER_S):
+                        await line.lost.wait()
         finally:
             for task in beside:
                 task.cancel()
@@ -383,6 +385,8 @@ class Runner:
             line.look(self._silence_ns)
             if self.publisher is not None:
                 self.publisher.bus_state[line.ordinal] = line.state
+                self.publisher.bus_reason[line.ordinal] = line.reason
+                self.publisher.bus_since_ns[line.ordinal] = line.since_ns
 
     @property
     def _silence_ns(self) -> int:

@@ -19,7 +19,10 @@ import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
+from skinware_drivers.can.interface import read_controller
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/net_tstamp.h, linux/sockios.h; CPython lacks the names
 _SOL_CAN_RAW = 101
@@ -32,6 +35,7 @@ _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
+_AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 _CONTROL_WORDS = 4  # cmsghdr (2 words), then a timespec
 WANTED_BUFFER_BYTES = 8 << 20
@@ -85,6 +89,9 @@ class SocketCanBus(Bus):
         self.granted_buffer = 0
         self._last_poll_ns = 0
         self._rows = _Rows(FrameBatch(1, payload_size))
+        self._health = ControllerHealth()
+        self._is_bound = False
+        self._restarts_itself = True
 
     def open(self) -> None:
         """Open and bind the socket.
@@ -101,8 +108,8 @@ class SocketCanBus(Bus):
                 ) from None
             raise BusNotAvailable(f"bus {self.channel}: cannot open a CAN socket ({error.strerror})") from None
         try:
-            if self.payload_size > 8:
-                sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
+            # also where the layout has none: that there are FD frames on the bus explains why no others are heard
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
             sock.bind((self.channel,))
             if not _is_up(sock, self.channel):
@@ -111,11 +118,14 @@ class SocketCanBus(Bus):
                 )
         except OSError as error:
             sock.close()
-            raise BusNotAvailable(_why_not_bound(self.channel, error)) from None
+            raise _why_not_bound(self.channel, error) from None
         except BusNotAvailable:
             sock.close()
             raise
         self.adopt(sock)
+        self._is_bound = True
+        self._health.reset()
+        self._ask_kernel()
 
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
@@ -130,13 +140,39 @@ class SocketCanBus(Bus):
 
     @property
     def note(self) -> str:
-        """A receive buffer that is smaller than was asked for, and what to do about it."""
-        if not self._socket or self.granted_buffer >= self._wanted_buffer:
-            return ""
-        return (
-            f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted_buffer} wanted;"
-            f" for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted_buffer}"
-        )
+        """A receive buffer that is smaller than was asked for, a controller that stays off; and what to do about it."""
+        notes = []
+        if self._socket and self.granted_buffer < self._wanted_buffer:
+            notes.append(
+                f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted_buffer}"
+                f" wanted; for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted_buffer}"
+            )
+        if not self._restarts_itself:
+            notes.append(
+                f"bus {self.channel}: its controller will not come back from bus-off by itself; to let it:"
+                f" ip link set {self.channel} down; ip link set {self.channel} type can restart-ms 100;"
+                f" ip link set {self.channel} up"
+            )
+        return "\n".join(notes)
+
+    def check(self) -> None:
+        """Ask the kernel for the interface's and its controller's state; see :class:`skinware_drivers.bus.Bus`."""
+        if self._socket is None or not self._is_bound:
+            return
+        name = str(self._socket.getsockname()[0])
+        if not name:
+            raise BusNotAvailable(f"bus {self.channel} vanished")
+        try:
+            is_up = _is_up(self._socket, name)
+        except OSError as error:
+            raise BusNotAvailable(f"bus {self.channel} vanished ({error.strerror})") from None
+        if not is_up:
+            raise BusNotAvailable(f"bus {self.channel} went down", is_down=True)
+        self._ask_kernel()
+
+    def reason(self, time_ns: int) -> BusReason:
+        """What the controller tells is wrong."""
+        return self._health.reason(time_ns)
 
     def fileno(self) -> int:
         """The socket, -1 while closed."""
@@ -159,6 +195,7 @@ class SocketCanBus(Bus):
         kept = self._sort_out(batch, first, count)
         batch.stop += kept
         self.counters.frames += kept
+        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         self.counters.lost = self._lost_before + self._kernel_drops()
         return kept
 
@@ -182,13 +219,24 @@ class SocketCanBus(Bus):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+            self._is_bound = False
+
+    def _ask_kernel(self) -> None:
+        """Learn what error frames may not have told."""
+        controller = read_controller(self.channel)
+        if controller is None:
+            return
+        self._restarts_itself = controller.restart_ms > 0
+        if controller.state is not None and controller.state < len(CONTROLLER_STATES):
+            self._health.believe(CONTROLLER_STATES[controller.state])
 
     def _nothing_received(self, number: int) -> int:
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:
             raise BusNotAvailable(f"bus {self.channel} went down", is_down=True)
-        raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})")
+        reason = BusReason.INTERFACE_GONE if number in _AWAY else BusReason.FAILED
+        raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
     def _stamps(self, control: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Kernel stamps on our clock: CLOCK_REALTIME with an offset sampled now, so that clock steps do no harm."""
@@ -202,20 +250,36 @@ class SocketCanBus(Bus):
         return stamps
 
     def _sort_out(self, batch: FrameBatch, first: int, count: int) -> int:
-        """Take error and remote frames out of the new rows; returns how many are left."""
+        """Take what is no data frame of this layout out of the new rows; returns how many are left."""
         rows = slice(first, first + count)
-        identifier = batch.wire["identifier"][rows]
+        identifier, length = batch.wire["identifier"][rows], batch.wire["length"][rows]
         flags = np.uint32(ERROR_FLAG | REMOTE_FLAG)
-        if not np.bitwise_or.reduce(identifier) & flags:
+        if not np.bitwise_or.reduce(identifier) & flags and not self._rows.any_cut(rows):
+            self._health.heard_data()
             return count
-        special = identifier & flags
-        is_error = (special & np.uint32(ERROR_FLAG)) != 0
-        self.counters.error_frames += int(is_error.sum())
-        self.counters.refused += int(((special != 0) & ~is_error).sum())
-        good = first + np.flatnonzero(special == 0)
+        is_error = (identifier & np.uint32(ERROR_FLAG)) != 0
+        other = ((identifier & np.uint32(REMOTE_FLAG)) != 0) | (length > batch.payload_size) | self._rows.cut(rows)
+        other &= ~is_error
+        self.counters.error_frames += int(np.count_nonzero(is_error))
+        self.counters.refused += int(np.count_nonzero(other))
+        good = np.flatnonzero(~(is_error | other))
+        self._take_errors(np.flatnonzero(is_error), good, identifier, batch.wire["payload"][rows])
+        good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]
         return len(good)
+
+    def _take_errors(
+        self,
+        errors: npt.NDArray[np.int64],
+        good: npt.NDArray[np.int64],
+        identifier: npt.NDArray[np.uint32],
+        payload: npt.NDArray[np.uint8],
+    ) -> None:
+        if len(errors):
+            self._health.take(identifier[errors], payload[errors], self._last_poll_ns)
+        if len(good) and (not len(errors) or good[-1] > errors[-1]):
+            self._health.heard_data()
 
     def _kernel_drops(self) -> int:
         if self._socket is None:
@@ -244,6 +308,7 @@ class _Rows:
         self._headers["iov_count"] = 1
         self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
         self._control_length = self._headers["control_length"]
+        self._flags = self._headers["flags"]
         self._address = self._headers.ctypes.data
 
     def receive(self, fd: int) -> int:
@@ -253,6 +318,15 @@ class _Rows:
         address = self._address + _MMSGHDR.itemsize * first
         count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
         return count
+
+    def any_cut(self, rows: slice) -> bool:
+        """Whether one of these frames was longer than a row: an FD frame where the layout knows none."""
+        return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
+
+    def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which of them were."""
+        found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
+        return found
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:
@@ -270,10 +344,11 @@ def _is_up(sock: socket.socket, interface: str) -> bool:
     return bool(flags & _IFF_UP)
 
 
-def _why_not_bound(interface: str, error: OSError) -> str:
+def _why_not_bound(interface: str, error: OSError) -> BusNotAvailable:
     if error.errno == errno.ENODEV:
         others = ", ".join(name for _, name in socket.if_nameindex() if "can" in name) or "none"
-        return f"there is no CAN interface {interface!r}; CAN interfaces here: {others} (see: ip link)"
+        return BusNotAvailable(f"there is no CAN interface {interface!r}; CAN interfaces here: {others} (see: ip link)")
     if error.errno in (errno.EPERM, errno.EACCES):
-        return f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
-    return f"bus {interface}: cannot be opened ({error.strerror})"
+        why = f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
+        return BusNotAvailable(why, reason=BusReason.REFUSED)
+    return BusNotAvailable(f"bus {interface}: cannot be opened ({error.strerror})", reason=BusReason.FAILED)

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from skinware import BusReason
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can import socketcan
@@ -229,6 +230,72 @@ def test_error_and_remote_frames_are_counted_and_kept_out(cable: Cable) -> None:
     assert batch.wire["payload"][: len(batch), 0].tolist() == [0, 2, 5]
     assert np.all(batch.time_ns[: len(batch)] > 0)
     assert (bus.counters.frames, bus.counters.error_frames, bus.counters.refused) == (3, 2, 1)
+
+
+def test_fd_frames_on_a_classic_layout_are_counted_whatever_their_length(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    for identifier, length in ((0x111, 64), (0x222, 3), (0x333, 12)):
+        cable.out.send(struct.pack("=IBB2x64s", identifier, length, 4, bytes(range(64))))
+    cable.put(0x444)
+    batch = FrameBatch(10)
+    drain(bus, batch)
+    assert batch.wire["identifier"][: len(batch)].tolist() == [0x444]
+    assert (bus.counters.frames, bus.counters.refused, bus.counters.error_frames) == (1, 3, 0)
+
+
+def test_fd_frames_are_data_of_a_layout_that_has_some(cable: Cable) -> None:
+    bus = SocketCanBus("can0", payload_size=64)
+    bus.adopt(cable.end)
+    cable.out.send(struct.pack("=IBB2x64s", 0x111, 64, 4, bytes(range(64))))
+    cable.put(0x222)
+    batch = FrameBatch(10, 64)
+    drain(bus, batch)
+    assert batch.wire["identifier"][: len(batch)].tolist() == [0x111, 0x222]
+    assert batch.wire["payload"][0].tolist() == list(range(64))
+    assert bus.counters.refused == 0
+
+
+PASSIVE, OFF = "0010000000000000", "00" * 8
+
+
+def test_what_the_controller_says_is_known_and_counted(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch = FrameBatch(10)
+    cable.put(0x111)
+    cable.put(ERROR_FLAG | 0x4, bytes.fromhex(PASSIVE))
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.ERROR_PASSIVE
+    cable.put(0x111)
+    cable.put(ERROR_FLAG | 0x40, bytes.fromhex(OFF))
+    drain(bus, batch)  # data before the error frame says nothing
+    assert bus.reason(time.monotonic_ns()) == BusReason.BUS_OFF
+    cable.put(0x111)
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.NONE
+    cable.put(ERROR_FLAG | 0x40, bytes.fromhex(OFF))
+    cable.put(0x111)
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.NONE
+    assert (bus.counters.bus_offs, bus.counters.error_frames, bus.counters.frames) == (2, 3, 4)
+
+
+def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch, seen = FrameBatch(64), []
+    for number in range(20):
+        for _ in range(100):
+            cable.put(ERROR_FLAG | 0x8C, bytes.fromhex("0001040A00000000"))
+        cable.put(number)
+        while True:
+            batch.clear()
+            if not bus.receive(batch, 0) and not bus.counters.error_frames % 100:
+                break
+            seen += batch.wire["identifier"][: len(batch)].tolist()
+    assert seen == list(range(20))
+    assert (bus.counters.error_frames, bus.counters.overflows, bus.counters.lost) == (2000, 2000, 0)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from skinware.driver_service import DriverWriter
+from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
 from skinware.status import PatchState
 from skinware_drivers.bus_line import BusLine
@@ -34,6 +35,8 @@ def figures(
                 "bus": lines[int(structure.patch_bus[patch])].name,
                 "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
                 "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
+                "interval": _bounds(publisher.timing.intervals[patch].tolist()),
+                "age": _bounds(publisher.timing.ages[patch].tolist()),
                 **counters,
             }
         )
@@ -44,3 +47,8 @@ def _bus(line: BusLine) -> dict[str, Any]:
     state_age_s = round((now_ns() - line.since_ns) / 1e9, 3)
     reason = line.reason.name.lower() if line.reason else None
     return {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
+
+
+def _bounds(counts: list[int]) -> dict[str, int | None]:
+    histogram = Histogram(counts)
+    return {"p50_ns": histogram.quantile_ns(0.5), "p99_ns": histogram.quantile_ns(0.99)}

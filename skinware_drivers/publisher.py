@@ -15,6 +15,7 @@ from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
 from skinware_drivers.bus import BusCounters
 from skinware_drivers.decoder import Decoder
+from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
 OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed", "overflows", "bus_offs")
@@ -86,6 +87,7 @@ class Publisher:
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
         self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show)
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
+        self.timing = PatchTiming(structure)
         self._behind = np.zeros(structure.n_modules, bool)
         self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
         self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
@@ -164,6 +166,7 @@ class Publisher:
 
     def _write(self, time_ns: int) -> None:
         state = self._state
+        self.timing.count(state.updated, state.module_time_ns, time_ns)
         columns = self._writer.begin()
         columns["values"][:] = state.values
         columns["module_time_ns"][:] = state.module_time_ns
@@ -174,6 +177,8 @@ class Publisher:
         columns["bus_since_ns"][:] = self.bus_since_ns
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
+        columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)
+        columns["patch_age_counts"][:] = self.timing.ages.reshape(-1)
         self._writer.commit(state.newest_ns or time_ns)
         if self._desk is not None and self._desk.waited_for:
             self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)

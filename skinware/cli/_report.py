@@ -21,7 +21,7 @@ from skinware.errors import BadServiceFile, ConfigurationError, Overrun, Service
 from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.memory.statistics import WriterStatistics
+from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 
@@ -127,11 +127,11 @@ def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
         name: {"count": s.count, "best_ns": s.best_ns, "mean_ns": round(s.mean_ns), "worst_ns": s.worst_ns}
         for name, s in (("wall", of.wall), ("cpu", of.cpu))
     }
-    histograms = {
-        name: {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
-        for name, h in (("age", of.age), ("lateness", of.lateness))
-    }
-    return spreads | histograms
+    return spreads | {"age": _histogram(of.age), "lateness": _histogram(of.lateness)}
+
+
+def _histogram(h: Histogram) -> dict[str, Any]:
+    return {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
 
 
 def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
@@ -200,6 +200,8 @@ def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list
         entry["state"] = patch_state_name(int(frame.patch_state[patch]))
         entry["age_ms"] = None if age_ns is None else round(age_ns / 1e6, 3)
         entry["fresh"] = fresh[patch]
+        entry["interval"] = _histogram(Histogram(frame.patch_interval_counts[patch].tolist()))
+        entry["age"] = _histogram(Histogram(frame.patch_age_counts[patch].tolist()))
     return [
         _with_counters(entry, counters) for entry, counters in zip(entries, driver.patch_counters(frame), strict=True)
     ]

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _WATCH_PERIOD_S = 1.0
 _OF_A_BUS = {"reason": "reason", "for": "state_age_s"}
 """What is shown of a bus where it is told: the column's title and the key in the report."""
+_OF_A_PATCH = {"99 % apart": "interval", "99 % aged": "age"}
+"""Likewise: bounds of the time between two updates of a module, and of an update's age when it was published."""
 _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
@@ -81,6 +83,8 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
     told = {title: key for title, key in _OF_A_BUS.items() if any(bus.get(key) is not None for bus in driver["buses"])}
+    timed = _OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
+    timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     lines = [
         f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
         f"sensors: {', '.join(units)}",
@@ -94,13 +98,14 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         "",
         *_counter_table(
             driver["patch_list"],
-            ("patch", "bus", "state", "fresh sensors", "age"),
+            ("patch", "bus", "state", "fresh sensors", "age", *timed),
             lambda patch: (
                 patch["name"],
                 patch["bus"],
                 _state(driver, patch),
                 f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
                 age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+                *(_bound(patch[key]) for key in timed.values()),
             ),
             {"orphans"},
         ),
@@ -179,6 +184,7 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
 
 
 _OWN_KEYS = {"name", "state", "reason", "state_age_s", "bus", "age_ms", "modules", "sensors", "fresh"}
+_OWN_KEYS |= set(_OF_A_PATCH.values())
 
 
 def _counter_table(

@@ -12,60 +12,52 @@ import fcntl
 import os
 import socket
 import struct
-import time
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
+from skinware_drivers.can.recvmmsg import Rows
+from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
+from skinware_drivers.options import options_from_strings
 
-# linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/net_tstamp.h, linux/sockios.h; CPython lacks the names
+# linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
 _SOL_CAN_RAW = 101
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
-_SO_TIMESTAMPNS = 35
 _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
-_CONTROL_WORDS = 4  # cmsghdr (2 words), then a timespec
 WANTED_BUFFER_BYTES = 8 << 20
 """Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
 
-_MMSGHDR = np.dtype(
-    [
-        ("name", np.uint64),
-        ("name_length", np.uint64),
-        ("iov", np.uint64),
-        ("iov_count", np.uint64),
-        ("control", np.uint64),
-        ("control_length", np.uint64),
-        ("flags", np.uint64),
-        ("length", np.uint64),
-    ]
-)
-"""``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
-_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
 
-_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
-_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
-_recvmmsg.restype = ctypes.c_int
+class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What can be said behind a CAN interface's name: ``can0?buffer=100000``."""
+
+    buffer: Annotated[int, msgspec.Meta(description="receive buffer, bytes", ge=1)] = WANTED_BUFFER_BYTES
+    timestamps: Annotated[
+        Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
+    ] = "auto"
 
 
 class SocketCanBus(Bus):
     """A CAN interface of the kernel (``can0``, ``vcan0``, ``slcan0``).
 
-    Options: ``buffer``: receive buffer in bytes, default 8 MiB. The bit rate is set where the interface is set up
-    (``ip link set can0 type can bitrate 1000000``).
+    Options: :class:`SocketCanOptions`. The bit rate is set where the interface is set up (``ip link set can0 type can
+    bitrate 1000000``).
     """
 
     def __init__(
@@ -77,18 +69,15 @@ class SocketCanBus(Bus):
         listen_only: bool = False,
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        unknown = set(self.options) - {"buffer"}
-        if unknown:
-            raise ConfigurationError(f"bus {channel}: unknown option {sorted(unknown)[0]!r}. Known: buffer")
         try:
-            self._wanted_buffer = int(self.options.get("buffer", WANTED_BUFFER_BYTES))
-        except ValueError:
-            raise ConfigurationError(f"bus {channel}: buffer={self.options['buffer']} is no number of bytes") from None
+            self._wanted = options_from_strings(SocketCanOptions, self.options)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"bus {channel}: {error}") from None
         self._socket: socket.socket | None = None
         self._lost_before = 0
         self.granted_buffer = 0
-        self._last_poll_ns = 0
-        self._rows = _Rows(FrameBatch(1, payload_size))
+        self._stamper = Stamper()
+        self._rows = Rows(FrameBatch(1, payload_size))
         self._health = ControllerHealth()
         self._is_bound = False
         self._restarts_itself = True
@@ -129,24 +118,25 @@ class SocketCanBus(Bus):
 
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
-        self.granted_buffer = _enlarge_buffer(sock, self._wanted_buffer)
-        # not SO_TIMESTAMPING: that costs 20 ns a frame more, and leaves frames unstamped that came before the kernel
-        # began to stamp (in the background)
-        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self.granted_buffer = _enlarge_buffer(sock, self._wanted.buffer)
+        wants_hardware = self._wanted.timestamps != "software"
+        self._stamper = Stamper(wants_hardware and has_hardware_stamps(sock, self.channel))
+        self._stamper.switch_on(sock)
         sock.setblocking(False)
         self._socket = sock
         self._lost_before = self.counters.lost
-        self._last_poll_ns = now_ns()
 
     @property
     def note(self) -> str:
         """A receive buffer that is smaller than was asked for, a controller that stays off; and what to do about it."""
         notes = []
-        if self._socket and self.granted_buffer < self._wanted_buffer:
+        if self._socket and self.granted_buffer < self._wanted.buffer:
             notes.append(
-                f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted_buffer}"
-                f" wanted; for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted_buffer}"
+                f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted.buffer}"
+                f" wanted; for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted.buffer}"
             )
+        if self._socket and self._wanted.timestamps == "hardware" and not self._stamper.hardware:
+            notes.append(f"bus {self.channel}: its controller gives no time stamps; the kernel's are taken instead")
         if not self._restarts_itself:
             notes.append(
                 f"bus {self.channel}: its controller will not come back from bus-off by itself; to let it:"
@@ -185,12 +175,14 @@ class SocketCanBus(Bus):
         if not batch.free:
             return 0
         if self._rows.batch is not batch:
-            self._rows = _Rows(batch)
+            self._rows = Rows(batch)
         first = batch.stop
         count = self._rows.receive(self._socket.fileno())
         if count < 0:
             return self._nothing_received(ctypes.get_errno())
-        batch.time_ns[first : first + count] = self._stamps(self._rows.control[first : first + count])
+        batch.time_ns[first : first + count] = self._stamper.read(self._rows.control[first : first + count])
+        if self._stamper.hardware:
+            self._rows.forget(slice(first, first + count))
         batch.bus[first : first + count] = ordinal
         kept = self._sort_out(batch, first, count)
         batch.stop += kept
@@ -238,17 +230,6 @@ class SocketCanBus(Bus):
         reason = BusReason.INTERFACE_GONE if number in _AWAY else BusReason.FAILED
         raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
-    def _stamps(self, control: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Kernel stamps on our clock: CLOCK_REALTIME with an offset sampled now, so that clock steps do no harm."""
-        poll_ns = now_ns()
-        offset_ns = poll_ns - time.time_ns()
-        stamps = control[:, 2] * NS_PER_S + control[:, 3] + offset_ns
-        np.maximum(stamps, self._last_poll_ns, out=stamps)
-        np.minimum(stamps, poll_ns, out=stamps)
-        # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
-        self._last_poll_ns = min(int(stamps[-1]), poll_ns)
-        return stamps
-
     def _sort_out(self, batch: FrameBatch, first: int, count: int) -> int:
         """Take what is no data frame of this layout out of the new rows; returns how many are left."""
         rows = slice(first, first + count)
@@ -277,7 +258,7 @@ class SocketCanBus(Bus):
         payload: npt.NDArray[np.uint8],
     ) -> None:
         if len(errors):
-            self._health.take(identifier[errors], payload[errors], self._last_poll_ns)
+            self._health.take(identifier[errors], payload[errors], now_ns())
         if len(good) and (not len(errors) or good[-1] > errors[-1]):
             self._health.heard_data()
 
@@ -286,47 +267,6 @@ class SocketCanBus(Bus):
             return 0
         words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
         return words[_MEMINFO_DROPS]
-
-
-class _Rows:
-    """What ``recvmmsg`` needs to put frames straight into the rows of one batch, made once.
-
-    Attributes:
-        batch: the batch.
-        control: (capacity, 4) int64, ancillary data of each row.
-    """
-
-    def __init__(self, batch: FrameBatch) -> None:
-        capacity, rows = batch.capacity, np.arange(batch.capacity)
-        self.batch = batch
-        self.control = np.zeros((capacity, _CONTROL_WORDS), np.int64)
-        self._iov = np.zeros(capacity, _IOVEC)
-        self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
-        self._iov["length"] = batch.wire.strides[0]
-        self._headers = np.zeros(capacity, _MMSGHDR)
-        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * rows
-        self._headers["iov_count"] = 1
-        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
-        self._control_length = self._headers["control_length"]
-        self._flags = self._headers["flags"]
-        self._address = self._headers.ctypes.data
-
-    def receive(self, fd: int) -> int:
-        """Fill the free rows of the batch; returns how many were filled, -1 on an error (errno)."""
-        first, free = self.batch.stop, self.batch.free
-        self._control_length[first:] = 8 * _CONTROL_WORDS  # the kernel wrote what it used
-        address = self._address + _MMSGHDR.itemsize * first
-        count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
-        return count
-
-    def any_cut(self, rows: slice) -> bool:
-        """Whether one of these frames was longer than a row: an FD frame where the layout knows none."""
-        return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
-
-    def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which of them were."""
-        found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
-        return found
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:

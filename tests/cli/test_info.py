@@ -73,6 +73,8 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert (driver["state"], driver["driver_type"], driver["dtype"]) == ("live", "fake", "uint8")
     assert (driver["paused"], driver["missed_periods"]) == (False, 0)
     first, second = driver["patch_list"]
+    for times in (first.pop("interval"), first.pop("age")):
+        assert times == {"p50_ns": None, "p99_ns": None, "counts": [0] * 32}  # this driver does not tell
     assert first.pop("age_ms") >= 0
     assert first == {
         "name": "board 7",
@@ -100,6 +102,20 @@ def test_why_a_bus_is_as_it_is_and_for_how_long(capsys: pytest.CaptureFixture[st
     assert re.search(r"^  bus   state  reason +for  frames", out, re.MULTILINE)
     assert re.search(r"^  can0  down   bus-off  1\d\.\d s ", out, re.MULTILINE)
     assert re.search(r"^  can1  live   99 +-  ", out, re.MULTILINE)
+
+
+def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4)) as skin:
+        skin.interval_counts[0, 25] = skin.age_counts[:, 21] = 100  # 16.8 to 33.6 ms; 1.05 to 2.1 ms
+        skin.publish()
+        first, second = told(capsys)["drivers"][0]["patch_list"]
+        out = text(capsys)
+    assert (first["interval"]["p99_ns"], first["age"]["p50_ns"]) == (2**25 - 1, 2**21 - 1)
+    assert second["interval"]["p99_ns"] is None
+    assert first["interval"]["counts"][25] == 100
+    assert re.search(r"age  99 % apart  99 % aged", out)
+    assert re.search(r"board 7 .*ms +34 ms +2.1 ms", out)
+    assert re.search(r"board 8 .*ms +- +2.1 ms", out)
 
 
 def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:

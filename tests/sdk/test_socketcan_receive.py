@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 from skinware import BusReason
-from skinware.errors import BusNotAvailable, BusSendError
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can import socketcan
+from skinware_drivers.can import recvmmsg, socketcan
 from skinware_drivers.can.socketcan import SocketCanBus
+from tests.conftest import wait_until
 
 SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
 RMEM_MAX = "/proc/sys/net/core/rmem_max"
 
 
@@ -53,6 +55,25 @@ class Cable:
     def close(self) -> None:
         self.end.close()
         self.out.close()
+
+
+@pytest.fixture(autouse=True)
+def stamping() -> Iterator[None]:
+    """The kernel begins to stamp a while after the first socket has asked for it, and goes on as long as one does."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", 0))
+        end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+
+        def is_stamped_at_once() -> bool:
+            end.sendto(b"", end.getsockname())
+            sent_ns = time.time_ns()
+            pass_ms(5)
+            _, ((_, _, stamp),), _, _ = end.recvmsg(10, 100)
+            seconds, nanoseconds = struct.unpack("=qq", stamp)
+            return bool(seconds * 10**9 + nanoseconds < sent_ns + 2_000_000)
+
+        wait_until(is_stamped_at_once)
+        yield
 
 
 @pytest.fixture
@@ -194,25 +215,71 @@ def test_stamps_tell_when_a_frame_arrived_not_when_it_was_fetched(cable: Cable) 
     assert np.all(np.diff(stamps) >= 0)
 
 
-@pytest.mark.parametrize("step_s", [3600, -3600])
-def test_a_step_of_the_wall_clock_bends_no_stamp_for_long(
-    cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: int
-) -> None:
+@pytest.mark.parametrize("step_s", [3600, -3600, 0.5, -0.5])
+def test_a_step_of_the_wall_clock_bends_no_stamp(cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: float) -> None:
     bus = SocketCanBus("can0")
-    opened_ns = time.monotonic_ns()
     bus.adopt(cable.end)
-    real = time.time_ns
-    monkeypatch.setattr(time, "time_ns", lambda: real() + step_s * 10**9)
+    batch = FrameBatch(10)
+    real, bounds = time.time_ns, []
+    for number in range(4):  # the clock is set to and fro, each time when a frame has been stamped and not yet fetched
+        pass_ms(5)
+        before_ns = time.monotonic_ns()
+        cable.put(0x123)
+        bounds.append((before_ns, time.monotonic_ns()))
+        pass_ms(20)
+        step_ns = round(step_s * 1e9) * (number % 2 == 0)
+        monkeypatch.setattr(time, "time_ns", lambda step_ns=step_ns: real() + step_ns)
+        # what is fetched now was stamped by a clock that was set since then
+        drain(bus, batch)
+    slack_ns = 2_000_000  # two clocks are read one after the other
+    for (before_ns, after_ns), stamp in zip(bounds, batch.time_ns[:4].tolist(), strict=True):
+        assert before_ns - slack_ns <= stamp <= after_ns + slack_ns
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ({"buffer": "big"}, "bus can0: option buffer=big: "),
+        ({"buffer": "0"}, "bus can0: option buffer=0: "),
+        ({"timestamps": "best"}, "bus can0: option timestamps=best: "),
+        ({"bufer": "1"}, "bus can0: unknown option 'bufer'; did you mean 'buffer'?"),
+    ],
+)
+def test_options_that_are_wrong_are_refused(query: dict[str, str], words: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        SocketCanBus("can0", query)
+    assert str(caught.value).startswith(words)
+
+
+def test_an_interface_without_stamps_of_its_own_says_so_where_they_were_asked_for(cable: Cable) -> None:
+    bus = SocketCanBus("lo", {"timestamps": "hardware", "buffer": "20000"})
+    bus.adopt(cable.end)
+    assert bus.note == "bus lo: its controller gives no time stamps; the kernel's are taken instead"
     cable.put(0x123)
     batch = FrameBatch(10)
     drain(bus, batch)
-    assert opened_ns <= batch.time_ns[0] <= time.monotonic_ns()
-    monkeypatch.setattr(time, "time_ns", real)
-    cable.put(0x123)
-    sent_ns = time.monotonic_ns()
-    pass_ms(20)
-    drain(bus, batch)
-    assert batch.time_ns[1] <= sent_ns + 5_000_000  # not clipped to the moment of the poll
+    assert batch.time_ns[0] > 0
+
+
+def test_stamping_with_hardware_takes_the_kernels_where_there_are_no_others(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socketcan, "has_hardware_stamps", lambda *_: True)
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch = FrameBatch(100)
+    for _ in range(3):
+        pass_ms(10)
+        before_ns = time.monotonic_ns()
+        for _ in range(10):
+            cable.put(0x123)
+        after_ns = time.monotonic_ns()
+        pass_ms(10)
+        first = batch.stop
+        drain(bus, batch)
+        stamps = batch.time_ns[first : batch.stop]
+        assert before_ns - 5_000_000 <= stamps.min()
+        assert stamps.max() <= after_ns + 5_000_000
 
 
 # What is no data
@@ -307,7 +374,7 @@ def test_an_interface_that_fails_says_how(
 ) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     with pytest.raises(BusNotAvailable, match=words) as caught:
         bus.receive(FrameBatch(10), 0)
     assert caught.value.is_down is is_down
@@ -317,7 +384,7 @@ def test_an_interface_that_fails_says_how(
 def test_nothing_to_receive_is_no_failure(cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     assert bus.receive(FrameBatch(10), 0) == 0
 
 

@@ -18,7 +18,17 @@ from skinware_drivers.decoder import Decoder
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed", "overflows", "bus_offs")
+OWN_BUS_COUNTERS = (
+    "frames",
+    "lost",
+    "errors",
+    "refused",
+    "sent",
+    "send_failures",
+    "polls_missed",
+    "overflows",
+    "bus_offs",
+)
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS

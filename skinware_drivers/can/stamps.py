@@ -78,7 +78,8 @@ class Stamper:
         self._offset_ns, poll_ns = _offset_now_ns()
         software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]
         stamps: Stamps = software + self._offset_ns
-        if abs(self._offset_ns - before_ns) > _SLEW_NS:
+        is_step = abs(self._offset_ns - before_ns) > _SLEW_NS
+        if is_step:
             other = software + before_ns
             is_other = (other >= self._last_poll_ns) & (other <= poll_ns)
             is_other &= (stamps < self._last_poll_ns) | (stamps > poll_ns)
@@ -87,6 +88,8 @@ class Stamper:
             stamps[software == 0] = poll_ns
         np.maximum(stamps, self._last_poll_ns, out=stamps)
         np.minimum(stamps, poll_ns, out=stamps)
+        if is_step:
+            np.maximum.accumulate(stamps, out=stamps)
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
         self._last_poll_ns = min(int(stamps[-1]), poll_ns)
         if self.hardware:

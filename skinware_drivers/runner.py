@@ -181,6 +181,7 @@ class Runner:
                     await line.reopen()
                 await self._recover_silent_patches(line)
                 with contextlib.suppress(TimeoutError):
+                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
                     async with asyncio.timeout(self._silence_ns / NS_PER_S):
                         await line.lost.wait()
         finally:
@@ -386,6 +387,8 @@ class Runner:
             line.look(self._silence_ns)
             if self.publisher is not None:
                 self.publisher.bus_state[line.ordinal] = line.state
+                self.publisher.bus_reason[line.ordinal] = line.reason
+                self.publisher.bus_since_ns[line.ordinal] = line.since_ns
 
     @property
     def _silence_ns(self) -> int:

@@ -33,7 +33,8 @@ from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Pub
 log = logging.getLogger("skinware.driver")
 
 _BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
-_TURNS = 8  # batches per wake-up before handshakes and timers get their turn
+_TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
+_REST, _LONGEST_REST_S = 4, 0.005  # after a take: so many times its duration, while more arrives (decision 0006)
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
 
@@ -90,6 +91,7 @@ class Runner:
         self._failure: BaseException | None = None
         self._built = asyncio.Condition()
         self._timer: asyncio.TimerHandle | None = None
+        self._rest: asyncio.TimerHandle | None = None
         self._known_patch_state = np.zeros(0, np.uint8)
         self._join_requested = asyncio.Event()
         self._begun_ns = 0  # the present generation
@@ -155,8 +157,9 @@ class Runner:
         for line in self.lines:
             await line.stop()
         loop.remove_reader(self._epoll.fileno())
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._rest):
+            if timer is not None:
+                timer.cancel()
         for line in self.lines:
             line.bus.close()
         self._epoll.close()
@@ -177,8 +180,10 @@ class Runner:
                 if line.lost.is_set():
                     await line.reopen()
                 await self._recover_silent_patches(line)
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
+                with contextlib.suppress(TimeoutError):
+                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
+                    async with asyncio.timeout(self._silence_ns / NS_PER_S):
+                        await line.lost.wait()
         finally:
             for task in beside:
                 task.cancel()
@@ -302,25 +307,43 @@ class Runner:
     # -- data -----------------------------------------------------------------------------------------------------
 
     def _on_readable(self) -> None:
-        for _ in range(_TURNS):
+        """Take what has arrived, then let more arrive before the next look: a batch costs little more than a frame."""
+        loop = asyncio.get_running_loop()
+        begun_ns = now_ns()
+        taken = self._take_frames()
+        if taken == "nothing":
+            loop.add_reader(self._epoll.fileno(), self._on_readable)
+        else:
+            loop.remove_reader(self._epoll.fileno())
+            rest_s = min(_REST * (now_ns() - begun_ns) / NS_PER_S, _LONGEST_REST_S)
+            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
+
+    def _take_frames(self) -> Literal["nothing", "all", "some"]:
+        """Take what has arrived, of every bus its share."""
+        for turn in range(_TURNS):
             events = self._epoll.poll(0)
             if not events:
-                break
+                return "all" if turn else "nothing"
             if self.decoder is not None:
                 self.decoder.put_back(self._batch)
             else:
                 self._batch.clear()
             time_ns = now_ns()
-            for fd, _ in events:
-                line = next((line for line in self.lines if line.bus.fileno() == fd), None)
-                if line is None:
-                    continue
+            is_behind = False
+            batch, by_fd = self._batch, {line.bus.fileno(): line for line in self.lines}
+            ready = [by_fd[fd] for fd, _ in events if fd in by_fd]
+            for number, line in enumerate(ready):
+                batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
                 try:
-                    if line.bus.receive(self._batch, line.ordinal):
+                    if line.bus.receive(batch, line.ordinal):
                         line.heard_ns = time_ns
+                        is_behind |= not batch.free
                 except BusNotAvailable as error:
                     line.lose(error)
             self._digest()
+            if not is_behind:
+                return "all"
+        return "some"
 
     def _digest(self) -> None:
         batch = self._batch
@@ -340,7 +363,7 @@ class Runner:
     def _publish_when_due(self) -> None:
         if self.publisher is None:
             return
-        self._on_readable()  # what has arrived comes first: this may be late
+        self._take_frames()  # what has arrived comes first: this may be late
         self._update_bus_states()
         self.publisher.publish_if_due()
         self._log_patches()
@@ -364,6 +387,8 @@ class Runner:
             line.look(self._silence_ns)
             if self.publisher is not None:
                 self.publisher.bus_state[line.ordinal] = line.state
+                self.publisher.bus_reason[line.ordinal] = line.reason
+                self.publisher.bus_since_ns[line.ordinal] = line.since_ns
 
     @property
     def _silence_ns(self) -> int:

@@ -48,7 +48,7 @@ _BETWEEN_DAMAGES = 5
 _RATE_TOLERANCE = 0.3
 _SILENCE_S = 3.0
 _RESTART_S = 20.0
-_MANY_BURSTS = 30
+_MANY_BURSTS = 60
 _MOST_GROWN = 16 * 1024
 _STALE = np.uint8(Status.STALE | Status.NEVER_SEEN)
 
@@ -248,13 +248,12 @@ class DriverConformance:
                 await rig.until_fresh()
                 await rig.sleep(10 * rig.adapter.period_s)
                 rig.truth.remember = rig.wire.remember = False  # what grows is then the driver's
-                grown = await _grown(rig)
-            for where, (count, size) in grown.items():
-                require(
-                    count < _MANY_BURSTS // 2 and size < _MOST_GROWN,
-                    f"memory grows with the data: {count} pieces and {size} bytes more every {_MANY_BURSTS} bursts,"
-                    f" made at {where}",
-                )
+                pieces, size, where = await _grown(rig)
+            require(
+                pieces < _MANY_BURSTS * 3 // 4 and size < _MOST_GROWN,
+                f"memory grows with the data: {pieces} pieces and {size} bytes more every {_MANY_BURSTS} bursts; most"
+                f" was made at {where}",
+            )
 
         play(scenario)
 
@@ -348,12 +347,12 @@ class DriverConformance:
                 comparison.require_complete(comparison.spoilt(), f" (others were {fault})")
                 if fault == "truncated" and rig.adapter.medium == "can":
                     right = {length for frame in rig.adapter.layout.frames for length in frame.length}
-                    short = [damage for damage in rig.wire.damages if len(damage.payload) not in right]
+                    least = sum(len(damage.payload) not in right for damage in rig.wire.damages)
                     counted = rig.counters()["bad_length"]
                     require(
-                        counted == len(short),
-                        f"{len(short)} frames were cut to lengths that the layout does not know, but {counted} were"
-                        " counted as of wrong length",
+                        least <= counted <= len(rig.wire.damages),
+                        f"{least} frames were cut to lengths that the layout does not know, and {counted} were counted"
+                        " as of wrong length",
                     )
                 self._require_all_counted(rig)
 
@@ -586,31 +585,29 @@ class DriverConformance:
         play(scenario)
 
 
-async def _grown(rig: Running) -> dict[tracemalloc.Traceback, tuple[int, int]]:
-    """By where it was made: (pieces, bytes) that came in each of two stretches of time and stayed.
+async def _grown(rig: Running) -> tuple[int, int, str]:
+    """Pieces and bytes that came in each of two stretches of time and stayed, and where most of them were made.
 
-    What only fills a cache (numpy has some) does so in one of the two.
+    What only fills a cache (numpy has some) does so in one of the two. Where a piece was made is sometimes told
+    wrongly, as Python uses the memory of small ones again: only the sum is to be trusted.
     """
     snapshots = []
     tracemalloc.start(1)
     try:
-        for _ in range(3):
-            await rig.sleep(_MANY_BURSTS * rig.adapter.period_s)
+        for bursts in (_MANY_BURSTS // 3, _MANY_BURSTS, _MANY_BURSTS):
+            await rig.sleep(bursts * rig.adapter.period_s)
             gc.collect()
-            snapshots.append(tracemalloc.take_snapshot())
+            snapshots.append(
+                tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(False, tracemalloc.__file__)])
+            )
     finally:
         tracemalloc.stop()
-    ours = [tracemalloc.Filter(False, f"*/skinware_drivers/{part}/*") for part in ("testing", "virtual")]
-    first, second, third = (snapshot.filter_traces(ours) for snapshot in snapshots)
-    before = {change.traceback: change for change in second.compare_to(first, "lineno")}
-    return {
-        change.traceback: (
-            min(change.count_diff, before[change.traceback].count_diff),
-            min(change.size_diff, before[change.traceback].size_diff),
-        )
-        for change in third.compare_to(second, "lineno")
-        if change.traceback in before
-    }
+    first, second, third = snapshots
+    changes = [second.compare_to(first, "lineno"), third.compare_to(second, "lineno")]
+    pieces = min(sum(change.count_diff for change in part) for part in changes)
+    size = min(sum(change.size_diff for change in part) for part in changes)
+    worst = max(changes[1], key=lambda change: (change.count_diff, change.size_diff))
+    return pieces, size, str(worst.traceback)
 
 
 _NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")

@@ -27,7 +27,7 @@ T = TypeVar("T")
 NAME = "driver_under_test"
 _BUS = "bus"
 _SLOTS = 64
-_LONGEST_START_S = 30.0
+_LONGEST_START_S = 12.0
 SHOWN_ANYWAY = int(Status.SUSPECT | Status.OUT_OF_RANGE)
 """Status bits of values that are shown as they were sent."""
 
@@ -74,7 +74,7 @@ class Recorder:
     def look(self, runner: Runner) -> None:
         """Take what was published."""
         if self.reader is None:
-            if runner.writer is None:
+            if runner.writer is None or runner.writer.closed:
                 return
             self.reader = DriverReader(runner.name)
         while True:

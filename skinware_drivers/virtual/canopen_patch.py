@@ -111,7 +111,7 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def _command(self, device: Device, command: int, now_ns: int) -> bool:
         if command in _RESETS:
-            self.restart(device.number, now_ns)
+            self.lose_power_for_a_moment(device, now_ns)
         elif command in _STATES:
             self._go_to(device, _STATES[command], now_ns)
         else:

@@ -39,6 +39,7 @@ _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
 _BOOT_UP, _OPERATIONAL = 0, 5
 _EXACT = EXTENDED_FLAG | 0x7FF
 _LAST_SYNCHRONOUS = 240
+_MOST_ERRORS_TOLD = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
 
@@ -216,6 +217,7 @@ class _NodeState:
         self._tell = tell
         self._heard_s: float | None = None
         self._is_operational = False
+        self._errors: set[int] = set()
 
     def hear(self, frame: Reply) -> None:
         """A heartbeat, a boot-up message, or an EMCY."""
@@ -234,6 +236,7 @@ class _NodeState:
     def _hear_state(self, state: int) -> None:
         if state == _BOOT_UP:
             self._heard_s = None
+            self._errors.clear()
             self._tell(self._patch, Notice.RESTARTED)
         else:
             self._heard_s = asyncio.get_running_loop().time()
@@ -246,10 +249,13 @@ class _NodeState:
             return
         code = int.from_bytes(payload[:2], "little")
         if code >> 8 == 0:  # error reset, or no error
+            self._errors.clear()
             self._tell(self._patch, Notice.SOUND)
             return
-        text = EmcyError(code, payload[2], payload[3:], 0).get_desc() or "unknown error"
-        log.warning("%s reports an error: %s (code %04X)", self._patch.name, text, code)
+        if code not in self._errors and len(self._errors) < _MOST_ERRORS_TOLD:  # each once, until they are over
+            self._errors.add(code)
+            text = EmcyError(code, payload[2], payload[3:], 0).get_desc() or "unknown error"
+            log.warning("%s reports an error: %s (code %04X)", self._patch.name, text, code)
         self._tell(self._patch, Notice.SUSPECT)
 
 

@@ -127,8 +127,8 @@ class Emulator(Stage, Generic[OptionsT]):
         self._random: dict[int, np.random.Generator] = {}
         self._press: dict[int, Press] = {}
         self._n_values = 0
-        for name in ("dead", "restart"):
-            for number in getattr(options, name):
+        for name in ("dead", "restart", "faulty"):
+            for number in getattr(options, name, ()):
                 if number not in self.numbers:
                     known = ",".join(map(str, self.numbers))
                     raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")

@@ -283,6 +283,26 @@ def test_a_node_without_a_heartbeat_is_lost_however_seldom_it_sends() -> None:
     play(scenario())
 
 
+def test_the_heartbeat_of_a_node_that_keeps_its_own_period_is_not_missed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    eds = tmp_path / "own.eds"
+    head, rest = EXAMPLE.read_text().split("[1017]")
+    eds.write_text(f"{head}[1017]{rest.replace('AccessType=rw', 'AccessType=ro', 1)}")
+
+    async def scenario() -> None:
+        case = Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)}, {"eds": str(eds), "nodes": (5,)})
+        async with Bench(case) as bench:
+            assert isinstance(bench.adapter, CanopenDriver)
+            assert bench.adapter.expects_heartbeat_of == set()
+        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)})) as bench:
+            assert isinstance(bench.adapter, CanopenDriver)
+            assert bench.adapter.expects_heartbeat_of == {5, 6}
+
+    play(scenario())
+    assert "object 1017:0 of node 5: Attempt to write a read only object" in caplog.text
+
+
 def test_a_dead_node_is_stale_and_the_other_one_goes_on(stage: Stage) -> None:
     stage.do("kill", 6)
     stage.read(lambda f: f.patch_state.tolist() == [LIVE, STALE] and not f.status[:16].any())

@@ -15,6 +15,8 @@ The emulator is made with ``emulator(options, log=None, source=source)``, as :cl
 Emulator` is, and has ``Options``, ``numbers``, ``places()``, ``full_scale`` (and ``lowest``, if that is not 0) and
 ``restart(number, now_ns)``. It calls ``source(number, cycle)`` for the values of each burst of each device: the n-th
 value is that of the n-th sensor of the patch, and patches come in the order of ``numbers``.
+
+The payloads of an emulator for a serial line are the bytes on the line; or, if it has a ``framing``, the messages.
 """
 
 from __future__ import annotations

@@ -21,7 +21,15 @@ from skinware_drivers.link import Link
 from skinware_drivers.runner import Runner
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.wire import EmulatedBus, EmulatedSerialBus, Interference, Pattern, Truth, make_bus
+from skinware_drivers.testing.wire import (
+    EmulatedBus,
+    EmulatedSerialBus,
+    Interference,
+    OnTheLine,
+    Pattern,
+    Truth,
+    make_bus,
+)
 
 T = TypeVar("T")
 NAME = "driver_under_test"
@@ -121,11 +129,12 @@ class Rig:
         self.clock = clock
         self.adapter = case.adapter()
         options = case.options(**emulated)
-        n_values = len(case.emulator(options).places())
-        self.truth = Truth(clock, n_values, pattern, case.shown)
+        n_felt = len(case.emulator(options).places())
+        self.truth = Truth(clock, n_felt, pattern, case.shown)
         self.devices = case.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
-        self.wire = Interference(self.devices)
+        framing = getattr(self.devices, "framing", None)
+        self.wire = Interference(self.devices if framing is None else OnTheLine(self.devices, framing))
         self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
 
     @property

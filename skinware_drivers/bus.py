@@ -220,6 +220,11 @@ class Bus(ABC):
         """What a person should know about this bus (say, a receive buffer smaller than asked for)."""
         return ""
 
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"bus {self.channel}"
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.channel}>"
 

@@ -60,7 +60,7 @@ class Link:
     @property
     def bus_name(self) -> str:
         """Name of the bus, for messages."""
-        return self._bus.channel
+        return self._bus.name
 
     @property
     def listen_only(self) -> bool:

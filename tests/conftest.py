@@ -12,8 +12,13 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from skinware.memory.namespace import Namespace
+
+# other things run beside the tests: how long an example takes says nothing
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 
 def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:

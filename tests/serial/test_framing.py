@@ -12,7 +12,7 @@ from tests.serial.framings import EXAMPLES, Example
 from tests.serial.streams import BUSY, Found, cut, feed, frames, noise, outcome, streams
 
 ALWAYS, NEVER = 0, 1 << 60
-each = pytest.mark.parametrize("name", EXAMPLES)
+names = st.sampled_from(list(EXAMPLES))
 
 
 def starting(example: Example) -> bytes:
@@ -30,9 +30,8 @@ def ending(example: Example) -> bytes:
     return b""
 
 
-@each
-@settings(BUSY, max_examples=6)
-@given(data=st.data())
+@settings(BUSY, max_examples=50)
+@given(name=names, data=st.data())
 def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     sent = data.draw(st.lists(frames(example), min_size=1, max_size=6))
@@ -43,9 +42,8 @@ def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
         assert [(f.identifier, f.body) for f in found[: len(sent)]] == [(i, body) for i, body, _ in sent]
 
 
-@each
-@settings(BUSY, max_examples=20)
-@given(data=st.data())
+@settings(BUSY, max_examples=120)
+@given(name=names, data=st.data())
 def test_chunking_and_the_way_of_working_change_nothing(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     stream = data.draw(streams(example))
@@ -56,9 +54,8 @@ def test_chunking_and_the_way_of_working_change_nothing(name: str, data: st.Data
     assert outcome(example.framing, chunks, NEVER) == whole
 
 
-@each
-@settings(BUSY, max_examples=3)
-@given(data=st.data())
+@settings(BUSY, max_examples=20)
+@given(name=names, data=st.data())
 def test_a_trickle_of_single_bytes_gives_the_same(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     stream = data.draw(streams(example))[:400]
@@ -73,9 +70,8 @@ CHECKED = [
 ]
 
 
-@pytest.mark.parametrize("name", CHECKED)
-@settings(BUSY, max_examples=10)
-@given(data=st.data())
+@settings(BUSY, max_examples=80)
+@given(name=st.sampled_from(CHECKED), data=st.data())
 def test_whole_frames_behind_noise_are_found(name: str, data: st.DataObject) -> None:
     """All of them, in order; beyond them at most what the noise happens to hold."""
     example = EXAMPLES[name]

@@ -13,6 +13,7 @@ from msgspec import Meta
 from serial.tools import list_ports
 
 from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.status import BusReason
 from skinware_drivers.serial.ports import DescriptorPort, Port, ThreadedPort
 
 DEFAULT_BAUDRATE = 115_200
@@ -121,12 +122,17 @@ def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | Co
         return BusNotAvailable(f"no serial port {path}; {_known_ports(list(list_ports.comports()))}")
     if number in (errno.EACCES, errno.EPERM):
         group = _group_of(path)
-        return BusNotAvailable(f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again")
+        return BusNotAvailable(
+            f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again",
+            reason=BusReason.REFUSED,
+        )
     if number in (errno.EAGAIN, errno.EBUSY):
-        return BusNotAvailable(f"{path}: another program has it open; which one: fuser -v {path}")
+        return BusNotAvailable(
+            f"{path}: another program has it open; which one: fuser -v {path}", reason=BusReason.REFUSED
+        )
     if isinstance(error, ValueError) and "baud" in str(error).lower():
         return ConfigurationError(f"{path}: it cannot do {baudrate} baud")
-    return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}")
+    return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}", reason=BusReason.FAILED)
 
 
 def _group_of(path: str) -> str:

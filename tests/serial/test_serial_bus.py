@@ -13,6 +13,7 @@ import serial
 from serial.tools import list_ports
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import make_bus, parse_bus_name
 from skinware_drivers.serial.bus import PtyBus, SerialBus
@@ -249,21 +250,24 @@ def test_a_second_program_on_the_port_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "message"),
+    ("number", "message", "reason"),
     [
-        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER"),
-        (errno.EBUSY, "another program has it open"),
-        (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all"),
-        (errno.EIO, "cannot be opened as a serial port"),
+        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER", BusReason.REFUSED),
+        (errno.EBUSY, "another program has it open", BusReason.REFUSED),
+        (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all", BusReason.INTERFACE_GONE),
+        (errno.EIO, "cannot be opened as a serial port", BusReason.FAILED),
     ],
 )
-def test_refusals_say_what_to_do(number: int, message: str, usb: Usb, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refusals_say_what_to_do(
+    number: int, message: str, reason: BusReason, usb: Usb, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(self: serial.Serial) -> None:
         raise serial.SerialException(number, os.strerror(number))
 
     monkeypatch.setattr(serial.Serial, "open", refuse)
-    with pytest.raises(BusNotAvailable, match=message):
+    with pytest.raises(BusNotAvailable, match=message) as raised:
         SerialBus("/dev/ttyS9").open()
+    assert raised.value.reason == reason
 
 
 def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from skinware import DriverFrame, DriverReader
 from skinware.errors import ConfigurationError
-from skinware.status import BusState, Status
+from skinware.status import BusReason, BusState, Status
 from skinware_drivers.adapter import NoOptions
 from skinware_drivers.bus import Bus
 from skinware_drivers.can.socketcan import SocketCanBus
@@ -66,8 +66,14 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
                 for frame in reader.in_order(timeout_s=30):
                     if fresh(frame, 0):
                         values.append(int(frame.values[0]))
-                    if tip.value > before + 100 and bus.framing_counters.bytes_in > seen + 3_000_000:
+                    if (
+                        tip.value > before + 100
+                        and bus.framing_counters.bytes_in > seen + 3_000_000
+                        and bus._is_garbled
+                    ):
                         break
+                wait_until(lambda: runner.lines[1].reason == BusReason.BUS_ERRORS)
+                assert runner.lines[0].reason == BusReason.NONE
                 assert values == sorted(values)
                 assert len(set(values)) > 80
                 assert bus.framing_counters.bytes_in - bus.framing_counters.skipped_bytes < 200_000

@@ -91,13 +91,13 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
             rtscts=options.rtscts,
             exclusive=None if is_url else True,
             timeout=_READ_TIMEOUT_S,
-            write_timeout=_WRITE_TIMEOUT_S,
+            write_timeout=None if path.startswith("rfc2217:") else _WRITE_TIMEOUT_S,  # which knows none
         )
     except (serial.SerialException, ValueError) as error:
         raise ConfigurationError(f"{path}: {error}") from None
     try:
         line.open()
-    except (OSError, ValueError, EOFError) as error:  # SerialException is an OSError
+    except (OSError, ValueError, EOFError, NotImplementedError) as error:  # SerialException is an OSError
         raise _refusal(path, error, baudrate) from None
     if not is_url or path.startswith("socket://"):
         port: Port = DescriptorPort(path, line)

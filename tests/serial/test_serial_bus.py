@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
+from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
@@ -334,6 +337,39 @@ def test_a_line_without_a_descriptor() -> None:
             bus.send(value, bytes(40))
         assert [identifier for identifier, _, _ in receive(bus, 5)] == list(range(5))
         assert not is_readable(bus)
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial 3.5
+def test_a_port_of_another_machine() -> None:
+    """rfc2217: pyserial's own server, with a port that gives back what it gets."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ending = threading.Event()
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            peer.settimeout(0.05)
+            with peer, serial.serial_for_url("loop://", timeout=0.01) as port:
+                stream = peer.makefile("wb", buffering=0)
+                manager = PortManager(port, stream)
+                while not ending.is_set():
+                    with contextlib.suppress(TimeoutError):
+                        data = peer.recv(1024)
+                        if not data:
+                            break
+                        port.write(b"".join(manager.filter(data)))
+                    peer.sendall(b"".join(manager.escape(port.read(port.in_waiting or 1))))
+                stream.close()
+
+        serving = threading.Thread(target=serve, daemon=True)
+        serving.start()
+        try:
+            with opened(f"rfc2217://127.0.0.1:{server.getsockname()[1]}") as bus:
+                bus.send(7, bytes(range(200, 256)))
+                assert receive(bus, 1)[0][:2] == (7, bytes(range(200, 256)))
+        finally:
+            ending.set()
+            serving.join(30)
+        assert not serving.is_alive()
 
 
 def test_pyserial_can_spy_on_a_port(capfd: pytest.CaptureFixture[str]) -> None:

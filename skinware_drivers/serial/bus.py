@@ -58,7 +58,9 @@ class SerialBus(Bus):
         listen_only: bool = False,
     ) -> None:
         own, of_url = _split_options(channel, options or {})
-        super().__init__(channel + of_url, own, payload_size=payload_size, listen_only=listen_only)
+        self._path = channel + of_url
+        name = self._path or "&".join(f"{key}={own[key]}" for key in ("serial_number", "vid_pid") if key in own)
+        super().__init__(name, own, payload_size=payload_size, listen_only=listen_only)
         self._serial_options = options_from_strings(SerialOptions, own)
         self._framing: Framing = Unframed(payload_size)
         self._commands: Encoding = self._framing
@@ -111,7 +113,7 @@ class SerialBus(Bus):
         self._epoll.register(self._event, select.EPOLLIN)
 
     def _open_port(self) -> Port:
-        path = find_port(self.channel, self._serial_options)
+        path = find_port(self._path, self._serial_options)
         return open_port(path, self._serial_options, self._serial_options.baudrate or self._baudrate)
 
     def fileno(self) -> int:
@@ -286,7 +288,7 @@ class PtyBus(SerialBus):
     """
 
     def _open_port(self) -> Port:
-        return PtyPort(self.channel)
+        return PtyPort(self._path)
 
 
 def _split_options(channel: str, options: dict[str, str]) -> tuple[dict[str, str], str]:

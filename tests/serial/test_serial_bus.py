@@ -235,6 +235,7 @@ def test_ports_by_vendor_and_product(usb: Usb) -> None:
         with pytest.raises(BusNotAvailable, match=r"2 serial ports have VID:PID 0483:5700: .*serial_number=A9"):
             bus.open()
         both = SerialBus("", {"vid_pid": "0483:5700", "serial_number": "A7"})
+        assert both.channel == "serial_number=A7&vid_pid=0483:5700"
         both.open()
         both.close()
 

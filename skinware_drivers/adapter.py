@@ -34,6 +34,8 @@ class Notice(enum.Enum):
 
     RESTARTED = "restarted"
     """It lost its configuration: ``revive`` is called for it, and for it alone."""
+    CHANGED = "changed"
+    """It is not what it was described as (another device was plugged in, new firmware): ``join`` is called."""
     LOST = "lost"
     """It is not there, or not in a state to send: stale, until data comes."""
     SUSPECT = "suspect"

@@ -212,7 +212,6 @@ def test_garbage_in_both_directions(firmware: Path) -> None:
     noise = random.Random(5)
     with Microcontroller(firmware, "hand") as patch, driven(patch, rate_hz=200) as (running, reader):
         read_until(reader, is_fresh)
-        os.set_blocking(patch.master, False)
         for count, frame in enumerate(reader.in_order(timeout_s=30)):
             samples_of(frame)
             if count % 3 == 0:

@@ -79,9 +79,10 @@ typedef struct {
     void *context;                                                /* handed to each of these */
     void (*write)(void *context, const uint8_t *bytes, size_t n); /* send or queue all of them */
     uint32_t (*now_us)(void *context);                            /* microseconds; wraps at 2^32 */
-    size_t (*room)(void *context);                     /* bytes that write takes without waiting; NULL: let it wait */
+    size_t (*room)(void *context); /* bytes that write takes without waiting: data that finds no room is dropped and
+                                      counted, only replies wait. NULL: everything waits */
     uint32_t (*set_period)(void *context, uint32_t us); /* -> the period that it became; NULL: exactly that */
-    uint8_t (*tare)(void *context, uint8_t module);     /* -> OPENPATCH_OK, _FAILED ...; NULL: not supported */
+    uint8_t (*tare)(void *context, uint8_t module); /* when done -> OPENPATCH_OK, _FAILED ...; NULL: not supported */
 } openpatch_hardware;
 
 typedef struct { /* what is known of one module */
@@ -93,7 +94,7 @@ typedef struct {
     uint32_t period_us; /* yours to read: sample every module that is wanted once in this time */
     uint8_t streaming;  /* yours to read: the host wants data. The rest belongs to this header. */
     uint8_t n_modules, reset_reason, greeted, dry, request_length, left, code, spoilt;
-    uint16_t length, fill, block, n_items;
+    uint16_t fill, block, n_items;
     uint32_t last_us, rest_us, uptime_ms, announced_ms, crc, description_crc, sent, dropped, bad_requests;
     const openpatch_description *description;
     const openpatch_hardware *hardware;
@@ -156,7 +157,6 @@ static void op_stuff(openpatch *op, uint8_t byte) {
 static void op_put(openpatch *op, uint32_t value, int bytes) {
     for (; bytes > 0; bytes--, value >>= 8) {
         op->crc = op_crc(op->crc, (uint8_t)value);
-        op->length++;
         if (!op->dry) op_stuff(op, (uint8_t)value);
     }
 }
@@ -176,25 +176,27 @@ static void op_put_text(openpatch *op, const char *text, int in_table) { /* with
     } while (c != 0);
 }
 
-static int op_begin(openpatch *op, uint8_t type, size_t payload) { /* 0: there is no room for it now */
-    size_t framed = payload + 5 + (payload + 5) / 254 + 2;
-    if (op->hardware->room != NULL && op->hardware->room(op->hardware->context) < framed) return 0;
+static int op_has_room(const openpatch *op, size_t payload) {
+    const size_t framed = payload + 5 + (payload + 5) / 254 + 2;
+    return op->hardware->room == NULL || op->hardware->room(op->hardware->context) >= framed;
+}
+
+static void op_begin(openpatch *op, uint8_t type) {
     op->fill = op->block = 0;
     op->crc = 0xFFFFFFFFu;
     op_emit(op, 0);
     op_put(op, type, 1);
-    return 1;
 }
 
 static void op_end(openpatch *op) {
-    op_put(op, ~op->crc, 4); /* op_put goes on with op->crc, but the value is taken before */
+    op_put(op, ~op->crc, 4);
     op_end_block(op, 0);
     op->hardware->write(op->hardware->context, op->out, op->fill);
 }
 
-static uint16_t op_put_item(openpatch *op, uint16_t item) { /* -> how many items there are */
+static void op_put_item(openpatch *op, uint16_t item) {
     const openpatch_description *d = op->description;
-    const uint16_t first_kind = (uint16_t)(1 + d->n_types), last = (uint16_t)(first_kind + d->n_kinds);
+    const uint16_t first_kind = (uint16_t)(1 + d->n_types);
     uint8_t i, axis;
     if (item == 0) { /* the patch */
         op_put(op, 1, 1);
@@ -215,7 +217,7 @@ static uint16_t op_put_item(openpatch *op, uint16_t item) { /* -> how many items
         op_put_float(op, type.maximum);
         op_put_text(op, type.name, 1);
         op_put_text(op, type.unit, 1);
-    } else if (item < last) {
+    } else if (item < first_kind + d->n_kinds) {
         openpatch_kind kind;
         OPENPATCH_COPY(&kind, d->kinds + (item - first_kind), sizeof kind);
         op_put(op, 3, 1);
@@ -229,7 +231,7 @@ static uint16_t op_put_item(openpatch *op, uint16_t item) { /* -> how many items
             op_put(op, run.n_axes, 1);
             for (axis = 0; axis < run.n_axes; axis++) op_put(op, run.axes[axis], 1);
         }
-    } else if (item == last) { /* the modules */
+    } else { /* the modules */
         op_put(op, 4, 1);
         op_put(op, d->n_modules, 1);
         for (i = 0; i < d->n_modules; i++) {
@@ -239,15 +241,6 @@ static uint16_t op_put_item(openpatch *op, uint16_t item) { /* -> how many items
             op_put(op, modules.count, 1);
         }
     }
-    return (uint16_t)(last + 1);
-}
-
-static uint16_t op_measure_item(openpatch *op, uint16_t item) { /* its length; the CRC goes on */
-    op->dry = 1;
-    op->length = 0;
-    op_put_item(op, item);
-    op->dry = 0;
-    return op->length;
 }
 
 static void op_put_greeting(openpatch *op) {
@@ -291,10 +284,11 @@ static void op_send(openpatch *op, uint8_t module, uint32_t us, const void *valu
     uint8_t size, kind;
     uint16_t n, i, sequence = op->modules[module].sequence++;
     kind = op_find_kind(op, module, &size, &n);
-    if (!op_begin(op, (uint8_t)(OP_DATA + kind), 8u + (size_t)n * (size_t)(size + (each != NULL)))) {
+    if (!op_has_room(op, 8u + (size_t)n * (size_t)(size + (each != NULL)))) {
         op->dropped++;
         return;
     }
+    op_begin(op, (uint8_t)(OP_DATA + kind));
     op_put(op, module, 1);
     op_put(op, sequence, 2);
     op_put(op, us, 4);
@@ -327,15 +321,14 @@ static void op_answer(openpatch *op, uint8_t type, const uint8_t *a, uint8_t len
     static const uint8_t needed[] = {0, 2, 2, 4, 0, 4, 2, 1, 0};
     const openpatch_description *d = op->description;
     uint8_t error = OPENPATCH_OK, i;
-    uint16_t item = 0, size = 0;
+    uint16_t item = 0;
     if (type > OP_STATUS) error = OPENPATCH_UNKNOWN_REQUEST;
     else if (length < 1 + needed[type]) error = OPENPATCH_BAD_LENGTH;
     else switch (type) {
-    case OP_HELLO: size = 14; break;
-    case OP_STATUS: size = 16; break;
+    case OP_HELLO: case OP_STATUS: break;
     case OP_DESCRIBE:
         item = (uint16_t)(a[1] | a[2] << 8);
-        if (item < op->n_items) size = (uint16_t)(2 + op_measure_item(op, item)); else error = OPENPATCH_NO_SUCH;
+        if (item >= op->n_items) error = OPENPATCH_NO_SUCH;
         break;
     case OP_START:
         if (op_read32(a + 1) != op->description_crc) { error = OPENPATCH_OTHER_DESCRIPTION; break; }
@@ -344,7 +337,6 @@ static void op_answer(openpatch *op, uint8_t type, const uint8_t *a, uint8_t len
         break;
     case OP_STOP: op->streaming = 0; break;
     case OP_PERIOD:
-        size = 4;
         if (op_read32(a + 1) < d->shortest_period_us || op_read32(a + 1) > d->longest_period_us)
             error = OPENPATCH_BAD_VALUE;
         else if (op->hardware->set_period != NULL)
@@ -357,20 +349,18 @@ static void op_answer(openpatch *op, uint8_t type, const uint8_t *a, uint8_t len
             error = op->hardware->tare ? op->hardware->tare(op->hardware->context, a[1])
                                           : (uint8_t)OPENPATCH_NOT_SUPPORTED;
     }
-    if (error != OPENPATCH_OK) size = 0;
-    if (op_begin(op, (uint8_t)(OP_REPLY + type), 2u + size)) {
-        op_put(op, a[0], 1);
-        op_put(op, error, 1);
-        if (size != 0 && type == OP_HELLO) op_put_greeting(op);
-        if (size != 0 && type == OP_STATUS) op_put_report(op);
-        if (size != 0 && type == OP_PERIOD) op_put(op, op->period_us, 4);
-        if (size != 0 && type == OP_DESCRIBE) { op_put(op, item, 2); op_put_item(op, item); }
-        op_end(op);
-    }
-    if (error != OPENPATCH_OK || (type != OP_ENABLE && type != OP_START)) return;
+    op_begin(op, (uint8_t)(OP_REPLY + type));
+    op_put(op, a[0], 1);
+    op_put(op, error, 1);
+    if (error != OPENPATCH_OK) type = 0; /* nothing more to be said or done */
+    if (type == OP_HELLO) op_put_greeting(op);
+    if (type == OP_STATUS) op_put_report(op);
+    if (type == OP_PERIOD) op_put(op, op->period_us, 4);
+    if (type == OP_DESCRIBE) { op_put(op, item, 2); op_put_item(op, item); }
+    op_end(op);
     for (i = 0; i < op->n_modules; i++) {
         if (type == OP_START) op_switch(op, i, op->modules[i].enabled);
-        else if (a[1] == i || a[1] == OPENPATCH_ALL) op_switch(op, i, a[2] != 0);
+        if (type == OP_ENABLE && (a[1] == i || a[1] == OPENPATCH_ALL)) op_switch(op, i, a[2] != 0);
     }
 }
 
@@ -424,7 +414,9 @@ void openpatch_init(openpatch *op, const openpatch_description *description, con
     for (i = 0; i < op->n_modules; i++) { modules[i].sequence = 0; modules[i].enabled = 1; }
     op->n_items = (uint16_t)(2 + description->n_types + description->n_kinds);
     op->crc = 0xFFFFFFFFu;
-    for (item = 0; item < op->n_items; item++) op_measure_item(op, item);
+    op->dry = 1; /* nothing is sent: only the CRC is of interest */
+    for (item = 0; item < op->n_items; item++) op_put_item(op, item);
+    op->dry = 0;
     op->description_crc = ~op->crc;
     op->last_us = hardware->now_us(hardware->context);
     op->announced_ms = (uint32_t)-1000; /* at once */
@@ -449,7 +441,8 @@ void openpatch_poll(openpatch *op) {
     }
     if (op->uptime_ms - op->announced_ms < 1000 || (op->greeted && !op->streaming)) return;
     op->announced_ms = op->uptime_ms;
-    if (!op_begin(op, op->streaming ? OP_REPORT : OP_BOOT, op->streaming ? 16 : 14)) return;
+    if (!op_has_room(op, 16)) return;
+    op_begin(op, op->streaming ? OP_REPORT : OP_BOOT);
     if (op->streaming) op_put_report(op); else op_put_greeting(op);
     op_end(op);
 }
@@ -466,7 +459,8 @@ void openpatch_send(openpatch *op, uint8_t module, uint32_t sampled_us, const vo
 void openpatch_note(openpatch *op, uint8_t severity, const char *text) {
     size_t n = strlen(text);
     if (n > 200) n = 200;
-    if (!op_begin(op, OP_NOTE, 1 + n)) return;
+    if (!op_has_room(op, 1 + n)) return;
+    op_begin(op, OP_NOTE);
     op_put(op, severity, 1);
     for (; n > 0; n--) op_put(op, (uint8_t)*text++, 1);
     op_end(op);

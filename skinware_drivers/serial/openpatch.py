@@ -11,11 +11,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
+from skinware_drivers.device_time import DeviceClock
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
@@ -24,9 +27,12 @@ from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
+    DATA,
+    DATA_HEADER,
     MAJOR,
     MINOR,
     MOST_PAYLOAD,
+    STAMP,
     BadDescription,
     Description,
     Greeting,
@@ -43,6 +49,7 @@ _REPLY = 0x40
 
 _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
+_LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _ERRORS = (
     "it is done",
@@ -98,6 +105,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
         self._period_us = 0
         self._disabled: set[int] = set()
+        self._clock = DeviceClock(1e-6)
+        self._clock_fails = False
         self._number = 0
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
@@ -150,6 +159,20 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         """Make it silent."""
         await self._ask(link, STOP)
 
+    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
+        """Data messages tell when their samples were taken, by the patch's clock."""
+        rows = np.flatnonzero((wire["identifier"] >= DATA) & (wire["length"] >= DATA_HEADER))
+        if not len(rows):
+            return
+        stamps = np.ascontiguousarray(wire["payload"][rows, STAMP]).view("<u4")[:, 0]
+        received_ns = time_ns[rows]
+        sampled_ns = self._clock.convert(stamps, received_ns)
+        if (received_ns - sampled_ns).max() > _LONGEST_DELAY_NS:
+            self._clock = DeviceClock(1e-6)
+            self._clock_fails = True
+        else:
+            time_ns[rows] = sampled_ns
+
     # -- looking after it -----------------------------------------------------------------------------------------
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
@@ -158,6 +181,11 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
             while True:
                 message = await heard.get()
+                if self._clock_fails:
+                    self._say(
+                        link, logging.WARNING, "clock", "has a clock that stands still: times are those of receipt"
+                    )
+                    self._clock_fails = False
                 try:
                     if message.identifier == BOOT:
                         self._take_greeting(link, Greeting.read(message.payload))
@@ -182,6 +210,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
         """Set it up and start it again."""
+        self._clock = DeviceClock(1e-6)
         try:
             await self.configure(link)
             await self.start(link)

@@ -25,8 +25,11 @@ MOST_PAYLOAD = 1024
 MOST_ITEMS = 256
 ALL_MODULES = 0xFF
 DATA = 0x80
+DATA_HEADER = 8
+"""Bytes of a data message's payload before the values."""
+STAMP = slice(3, 7)
+"""Of these, the device time."""
 
-_HEADER = 8  # bytes of a data payload before the values
 _MOST_KINDS, _MOST_TYPES, _MOST_MODULES, _MOST_AXES = 32, 64, 255, 9
 _MOST_VALUES = 16384  # of all modules together
 _PADDING = 0xFF
@@ -274,8 +277,10 @@ def _kind(reader: _Reader, n_types: int) -> Kind:
         runs.append(Run(count, [None if axis == _PADDING else axis for axis in axes]))
     kind = Kind(name, _DTYPES[dtype], runs)
     size = kind.n_values * int(_DTYPES[dtype][-1])
-    if not 1 <= size <= MOST_PAYLOAD - _HEADER:
-        raise reader.bad(f"kind {name!r} has {size} bytes of values; 1 to {MOST_PAYLOAD - _HEADER} fit into a message")
+    if not 1 <= size <= MOST_PAYLOAD - DATA_HEADER:
+        raise reader.bad(
+            f"kind {name!r} has {size} bytes of values; 1 to {MOST_PAYLOAD - DATA_HEADER} fit into a message"
+        )
     return kind
 
 
@@ -300,7 +305,7 @@ def _checked(found: Description) -> Description:
 
 
 def _frame(number: int, kind: Kind) -> Frame:
-    values = Values(_HEADER, kind.dtype, kind.n_values)
+    values = Values(DATA_HEADER, kind.dtype, kind.n_values)
     flags: list[Flag | Sentinel | StatusBytes] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
     lengths = [values.end]
     if values.end + kind.n_values <= MOST_PAYLOAD:

@@ -268,6 +268,38 @@ def test_data_of_a_wrong_form_is_not_shown(payload: bytes, is_module: bool) -> N
     assert dict(zip(BUS_COUNTERS, state.bus_counters[0].tolist(), strict=True))["bad_length"] == is_module
 
 
+def stamped(driver: OpenPatchDriver, stamps: Sequence[int], received_ns: Sequence[int]) -> list[int]:
+    batch = FrameBatch(len(stamps), driver.payload_size)
+    for stamp, time_ns in zip(stamps, received_ns, strict=True):
+        batch.append(0, time_ns, 0x80, struct.pack("<BHIB", 0, 0, stamp, 0))
+    driver.stamp(batch.wire, batch.time_ns)
+    times: list[int] = batch.time_ns.tolist()
+    return times
+
+
+def test_samples_have_the_time_at_which_they_were_taken() -> None:
+    driver = OpenPatchDriver(OpenPatchOptions())
+    wrapping = [2**32 - 10_000, 0, 10_000, 20_000]
+    assert stamped(driver, wrapping, [10**9, 1_010_000_000, 1_055_000_000, 1_056_000_000]) == [
+        1_000_000_000,
+        1_010_000_000,
+        1_020_000_000,
+        1_030_000_000,
+    ]
+    batch = FrameBatch(2, driver.payload_size)
+    batch.append(0, 5, 0x41, bytes(20))
+    batch.append(0, 6, 0x80, bytes(3))
+    driver.stamp(batch.wire, batch.time_ns)
+    assert batch.time_ns.tolist() == [5, 6]
+
+
+def test_a_clock_that_stands_still_is_not_believed_for_long() -> None:
+    driver = OpenPatchDriver(OpenPatchOptions())
+    received_ns = [n * 10**8 for n in range(1, 50)]
+    told = [stamped(driver, [7], [time_ns])[0] for time_ns in received_ns]
+    assert all(time_ns - then <= 2 * 10**9 for time_ns, then in zip(received_ns, told, strict=True))
+
+
 NAMES = st.text(st.characters(codec="utf-8", categories=["L", "N"]), max_size=5)
 REALS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 LIMITS = st.tuples(REALS, REALS).map(lambda pair: (min(pair), max(pair)))

@@ -111,6 +111,24 @@ def test_no_module_is_torn_and_no_sample_lost(firmware: Path) -> None:
         assert reader.patch_counters(frame)[0]["sequence_lost"] == 0
 
 
+def test_modules_have_the_time_of_their_sample_over_a_wrap_of_the_clock(firmware: Path) -> None:
+    with Microcontroller(firmware, "hand", running=False) as patch:
+        patch.run(first_us=2**32 - 300_000)
+        with driven(patch) as (_, reader):
+            read_until(reader, is_fresh)
+            before_ns, seen = np.zeros(7, np.int64), 0
+            for count, frame in enumerate(reader.in_order(timeout_s=30)):
+                assert (frame.module_time_ns >= before_ns).all()
+                assert (frame.module_time_ns <= frame.published_ns).all()
+                before_ns = frame.module_time_ns
+                if len(set(samples_of(frame))) == 1 and is_fresh(frame):
+                    assert len(set(frame.module_time_ns.tolist())) == 1
+                    seen += 1
+                if count >= 25:
+                    break
+            assert seen
+
+
 def test_messages_as_long_as_they_can_be(firmware: Path) -> None:
     with Microcontroller(firmware, "wide") as patch, driven(patch) as (_, reader):
         frame = read_until(reader, is_fresh)

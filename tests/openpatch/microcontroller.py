@@ -21,9 +21,10 @@ HERE = Path(__file__).parent
 POWER_UP, WATCHDOG = 1, 3
 
 
-def program(source: Path, language: str, folder: pytest.TempPathFactory) -> Path:
+def program(source: Path, language: str, folder: pytest.TempPathFactory, *options: str) -> Path:
     """A program with openpatch.h, free of warnings."""
-    return compiled(source, language, folder, ["-Wconversion", "-Wshadow", f"-I{skinware_drivers.get_include()}"])
+    include = f"-I{skinware_drivers.get_include()}"
+    return compiled(source, language, folder, ["-Wconversion", "-Wshadow", include, *options])
 
 
 class Microcontroller:

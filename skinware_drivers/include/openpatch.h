@@ -95,7 +95,7 @@ typedef struct {
     uint8_t streaming;  /* yours to read: the host wants data. The rest belongs to this header. */
     uint8_t n_modules, reset_reason, greeted, dry, request_length, left, code, spoilt;
     uint16_t fill, block, n_items;
-    uint32_t last_us, rest_us, uptime_ms, announced_ms, crc, description_crc, sent, dropped, bad_requests;
+    uint32_t sampled_us, last_us, rest_us, uptime_ms, announced_ms, crc, description_crc, sent, dropped, bad_requests;
     const openpatch_description *description;
     const openpatch_hardware *hardware;
     openpatch_module *modules;
@@ -283,6 +283,7 @@ static void op_send(openpatch *op, uint8_t module, uint32_t us, const void *valu
     const uint8_t *from = (const uint8_t *)values;
     uint8_t size, kind;
     uint16_t n, i, sequence = op->modules[module].sequence++;
+    op->sampled_us = us;
     kind = op_find_kind(op, module, &size, &n);
     if (!op_has_room(op, 8u + (size_t)n * (size_t)(size + (each != NULL)))) {
         op->dropped++;
@@ -310,7 +311,7 @@ static void op_send(openpatch *op, uint8_t module, uint32_t us, const void *valu
 
 static void op_switch(openpatch *op, uint8_t module, uint8_t enabled) { /* what is off says so once, and is silent */
     op->modules[module].enabled = enabled;
-    if (op->streaming && !enabled) op_send(op, module, op->last_us, NULL, OPENPATCH_MASKED, NULL);
+    if (op->streaming && !enabled) op_send(op, module, op->sampled_us, NULL, OPENPATCH_MASKED, NULL);
 }
 
 static uint32_t op_read32(const uint8_t *bytes) {
@@ -333,6 +334,7 @@ static void op_answer(openpatch *op, uint8_t type, const uint8_t *a, uint8_t len
     case OP_START:
         if (op_read32(a + 1) != op->description_crc) { error = OPENPATCH_OTHER_DESCRIPTION; break; }
         op->streaming = 1;
+        op->sampled_us = op->last_us;
         op->announced_ms = op->uptime_ms;
         break;
     case OP_STOP: op->streaming = 0; break;

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
-from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
@@ -67,13 +68,11 @@ _SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR)
 
 
 class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of the driver.
+    """Options of the driver."""
 
-    Attributes:
-        rate_hz: cycles per second that the patches are told to deliver; 0: what each does by itself.
-    """
-
-    rate_hz: float = 0.0
+    rate_hz: Annotated[
+        float, Meta(ge=0, le=1e6, description="cycles per second, as the patches are told; 0: what each does by itself")
+    ] = 0.0
 
 
 class Refused(BusError):
@@ -97,8 +96,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     def __init__(self, options: OpenPatchOptions) -> None:
         super().__init__(options)
-        if not 0 <= options.rate_hz <= 1e6:
-            raise ConfigurationError(f"rate_hz {options.rate_hz:g}: give 0 to 1000000 Hz")
         self._description: Description | None = None
         self._crc = 0
         self._patch: Patch | None = None

@@ -328,7 +328,7 @@ static void op_answer(openpatch *op, uint8_t type, const uint8_t *a, uint8_t len
     else switch (type) {
     case OP_HELLO: case OP_STATUS: break;
     case OP_DESCRIBE:
-        item = (uint16_t)(a[1] | a[2] << 8);
+        item = (uint16_t)(a[1] | (unsigned)a[2] << 8);
         if (item >= op->n_items) error = OPENPATCH_NO_SUCH;
         break;
     case OP_START:

@@ -21,7 +21,7 @@ SAID = wire.Said()
 
 def vectors() -> list[tuple[str, str]]:
     """(word, rest) of every line."""
-    block = re.search(r"```vectors\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    block = re.search(r"## Vectors.*?```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert block
     return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in block[1].splitlines())]
 

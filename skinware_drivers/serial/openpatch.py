@@ -122,7 +122,13 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     # -- setting up -----------------------------------------------------------------------------------------------
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the patch what it is."""
+        """Ask the patch what it is.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
         greeting = await self._greet(link)
         if self._patch is not None and greeting.crc == self._crc:
             return [self._patch]

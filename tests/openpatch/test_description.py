@@ -355,6 +355,37 @@ def test_every_description_and_its_data_come_out_as_they_were_said(said: wire.Sa
     assert structure.module_kind.tolist() == [kind[0].encode() for kind in of_module]
 
 
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.integers(0, 65535), min_size=1, max_size=30), st.data())
+def test_of_a_damaged_stream_only_whole_messages_are_shown(samples: list[int], more: st.DataObject) -> None:
+    """Flipped bits, lost and inserted bytes: every update that comes out is one that was sent."""
+    sent = [data(n % 2, struct.pack("<4H", *[value] * 4), sequence=n) for n, value in enumerate(samples)]
+    stream = bytearray(b"".join(wire.frame(0x80, message) for message in sent))
+    for _ in range(more.draw(st.integers(0, 8))):
+        at = more.draw(st.integers(0, max(0, len(stream) - 1)))
+        stream[at : at + more.draw(st.integers(0, 3))] = more.draw(st.binary(max_size=3))
+    framer = OpenPatchDriver.framing.framer()
+    found, rest = [], bytes(stream)
+    while rest:
+        size = more.draw(st.integers(1, 200))
+        found += [
+            (i, body) for f in [framer.feed(rest[:size])] for i, body in zip(f.identifier, f.bodies(), strict=True)
+        ]
+        rest = rest[size:]
+    assert all(identifier == 0x80 and body in sent for identifier, body in found)
+    state = decoded(wire.Said(), found).state
+    for module in range(2):
+        shown = set(state.values[4 * module : 4 * module + 4].tolist())
+        assert len(shown) == 1
+        assert shown <= {0, *samples}
+
+
+def test_listening_alone_is_refused_with_the_reason() -> None:
+    link = Link(SerialBus("/dev/ttyNOWHERE", listen_only=True))
+    with pytest.raises(BusError, match="only when it is asked"):
+        asyncio.run(OpenPatchDriver(OpenPatchOptions()).describe(link))
+
+
 @settings(deadline=None, max_examples=300)
 @given(st.data())
 def test_damaged_descriptions_are_understood_or_refused(more: st.DataObject) -> None:

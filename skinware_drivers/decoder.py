@@ -156,6 +156,10 @@ class Decoder:
             updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
 
+    def forget(self, patch: int) -> None:
+        """A patch has restarted: its sequence numbers begin anew."""
+        self._last_sequence[self._module_patch == patch] = -1
+
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""
         bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]

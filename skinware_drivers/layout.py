@@ -143,6 +143,19 @@ class Sentinel:
 
 
 @dataclass(frozen=True)
+class StatusBytes:
+    """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
+
+    Attributes:
+        offset: first byte.
+        mask: bits of each that are status bits.
+    """
+
+    offset: int
+    mask: Status
+
+
+@dataclass(frozen=True)
 class Stamp:
     """A sequence number in the payload that counts a module's frames; what it skips or repeats is counted.
 
@@ -224,7 +237,7 @@ class Frame:
     values: Values | Sequence[Values] | Expand
     patch: Bits | int | None = None
     module: Bits | int | None = None
-    flags: Sequence[Flag | Sentinel] = ()
+    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
     stamp: Stamp | None = None
     time: DeviceTime | None = None
 

@@ -226,7 +226,7 @@ class Runner:
             except BusError as error:
                 log.warning("%s: nothing joined: %s", line.name, str(error))
                 continue
-            if patches and patches != line.patches:
+            if patches:  # also the same ones: what is known of their types and frames may have changed
                 line.patches = patches
                 await self._build()
 
@@ -335,7 +335,9 @@ class Runner:
             for number, line in enumerate(ready):
                 batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
                 try:
+                    first = batch.stop
                     if line.bus.receive(batch, line.ordinal):
+                        line.adapter.stamp(batch.wire[first : batch.stop], batch.time_ns[first : batch.stop])
                         line.heard_ns = time_ns
                         is_behind |= not batch.free
                 except BusNotAvailable as error:
@@ -416,9 +418,10 @@ class Runner:
         """Set one patch up anew."""
         async with line.busy:
             number = self._number_of(line, patch)
-            if self.publisher is None or self._watch is None or number is None:
+            if self.publisher is None or self._watch is None or self.decoder is None or number is None:
                 return
             self.publisher.lose(number, PatchState.RESTARTED)
+            self.decoder.forget(number)
             try:
                 await line.adapter.revive(line.link, patch)
             except BusError as error:
@@ -445,6 +448,9 @@ class Runner:
                 self._watch.forget(number)
             elif notice is Notice.LOST or self._listen_only:
                 self.publisher.lose(number, PatchState.STALE)
+            elif notice is Notice.CHANGED:
+                self.publisher.lose(number, PatchState.STALE)
+                self.join()
             elif patch.key not in reviving or reviving[patch.key].done():
                 log.warning("%s: %s has restarted", line.name, patch.name)
                 self.publisher.lose(number, PatchState.RESTARTED)

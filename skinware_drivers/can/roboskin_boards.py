@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware_drivers.can.roboskin_layout import board_of
+from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 
-ADDRESSES = range(1, 15)
-"""Addresses that boards can have; 0 is the host, 15 everybody."""
+ADDRESSES = range(FIRST_BOARD, LAST_BOARD + 1)
 BOARD_TYPES = {5: "mtb", 11: "mtb4", 16: "mtb4w", 20: "mtb4c"}
 """Types of boards that carry skin."""
 
@@ -138,7 +139,7 @@ class BoardOperations:
     @operation(looks=True)
     async def versions(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:
         """Type, firmware and protocol of the boards, by address; null for one that does not answer."""
-        asked = sorted({_address_of(patch) for patch in patches}) or list(ADDRESSES)
+        asked = sorted({board_of(patch) for patch in patches}) or list(ADDRESSES)
         found: dict[str, Any] = {str(address): None for address in asked} if patches else {}
         for board in await ask_versions(link, asked):
             found[str(board.address)] = board.as_data()
@@ -147,7 +148,7 @@ class BoardOperations:
     @operation(alone=True)
     async def set_address(self, link: Link, patches: Sequence[Patch], address: int) -> dict[str, Any]:
         """Give one board (name it as patch="board 7") another address, 1 to 14, for good."""
-        boards = sorted({_address_of(patch) for patch in patches})
+        boards = sorted({board_of(patch) for patch in patches})
         if len(boards) != 1:
             raise ConfigurationError(
                 f"there are boards {', '.join(map(str, boards))}: say which one, as patch='board 7'"
@@ -178,7 +179,3 @@ async def _ask_version(link: Link, address: int) -> Board | None:
 def _from_discovery(identifier: int, payload: bytes) -> Board:
     """FF type major minor from a boot loader; the application adds its build."""
     return Board(identifier >> 4 & 0xF, payload[1], ".".join(map(str, payload[2:5])), is_loader=len(payload) == 4)
-
-
-def _address_of(patch: Patch) -> int:
-    return patch.key & 0xF

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BusError, ConfigurationError
+from skinware.errors import BusError, BusSendError, ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus
+from skinware_drivers.description import Patch
 from skinware_drivers.finding.traffic import Traffic
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout
 from skinware_drivers.link import Heard, Link
@@ -81,7 +82,8 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
         drivers: those in question.
     """
     wire = traffic.wire()
-    matches = [match for name, driver in drivers.items() if (match := _match(name, driver, wire)) is not None]
+    adapters = {name: adapter for name, driver in drivers.items() if (adapter := _adapter(driver)) is not None}
+    matches = [match for name, adapter in adapters.items() if (match := _match(name, adapter, wire)) is not None]
     explained = np.zeros(len(wire), bool)
     guesses = []
     for match in sorted(matches, key=lambda match: -match.weight):
@@ -91,6 +93,20 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
         patches = await _names(match, bus, traffic.heard())
         guesses.append(Guess(match.name, count, count / len(wire), patches, bool(is_new.any())))
     return sorted(guesses, key=lambda one: not one.likely)
+
+
+async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list[Patch]:
+    """The patches of one driver that were heard, as it describes them; nothing is sent.
+
+    Args:
+        traffic: what was heard.
+        bus: on which bus; only its name is used.
+        adapter: the driver's object.
+    """
+    match = _match(type(adapter).__name__, adapter, traffic.wire())
+    if match is None:
+        return []
+    return [patch for patch in await _describe(adapter, bus, traffic.heard()) if patch.key in match.keys]
 
 
 def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
@@ -109,13 +125,17 @@ def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]
     return match
 
 
-def _match(name: str, driver: type[AnyAdapter], wire: npt.NDArray[Any]) -> _Match | None:
-    """How much a driver knows; None if nothing, or if it only learns from the hardware what frames mean."""
+def _adapter(driver: type[AnyAdapter]) -> AnyAdapter | None:
+    """A driver's object with default options; None if it has options that must be given."""
     try:
-        adapter = driver(driver.Options())
-        layout: Layout | None = getattr(adapter, "layout", None)
-    except (TypeError, ConfigurationError):  # options that must be given
+        return driver(driver.Options())
+    except (TypeError, ConfigurationError):
         return None
+
+
+def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | None:
+    """How much a driver knows; None if nothing, or if it only learns from the hardware what frames mean."""
+    layout: Layout | None = getattr(adapter, "layout", None)
     if layout is None or not len(wire):
         return None
     members = set(layout.cycle.members) if layout.cycle else set()
@@ -162,6 +182,9 @@ class _Replay(Link):
     def listen_only(self) -> bool:
         return True
 
+    async def send(self, identifier: int, payload: bytes, *, timeout_s: float = 0.0) -> None:  # noqa: ARG002
+        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: this only replays what was heard")
+
     async def listen(self, duration_s: float) -> Counter[Heard]:
         del duration_s
         return self._known
@@ -173,12 +196,16 @@ class _Replay(Link):
 
 async def _names(match: _Match, bus: Bus, heard: dict[Heard, int]) -> tuple[str, ...]:
     """What the driver itself would call the patches that were heard."""
-    try:
-        patches = await asyncio.wait_for(match.adapter.describe(_Replay(bus, heard)), _NAMING_S)
-    except (BusError, TimeoutError):
-        patches = ()
-    names = {patch.key: patch.name for patch in patches}
+    names = {patch.key: patch.name for patch in await _describe(match.adapter, bus, heard)}
     return tuple(names.get(key, f"patch {key}") for key in sorted(match.keys))
+
+
+async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
+    """What a driver that only listens would make of what was heard."""
+    try:
+        return await asyncio.wait_for(adapter.describe(_Replay(bus, heard)), _NAMING_S)
+    except (BusError, TimeoutError):
+        return ()
 
 
 def likely(guesses: Iterable[Guess]) -> list[Guess]:

@@ -92,8 +92,8 @@ def command(
             )
         outcome = _through_driver(owner, of_bus, operation, given, timeout_s, yes)
     else:
-        adapter = _adapter(target, driver_name, options, config)
-        outcome = _without_driver(target, place.name, adapter, operation, given, yes, force)
+        driver_type, adapter = _adapter(target, driver_name, options, config)
+        outcome = _without_driver(target, place.name, driver_type, adapter, operation, given, yes, force)
     if as_json:
         print_json({"target": target, "driver": owner, "operation": operation, **outcome})
     else:
@@ -150,6 +150,7 @@ def _through_driver(
 def _without_driver(
     bus_name: str,
     namespace: str,
+    driver_type: str,
     adapter: AnyAdapter,
     operation: str | None,
     arguments: dict[str, Any],
@@ -173,7 +174,7 @@ def _without_driver(
         if owner is not None:
             raise ConfigurationError(f"{owner} was started meanwhile; nothing was changed")
 
-    bus = make_bus(bus_name, payload_size=adapter.payload_size)
+    bus = make_bus(bus_name, payload_size=adapter.payload_size, driver=driver_type)
     try:
         result = asyncio.run(carry_out(bus, bus_name, adapter, operation, arguments, agree=agree, force=force))
     except BusNotAvailable as error:
@@ -183,19 +184,23 @@ def _without_driver(
     return {"results": {bus_name: result}}
 
 
-def _adapter(bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None) -> AnyAdapter:
+def _adapter(
+    bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
+) -> tuple[str, AnyAdapter]:
+    """Name and object of the driver for a bus that has none running."""
     from skinware_drivers.config import DriverConfig, options_of_bus, read_config
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
     settings = read_config(config) if config else DriverConfig()
-    driver = load_driver(driver_name or settings.driver or DEFAULT_DRIVER)
+    driver_type = driver_name or settings.driver or DEFAULT_DRIVER
+    driver = load_driver(driver_type)
     given = {}
     for text in options:
         key, equals, value = text.partition("=")
         if not equals:
             raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
         given[key] = value
-    return driver(options_of_bus(driver.Options, settings, bus_name, given))
+    return driver_type, driver(options_of_bus(driver.Options, settings, bus_name, given))
 
 
 def _ask_back(what: str, description: str, yes: bool) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _CAN_PAYLOAD = 64
 _BATCH_FRAMES = 2048
+_SERIAL = ("serial", "pty")
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which a second listener takes nothing away from the first."""
 _OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "physical": "--physical"}
@@ -46,7 +47,7 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
     from skinware_drivers.registry import make_bus, parse_bus_name
 
     interface, channel, _ = parse_bus_name(bus_name)
-    _refuse_what_has_one_owner(bus_name, interface, channel)
+    _refuse_what_has_one_owner(bus_name, interface)
     name = channel_name(interface, channel)
     bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     left = count
@@ -77,11 +78,11 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         _tell_what_is_missing(bus)
 
 
-def _refuse_what_has_one_owner(bus_name: str, interface: str, channel: str) -> None:
+def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
     from skinware.errors import ConfigurationError
     from skinware_drivers.finding.running import driver_on, running_drivers
 
-    if interface in ("serial", "pty") or (interface == "socketcan" and "/" in channel):
+    if interface in _SERIAL:
         raise ConfigurationError(
             f"{bus_name}: a serial port has one owner, nobody can listen beside it; what its driver makes of it:"
             " skin-dump NAME"

@@ -124,10 +124,10 @@ def _chosen(
     chosen: tuple[list[CanInterface], list[SerialPort], list[str]] = [], [], []
     for name in buses:
         interface, channel, _ = parse_bus_name(name)
-        if channel.startswith("/dev/") and interface in ("socketcan", "serial"):
-            port = next((port for port in serial_ports() if same_bus(port.path, channel)), None)
+        if interface in ("serial", "pty"):
+            port = next((port for port in serial_ports() if channel and same_bus(port.path, channel)), None)
             if port is None:
-                raise BusNotAvailable(f"there is no serial port {channel}; skin-find shows those that are there")
+                raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
             chosen[1].append(port)
         elif interface == "socketcan" and channel in [one.name for one in interfaces]:
             chosen[0].extend(one for one in interfaces if one.name == channel)
@@ -191,14 +191,12 @@ def _can_data(
 ) -> dict[str, Any]:
     import msgspec
 
-    from skinware_drivers.finding.interfaces import NO_CAN, NO_INTERFACE, has_iproute2, kernel_has_can
+    from skinware_drivers.finding.interfaces import NO_CAN, NO_INTERFACE, kernel_has_can
 
     in_kernel = kernel_has_can()
     advice = []
     if whole and not interfaces:
         advice.append(NO_INTERFACE if in_kernel else NO_CAN)
-    if interfaces and not has_iproute2():
-        advice.append("bit rates and states of controllers are not known: for them, install iproute2 (the command ip)")
     return {
         "in_kernel": in_kernel,
         "advice": advice,

@@ -75,6 +75,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
         load = f", {100 * heard.load:.0f} % of the bus' time" if heard.load is not None and heard.frames else ""
         what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
         errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""
+        errors += f"; the controller tells: {heard.trouble}" if heard.trouble else ""
         lines += _wrapped(f"heard in {heard.duration_s:g} s: {what}{errors}")
         for one in heard.classes[:_MOST_CLASSES]:
             span = f"{one.first:X}" if one.first == one.last else f"{one.first:X} to {one.last:X}"

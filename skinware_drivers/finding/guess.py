@@ -82,7 +82,9 @@ async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]
         drivers: those in question.
     """
     wire = traffic.wire()
-    adapters = {name: adapter for name, driver in drivers.items() if (adapter := _adapter(driver)) is not None}
+    adapters = {
+        name: adapter for name, driver in drivers.items() if (adapter := with_default_options(driver)) is not None
+    }
     matches = [match for name, adapter in adapters.items() if (match := _match(name, adapter, wire)) is not None]
     explained = np.zeros(len(wire), bool)
     guesses = []
@@ -125,7 +127,7 @@ def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]
     return match
 
 
-def _adapter(driver: type[AnyAdapter]) -> AnyAdapter | None:
+def with_default_options(driver: type[AnyAdapter]) -> AnyAdapter | None:
     """A driver's object with default options; None if it has options that must be given."""
     try:
         return driver(driver.Options())

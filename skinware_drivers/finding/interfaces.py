@@ -1,4 +1,4 @@
-"""CAN interfaces of the kernel: from sysfs, and with iproute2 also what only netlink tells (bit rate, state).
+"""CAN interfaces of the kernel: from sysfs, and what only netlink tells (bit rate, state), with iproute2 in detail.
 
 Sources: Documentation/ABI/testing/sysfs-class-net, linux/if_arp.h (type 280), linux/if.h, ip-link(8).
 """
@@ -6,15 +6,20 @@ Sources: Documentation/ABI/testing/sysfs-class-net, linux/if_arp.h (type 280), l
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import json
 import shutil
 import socket
 import subprocess
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from skinware_drivers.can.interface import Controller, read_controller
+
+_STATES = ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF", "STOPPED", "SLEEPING")
 _ARPHRD_CAN = 280
 _IFF_UP = 1
 _FD_MTU = 72
@@ -35,7 +40,7 @@ class CanInterface:
 
     Attributes:
         name: ``can0``.
-        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` or ``can`` where iproute2 is missing.
+        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` where iproute2 is missing.
         driver: kernel driver of the hardware, empty without.
         up: it is set up.
         carrier: what the kernel calls its operational state: ``up``, ``down``, ``unknown``.
@@ -95,26 +100,27 @@ def kernel_has_can() -> bool:
     return True
 
 
-def can_interfaces(root: Path = Path("/sys"), links: dict[str, dict[str, Any]] | None = None) -> list[CanInterface]:
+def can_interfaces(
+    root: Path = Path("/sys"),
+    links: dict[str, dict[str, Any]] | None = None,
+    controller: Callable[[str], Controller | None] = read_controller,
+) -> list[CanInterface]:
     """All CAN interfaces, by name.
 
     Args:
         root: where sysfs is.
         links: what iproute2 says of each interface; default: it is asked.
+        controller: tells bit rate and state where iproute2 does not.
     """
     told = ask_iproute2() if links is None else links
     folders = sorted((root / "class/net").glob("*"))
-    return [_interface(folder, (told or {}).get(folder.name)) for folder in folders if _is_can(folder)]
-
-
-def has_iproute2() -> bool:
-    """Whether bit rates and states can be known."""
-    return _ip() is not None
+    found = [_interface(folder, told.get(folder.name, {})) for folder in folders if _is_can(folder)]
+    return [one if told else _with_controller(one, controller(one.name)) for one in found]
 
 
 def ask_iproute2() -> dict[str, dict[str, Any]]:
     """What ``ip`` says of all interfaces; empty if it is missing or too old for JSON."""
-    command = _ip()
+    command = shutil.which("ip") or shutil.which("ip", path=_SYSTEM_PATH)
     if command is None:
         return {}
     arguments = [command, "-j", "-details", "-statistics", "link", "show"]
@@ -124,16 +130,26 @@ def ask_iproute2() -> dict[str, dict[str, Any]]:
     return {}
 
 
-def _ip() -> str | None:
-    return shutil.which("ip") or shutil.which("ip", path=_SYSTEM_PATH)
-
-
 def _is_can(folder: Path) -> bool:
     return _number(folder / "type") == _ARPHRD_CAN
 
 
-def _interface(folder: Path, link: dict[str, Any] | None) -> CanInterface:
-    info: dict[str, Any] = (link or {}).get("linkinfo", {})
+def _with_controller(one: CanInterface, controller: Controller | None) -> CanInterface:
+    """What our own question to the kernel told added."""
+    if controller is None:
+        return one
+    known = controller.state is not None and controller.state < len(_STATES)
+    return dataclasses.replace(
+        one,
+        kind="can",
+        bit_rate=controller.bit_rate or None,
+        state=_STATES[controller.state or 0] if known else "",
+        restart_ms=controller.restart_ms,
+    )
+
+
+def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
+    info: dict[str, Any] = link.get("linkinfo", {})
     data: dict[str, Any] = info.get("info_data", {})
     has_hardware = (folder / "device").exists()
     driver = (folder / "device/driver").resolve().name if (folder / "device/driver").exists() else ""

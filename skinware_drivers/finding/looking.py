@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from skinware.errors import BusError, BusNotAvailable, ConfigurationError
-from skinware_drivers.adapter import AnyAdapter
+from skinware.realtime import now_ns
+from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.bus_news import reason_text
 from skinware_drivers.finding.attended import attended
-from skinware_drivers.finding.guess import Guess, guess, likely
+from skinware_drivers.finding.guess import Guess, guess, likely, with_default_options
 from skinware_drivers.finding.traffic import IdentifierClass, Traffic
 from skinware_drivers.registry import make_bus
 
@@ -30,6 +33,7 @@ class HeardOnBus:
         rate_hz: how many a second.
         load: how much of the bus' time they took, 0 to 1; None where the bit rate is not known.
         error_frames: what the controller told of errors.
+        trouble: what is wrong with the bus, as far as its controller tells: ``error-passive``; empty if nothing is.
         lost: frames that were not taken in time.
         classes: identifiers.
         guesses: which drivers know them.
@@ -42,6 +46,7 @@ class HeardOnBus:
     rate_hz: float = 0.0
     load: float | None = None
     error_frames: int = 0
+    trouble: str = ""
     lost: int = 0
     classes: list[IdentifierClass] = field(default_factory=list)
     guesses: list[Guess] = field(default_factory=list)
@@ -92,6 +97,7 @@ async def listen_on(
     try:
         async with attended(bus, traffic.take):
             await asyncio.sleep(duration_s)
+            reason = bus.reason(now_ns())
     except BusNotAvailable as error:
         return HeardOnBus(bus_name, str(error))
     return HeardOnBus(
@@ -101,6 +107,7 @@ async def listen_on(
         rate_hz=traffic.frames / duration_s if duration_s else 0.0,
         load=traffic.load(bit_rate, duration_s) if bit_rate and duration_s else None,
         error_frames=bus.counters.error_frames,
+        trouble=reason_text(reason) if reason else "",
         lost=bus.counters.lost,
         classes=traffic.classes(),
         guesses=await guess(traffic, bus, dict(drivers)),
@@ -125,13 +132,16 @@ async def ask(
         return Answer(heard.bus, refused=heard.problem)
     idle = force or not heard.frames
     known = {one.driver for one in likely(heard.guesses)}
-    asking = {name: driver for name, driver in drivers.items() if idle or name in known}
+    meant = {name: driver for name, driver in drivers.items() if idle or name in known}
+    asking = {name: driver for name, driver in meant.items() if can_ask(driver)}
     if not force and owner:
         return Answer(heard.bus, refused=f"{owner} has it; ask that: skin-config")
-    if not asking:
+    if not meant:
         return Answer(
             heard.bus, refused="no driver knows what is sending there, so a request could mean anything to it"
         )
+    if not asking:
+        return Answer(heard.bus, refused=f"there is no harmless question in {', '.join(meant)}")
     return await _ask_all(make_bus(heard.bus, payload_size=_CAN_PAYLOAD), heard.bus, asking, idle)
 
 
@@ -141,16 +151,31 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
     answers: dict[str, str] = {}
     problems: dict[str, str] = {}
     for name, driver in drivers.items():
+        if not can_ask(driver):
+            continue
+        adapter = with_default_options(driver)
+        if adapter is None:
+            problems[name] = "it has options that must be given"
+            continue
         try:
-            told = await _ask_all(make_bus(f"serial:{path}"), path, {name: driver}, idle=False)
-        except ConfigurationError as error:
-            return Answer(path, refused=str(error))
+            bus = make_bus(f"serial:{path}", payload_size=adapter.payload_size)
+            adapter.fit(bus)
+            told = await _ask_all(bus, path, {name: driver}, idle=False)
+        except ConfigurationError as error:  # say, a baud rate that the port cannot do
+            problems[name] = str(error)
+            continue
         if told.refused:
             return told
         asked.append(name)
         answers.update(told.answers)
         problems.update(told.problems)
-    return Answer(path, asked, answers, problems, "" if asked else "no driver for serial devices is installed")
+    nobody = "no installed driver has a harmless question for serial devices"
+    return Answer(path, asked, answers, problems, "" if asked or problems else nobody)
+
+
+def can_ask(driver: type[AnyAdapter]) -> bool:
+    """Whether a driver knows a question that harms nobody."""
+    return inspect.getattr_static(driver, "identify") is not inspect.getattr_static(Adapter, "identify")
 
 
 async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapter]], idle: bool) -> Answer:

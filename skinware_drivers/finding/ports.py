@@ -93,7 +93,10 @@ class SerialPort:
         elif not self.may_open:
             told.append("you may not open it: give it a group or uaccess by a udev rule (skin-find --udev)")
         if self.latency_ms is not None and self.latency_ms > SLOW_LATENCY_MS:
-            told.append(f"holds data back for up to {self.latency_ms} ms: a udev rule makes that 1 (skin-find --udev)")
+            told.append(
+                f"holds data back for up to {self.latency_ms} ms, unless a program asks it not to, as skin-driver does;"
+                " for all programs, a udev rule: skin-find --udev"
+            )
         return told
 
 

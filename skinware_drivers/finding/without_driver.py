@@ -51,7 +51,7 @@ async def carry_out(
         What the operation returns.
 
     Raises:
-        ConfigurationError: no such operation, patch or argument; or the bus is in use.
+        ConfigurationError: no such operation, patch or argument; the bus is in use, or another kind of bus.
         BusError: it cannot be opened, nobody answers, or what the operation raises.
     """
     declared = operations_of(type(adapter), alone=True)
@@ -64,6 +64,7 @@ async def carry_out(
         check_arguments(wanted.method, arguments)
     except TypeError as error:
         raise ConfigurationError(f"{operation}: {error}") from None
+    adapter.fit(bus)
     traffic = Traffic()
     async with attended(bus, traffic.take) as link:
         await asyncio.sleep(_LISTEN_S)

@@ -39,7 +39,6 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     ) -> None:
         monkeypatch.setattr(interfaces, "can_interfaces", lambda: can or [])
         monkeypatch.setattr(interfaces, "kernel_has_can", lambda: kernel_has_can)
-        monkeypatch.setattr(interfaces, "has_iproute2", lambda: True)
         monkeypatch.setattr(ports, "serial_ports", lambda: tty or [])
         monkeypatch.setattr(adapters, "detect_adapters", lambda _timeout_s: found or Detection())
 
@@ -147,7 +146,7 @@ def test_a_bus_with_a_running_driver_is_shown_and_not_asked(capsys: pytest.Captu
     [
         (TTY, "not asked: you may not open it"),
         (dataclasses.replace(TTY, may_open=True, users=(User(41, "screen"),)), "not asked: screen (pid 41) has it"),
-        (dataclasses.replace(TTY, may_open=True), "not asked: no driver for serial devices is installed"),
+        (dataclasses.replace(TTY, may_open=True), "not asked: no installed driver has a harmless question"),
     ],
 )
 def test_ports_that_cannot_be_asked_are_told(
@@ -168,6 +167,7 @@ def test_ports_that_cannot_be_asked_are_told(
         (["--force"], 2, "--probe"),
         (["--listen", "-1"], 2, "seconds"),
         (["--udev", "can0"], 2, "no serial port"),
+        (["serial:?serial_number=A5"], 3, "there is no serial port"),
     ],
 )
 def test_mistakes_get_one_clear_line_and_the_right_exit_code(

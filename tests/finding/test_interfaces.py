@@ -11,8 +11,9 @@ from typing import NoReturn
 
 import pytest
 
+from skinware_drivers.can.interface import Controller
 from skinware_drivers.finding import interfaces
-from skinware_drivers.finding.interfaces import CanInterface, ask_iproute2, can_interfaces, has_iproute2, kernel_has_can
+from skinware_drivers.finding.interfaces import CanInterface, ask_iproute2, can_interfaces, kernel_has_can
 from tests.finding.fakes import add_interface, ip_link
 
 
@@ -32,11 +33,14 @@ def test_a_controller_with_its_bit_rate_and_counters(tmp_path: Path) -> None:
     assert found.advice() == []
 
 
-def test_without_iproute2_all_but_bit_rate_and_state_is_known(tmp_path: Path) -> None:
+def test_without_iproute2_the_kernel_is_asked_for_bit_rate_and_state(tmp_path: Path) -> None:
     add_interface(tmp_path, "can0", driver="gs_usb", flags=0x1002, operstate="down")
+    add_interface(tmp_path, "can1", driver="peak_usb")
     add_interface(tmp_path, "vcan0")
-    can0, vcan0 = can_interfaces(tmp_path, {})
-    assert (can0.kind, can0.up, can0.bit_rate, can0.state, can0.restart_ms) == ("can", False, None, "", None)
+    known = {"can0": Controller(500_000, 3, 0), "can1": Controller(0, 99)}
+    can0, can1, vcan0 = can_interfaces(tmp_path, {}, known.get)
+    assert (can0.kind, can0.up, can0.bit_rate, can0.state, can0.restart_ms) == ("can", False, 500_000, "BUS-OFF", 0)
+    assert (can1.kind, can1.bit_rate, can1.state) == ("can", None, "")
     assert (vcan0.kind, vcan0.up, vcan0.driver, vcan0.is_fd) == ("virtual", True, "", False)
 
 
@@ -85,14 +89,12 @@ def test_iproute2_is_believed_if_it_speaks_json(
 ) -> None:
     fake_ip(tmp_path, script)
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
-    assert has_iproute2()
     assert list(ask_iproute2()) == links
 
 
 def test_a_machine_without_iproute2(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(interfaces, "_SYSTEM_PATH", str(tmp_path))
-    assert not has_iproute2()
     assert ask_iproute2() == {}
 
 

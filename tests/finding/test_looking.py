@@ -13,12 +13,21 @@ from skinware.errors import BusNotAvailable, HandshakeTimeout
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.can import roboskin_boards
+from skinware_drivers.can.barrett import BarrettDriver
+from skinware_drivers.can.canopen_patch import CanopenDriver
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
 from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.looking import Answer, HeardOnBus, ask, ask_port, listen_on
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
+from skinware_drivers.virtual.hardware import EmulatedHardware
+from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.xela import EmulatedXela, EmulatedXelaOptions
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 
 DRIVERS: dict[str, type[AnyAdapter]] = {"roboskin": RoboskinDriver}
@@ -147,32 +156,64 @@ class Hangs(Answers):
         return "late"
 
 
+class NeedsOptions(Answers):
+    class Options(msgspec.Struct):
+        model: str
+
+
 def test_a_port_is_asked_by_one_driver_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     names: list[str] = []
 
-    def make(name: str) -> VirtualCanBus:
+    def make(name: str, **_: object) -> VirtualCanBus:
         names.append(name)
         return emulated()
 
     monkeypatch.setattr(looking, "make_bus", make)
     monkeypatch.setattr(looking, "_IDENTIFY_S", 0.1)
-    drivers: dict[str, type[AnyAdapter]] = {"a": Silent, "b": Answers, "c": Hangs}
+    drivers: dict[str, type[AnyAdapter]] = {"a": Silent, "b": Answers, "c": Hangs, "d": NeedsOptions}
     answer = asyncio.run(ask_port("/dev/ttyUSB0", drivers))
     assert names == ["serial:/dev/ttyUSB0"] * 3
     assert answer.asked == ["a", "b", "c"]
     assert answer.answers == {"b": "it is me"}
-    assert answer.problems.keys() == {"a", "c"}
+    assert answer.problems.keys() == {"a", "c", "d"}
+    assert answer.problems["d"] == "it has options that must be given"
 
 
 def test_drivers_that_do_not_say_how_to_ask_ask_nobody() -> None:
-    class Plain(RoboskinDriver):
-        identify = AnyAdapter.identify
-
     async def on(bus: Bus) -> Sequence[str | None]:
         async with attended(bus) as link:
-            return [await Plain.identify(link, idle=True)]
+            return [await XelaDriver.identify(link, idle=True)]
 
     bus = emulated()
     assert asyncio.run(on(bus)) == [None]
     assert bus.counters.sent == 0
-    assert asyncio.run(ask_port("/dev/ttyUSB0", {})).refused == "no driver for serial devices is installed"
+    silent = HeardOnBus("bus", duration_s=1.0)
+    assert asyncio.run(ask(silent, {"xela": XelaDriver})).refused == "there is no harmless question in xela"
+    assert (
+        "no installed driver has a harmless question"
+        in asyncio.run(ask_port("/dev/ttyUSB0", {"a": XelaDriver})).refused
+    )
+
+
+@pytest.mark.parametrize(
+    ("emulator", "driver", "patches"),
+    [
+        (EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)), "roboskin", ("board 7",)),
+        (EmulatedXela(EmulatedXelaOptions(streaming=True)), "xela", ("board 1",)),
+        (EmulatedCyskinCpm(EmulatedCyskinCpmOptions(streaming=True)), "cyskin_cpm", ("finger",)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_devices_are_taken_for_what_they_are_and_for_nothing_else(
+    emulator: EmulatedHardware, driver: str, patches: tuple[str, ...]
+) -> None:
+    bus = VirtualCanBus.with_hardware(emulator, listen_only=True)
+    drivers: dict[str, type[AnyAdapter]] = {
+        "barrett": BarrettDriver,
+        "canopen": CanopenDriver,
+        "cyskin_cpm": CyskinCpmDriver,
+        "roboskin": RoboskinDriver,
+        "xela": XelaDriver,
+    }
+    heard = asyncio.run(listen_on(bus, "bus", 0.2, drivers))
+    assert [(one.driver, one.share, one.patches) for one in heard.guesses] == [(driver, 1.0, patches)]

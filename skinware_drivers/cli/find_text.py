@@ -89,7 +89,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
             lines += _wrapped(f"{how} {name}{'' if one.likely else '?'}: {patches} ({share})")
         if heard.frames and not heard.guesses:
             lines += _wrapped("no installed driver knows these frames")
-        if not heard.frames and probe is None:
+        if not heard.frames and probe is None and bus["used_by"] is None:
             lines += _wrapped(f"to ask who is there: skin-find {bus['bus']} --probe")
     return lines + _probe_lines(probe)
 

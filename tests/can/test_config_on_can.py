@@ -1,4 +1,4 @@
-"""``skin-config`` on a real CAN socket, beside and without a driver."""
+"""``skin-config`` on a real CAN socket."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from tests.commands import running
 pytestmark = pytest.mark.can
 
 
-def test_a_board_gets_an_address_and_a_driver_is_not_gone_behind(
-    vcan: Callable[[], str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_board_gets_another_address(vcan: Callable[[], str], capsys: pytest.CaptureFixture[str]) -> None:
     name = vcan()
 
     def configured(*arguments: str) -> Any:
@@ -30,10 +28,3 @@ def test_a_board_gets_an_address_and_a_driver_is_not_gone_behind(
         assert moved["driver"] is None
         assert moved["results"][name]["is"] == 9
         assert configured("versions")["results"][name].keys() == {"8", "9"}
-        with running("skin-driver", "--bus", name, "--name", "torso") as driver:
-            driver.wait_for("ready")
-            through = configured("versions")
-            assert through["driver"]["name"] == "torso"
-            assert through["results"][name].keys() == {"8", "9"}
-            assert exit_status(command, [name, "set_address", "address=7", "patch=board 9", "--yes"]) == 2
-            assert "needs the bus without a driver: end driver 'torso'" in capsys.readouterr().err

@@ -180,6 +180,21 @@ class Adapter(ABC, Generic[OptionsT]):
         return await self.describe(link)
 
     @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
+        """Ask who is there, without knowing anything of the bus, for ``skin-find --probe``. By default nobody is asked.
+
+        Only what can do no harm to any device of this kind may be sent, whatever it is doing.
+
+        Args:
+            link: the bus.
+            idle: nothing is sending: requests that would disturb a device which sends are harmless too.
+
+        Returns:
+            Who answered, in a few words for people; None if nobody did.
+        """
+        return None
+
+    @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
         """What marks doubtful values; by default nothing does."""
         return Watch(tables)

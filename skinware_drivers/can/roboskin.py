@@ -22,6 +22,7 @@ from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can.roboskin_boards import BoardOperations
 from skinware_drivers.can.roboskin_layout import (
     HEAD_BYTE,
     INERTIAL,
@@ -100,7 +101,7 @@ class BaselineWatch(Watch):
         self._not_acknowledged[patch] = 0
 
 
-class RoboskinDriver(CanAdapter[RoboskinOptions]):
+class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     """MTB3 and MTB4 boards. See this package's ``roboskin_layout`` for the wire, and ``RoboskinOptions``.
 
     Sensor uid = board << 16 | triangle << 8 | channel. Non-tactile channels (thermal pads) are of type temperature.

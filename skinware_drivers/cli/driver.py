@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from skinware.realtime import Profile
-    from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.config import DriverConfig
     from skinware_drivers.runner import PublishMode, Runner
 
@@ -97,7 +96,7 @@ def command(
     SIGHUP makes a listener take in what it has heard since it started.
     """
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.config import DriverConfig
+    from skinware_drivers.config import DriverConfig, options_of_bus
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
     from skinware_drivers.runner import Runner
 
@@ -115,7 +114,7 @@ def command(
     given = {key: text for key, text in driver_options.items() if text is not None}
     lines = []
     for bus_name in bus_names:
-        adapter = driver(_options(driver, settings, bus_name, given))
+        adapter = driver(options_of_bus(driver.Options, settings, bus_name, given))
         bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
         lines.append((bus_name, adapter, bus))
     runner = Runner(
@@ -187,18 +186,6 @@ def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[i
     if realtime is None and not chosen:
         return None
     return Profile.from_text("normal" if realtime is None else realtime, cpus=chosen)
-
-
-def _options(driver: type[AnyAdapter], settings: DriverConfig, bus_name: str, given: dict[str, str]) -> Any:
-    """The driver's options for one bus: the command line beats the bus' own, they beat the file's common ones."""
-    from skinware_drivers.config import convert
-    from skinware_drivers.options import options_from_strings
-
-    of_bus = next((bus.options for bus in settings.bus if bus.name == bus_name), {})
-    values = {**settings.options, **of_bus}
-    text_values = options_from_strings(driver.Options, given)
-    values.update({key: getattr(text_values, key) for key in given})
-    return convert(driver.Options, values, f"options of {bus_name}")
 
 
 def _read(path: str) -> DriverConfig:

@@ -55,7 +55,7 @@ class BusLine:
         self.adapter = adapter
         self.bus = bus
         adapter.fit(bus)
-        self.link = Link(bus)
+        self.link = Link(bus, adapter.pace_per_ms)
         self.patches: Sequence[Patch] | None = None
         self.state = BusState.CONNECTING
         self.reason = BusReason.NONE

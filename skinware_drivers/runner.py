@@ -275,6 +275,9 @@ class Runner:
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
         self.decoder = Decoder(self._layouts, tables)
+        for line in self.lines:
+            if line.patches:
+                line.link.narrow(line.adapter.layout)
         self._watch = adapter.watch(tables)
         for line in self.lines:
             for key in line.suspects:

@@ -6,13 +6,15 @@ Every frame comes with the kernel's own time stamp; what the kernel had to drop 
 from __future__ import annotations
 
 import array
+import contextlib
 import ctypes
 import errno
 import fcntl
 import os
 import socket
 import struct
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -21,7 +23,7 @@ import numpy.typing as npt
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.recvmmsg import Rows
@@ -30,6 +32,7 @@ from skinware_drivers.options import options_from_strings
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
 _SOL_CAN_RAW = 101
+_CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
@@ -38,6 +41,8 @@ _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
+MOST_FILTERS = 512
+"""``CAN_RAW_FILTER_MAX`` of linux/can/raw.h."""
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 WANTED_BUFFER_BYTES = 8 << 20
@@ -51,6 +56,10 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     timestamps: Annotated[
         Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
     ] = "auto"
+    filter: Annotated[
+        Literal["on", "off"],
+        msgspec.Meta(description="let the kernel leave out frames that the driver does not know; nobody counts them"),
+    ] = "off"
 
 
 class SocketCanBus(Bus):
@@ -75,6 +84,8 @@ class SocketCanBus(Bus):
             self._wanted = options_from_strings(SocketCanOptions, self.options)
         except ConfigurationError as error:
             raise ConfigurationError(f"bus {channel}: {error}") from None
+        self.narrows = self._wanted.filter == "on"
+        self._filters: Sequence[Filter] = ()
         self._socket: socket.socket | None = None
         self._lost_before = 0
         self.granted_buffer = 0
@@ -102,6 +113,8 @@ class SocketCanBus(Bus):
             # also where the layout has none: that there are FD frames on the bus explains why no others are heard
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
+            if self._filters:
+                _set_filters(sock, self._filters)
             sock.bind((self.channel,))
             if not _is_up(sock, self.channel):
                 raise BusNotAvailable(
@@ -146,6 +159,14 @@ class SocketCanBus(Bus):
                 f" ip link set {self.channel} up"
             )
         return "\n".join(notes)
+
+    def narrow(self, filters: Sequence[Filter]) -> None:
+        """Set the kernel's filters; see :class:`skinware_drivers.bus.Bus`. More than it takes are as none."""
+        filters = filters if len(filters) <= MOST_FILTERS else ()
+        if filters != self._filters and self._socket is not None:
+            with contextlib.suppress(OSError):  # the interface is gone, which receiving will tell
+                _set_filters(self._socket, filters)
+        self._filters = filters
 
     def check(self) -> None:
         """Ask the kernel for the interface's and its controller's state; see :class:`skinware_drivers.bus.Bus`."""
@@ -269,6 +290,12 @@ class SocketCanBus(Bus):
             return 0
         words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
         return words[_MEMINFO_DROPS]
+
+
+def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:
+    everything = (Filter(0, 0),)  # none at all would let nothing through
+    packed = b"".join(struct.pack("=II", *one) for one in filters or everything)
+    sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:

@@ -15,6 +15,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.description import Patch
+from skinware_drivers.limits import BusLimits
 from skinware_drivers.link import Link
 
 log = logging.getLogger("skinware.driver")
@@ -39,6 +40,7 @@ class BusLine:
         patches: what was found on it, None until it was asked.
         state: what the bus is doing.
         reason: why, or what is wrong with it though frames come.
+        limits: how close it is to what it can carry.
         since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
@@ -68,6 +70,7 @@ class BusLine:
         self.suspects: set[int] = set()
         self.revived_ns = 0
         self._epoll = epoll
+        self.limits = BusLimits(name, bus)
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0
@@ -138,6 +141,7 @@ class BusLine:
             return
         time_ns = now_ns()
         self._news.catch_up()
+        self.limits.look()
         before, reason = (self.state, self.reason), self.bus.reason(time_ns)
         if reason == BusReason.BUS_OFF:
             self._become(BusState.DOWN, reason)

@@ -25,6 +25,7 @@ from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.desk import RequestDesk
 from skinware_drivers.figures import figures
 from skinware_drivers.layout import Layout
+from skinware_drivers.limits import MachineLimits
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
 from skinware_drivers.polling import Poller
@@ -86,6 +87,7 @@ class Runner:
         self._group = group
         self._on_ready = on_ready
         self._watch: Watch | None = None
+        self._machine = MachineLimits()
         self._batch = self._make_batch(headroom=0)
         self._stopping = asyncio.Event()
         self._failure: BaseException | None = None
@@ -386,6 +388,7 @@ class Runner:
     # -- buses and patches ----------------------------------------------------------------------------------------
 
     def _update_bus_states(self) -> None:
+        self._machine.look()
         for line in self.lines:
             line.look(self._silence_ns)
             if self.publisher is not None:
@@ -499,7 +502,7 @@ class Runner:
 
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
-        return figures(self.lines, self.writer, self.decoder, self.publisher)
+        return figures(self.lines, self._machine, self.writer, self.decoder, self.publisher)
 
 
 def _first_patch(decoder: Decoder, line: BusLine) -> int:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.recvmmsg import Rows
@@ -38,7 +38,8 @@ _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
-_MEMINFO_DROPS = 8
+_MEMINFO_USED, _MEMINFO_SIZE, _MEMINFO_DROPS = 0, 1, 8
+_FRAME_BITS, _MORE_OF_EXTENDED = 47, 20  # of a frame without payload and stuff bits, with the pause after it
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 MOST_FILTERS = 512
@@ -211,7 +212,9 @@ class SocketCanBus(Bus):
         batch.stop += kept
         self.counters.frames += kept
         self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
-        self.counters.lost = self._lost_before + self._kernel_drops()
+        if self.bit_rate:
+            self.wire_bits += _wire_bits(batch.wire[first : first + kept])
+        self._read_memory()
         return kept
 
     def send(self, identifier: int, payload: bytes) -> None:
@@ -242,6 +245,8 @@ class SocketCanBus(Bus):
         if controller is None:
             return
         self._restarts_itself = controller.restart_ms > 0
+        # of FD frames a part is faster, and of filtered ones nothing is known: then there is no telling the load
+        self.bit_rate = 0 if self.payload_size > 8 or self.narrows else controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
 
@@ -285,11 +290,20 @@ class SocketCanBus(Bus):
         if len(good) and (not len(errors) or good[-1] > errors[-1]):
             self._health.heard_data()
 
-    def _kernel_drops(self) -> int:
-        if self._socket is None:
-            return 0
-        words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
-        return words[_MEMINFO_DROPS]
+    def _read_memory(self) -> None:
+        """What the kernel says of the receive buffer: how full it still is, and what did not fit."""
+        if self._socket is not None:
+            data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+            words = array.array("I", data)
+            self.counters.lost = self._lost_before + words[_MEMINFO_DROPS]
+            self.fullest = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
+
+
+def _wire_bits(wire: npt.NDArray[np.void]) -> int:
+    """About how many bits classic frames take on the wire, one stuff bit in ten bits included."""
+    extended = np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG))
+    bits = _FRAME_BITS * len(wire) + _MORE_OF_EXTENDED * extended + 8 * int(wire["length"].sum(dtype=np.int64))
+    return int(bits * 11) // 10
 
 
 def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:

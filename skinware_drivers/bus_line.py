@@ -228,6 +228,21 @@ class BusLine:
                 self.started = True
                 return
 
+    def begin_lost(self) -> None:
+        """Wait for a bus that nobody has opened yet as for one that was lost; nothing hangs on it so far."""
+        self.patches = ()
+        self.lost.set()
+
+    def remove(self) -> None:
+        """Let go of the bus for good."""
+        if self.bus.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                self._epoll.unregister(self.bus.fileno())
+        self.bus.close()
+        self.lost.set()
+        self.patches = ()
+        self._become(BusState.GONE, BusReason.REMOVED)
+
     async def stop(self) -> None:
         """Make its devices silent, if they were told to send and it can be done now."""
         if not self.started or self.bus.fileno() < 0:

@@ -17,7 +17,7 @@ from skinware.status import Status
 from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
-from skinware_drivers.link import Link
+from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
@@ -92,6 +92,7 @@ class Adapter(ABC, Generic[OptionsT]):
         patches: what hangs on each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+        pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
     """
 
     medium: ClassVar[str]
@@ -101,6 +102,7 @@ class Adapter(ABC, Generic[OptionsT]):
     layout: Layout
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
+    pace_per_ms: float = DEFAULT_PACE_PER_MS
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options

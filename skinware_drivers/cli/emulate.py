@@ -89,7 +89,14 @@ def _emulate(
     emulator = load_emulator(driver)
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
-    bus = make_bus(bus_name, payload_size=8)
+    bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", 8))
+    framing = getattr(emulator, "framing", None)
+    if framing is not None:
+        from skinware_drivers.serial.bus import SerialBus
+
+        if not isinstance(bus, SerialBus):
+            raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on serial lines; give pty or a port")
+        bus.use(framing)
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)

@@ -70,15 +70,16 @@ class HandClock:
         self._timers.discard(timer)
 
     def next_timer_ns(self) -> int | None:
-        """When the first of the timers is due."""
-        return min((timer.due_ns for timer in self._timers if timer.due_ns is not None), default=None)
+        """When the next of the timers will be due. Those that are due already are their readers' affair."""
+        due_ns = [timer.due_ns for timer in self._timers if timer.due_ns is not None and timer.due_ns > self.now_ns]
+        return min(due_ns, default=None)
 
     def pass_to(self, time_ns: int) -> None:
         """Let time pass."""
         for action in self.before_passing:
             action()
         self.now_ns = max(self.now_ns, time_ns)
-        for timer in self._timers:
+        for timer in list(self._timers):
             timer.look()
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -277,6 +277,8 @@ class _EmulatedPort(Port):
 
 class EmulatedSerialBus(SerialBus):
     """A serial line with emulated devices, in a clock's time."""
+
+    opens_slowly: ClassVar[bool] = False  # a thread would know nothing of that time
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)

@@ -15,11 +15,13 @@ from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
 from skinware_drivers.virtual.xela import EmulatedXela
@@ -112,6 +114,11 @@ class TestRoboskinMtb3(DriverConformance):
     emulator = EmulatedTriangles
     driver_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4)}
     emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4), "mtb3": (3,)}
+
+
+class TestOpenPatch(DriverConformance):
+    driver = OpenPatchDriver
+    emulator = EmulatedOpenPatch
 
 
 def test_every_driver_that_ships_is_here() -> None:

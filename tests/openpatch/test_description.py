@@ -241,6 +241,29 @@ def test_a_probe_tells_what_happened() -> None:
     assert told == [Notice.CHANGED]
 
 
+def test_another_patch_in_its_place_is_not_started() -> None:
+    items = wire.Said().items()
+    driver = describe(answering(items))
+    told: list[Notice] = []
+
+    def answer(request: int, arguments: bytes) -> bytes:
+        assert (request, arguments) == (3, struct.pack("<I", wire.crc32(b"".join(items))))
+        return b"\x08"
+
+    async def start() -> None:
+        link = ScriptedLink(answer)
+        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
+        await asyncio.sleep(0)
+        try:
+            await driver.start(link)
+        finally:
+            attending.cancel()
+
+    with pytest.raises(BusError, match="its description is not the one that was read"):
+        asyncio.run(start())
+    assert told == [Notice.CHANGED]
+
+
 def data(module: int, values: bytes, *, status: int = 0, sequence: int = 0) -> bytes:
     return struct.pack("<BHIB", module, sequence, 123, status) + values
 

@@ -288,7 +288,9 @@ def test_status_bits_of_modules_and_values() -> None:
 def test_data_of_a_wrong_form_is_not_shown(payload: bytes, is_module: bool) -> None:
     state = decoded(wire.Said(), [(0x80, payload), (0x81, data(0, bytes(8)))]).state
     assert (state.status == int(Status.NEVER_SEEN)).all()
-    assert dict(zip(BUS_COUNTERS, state.bus_counters[0].tolist(), strict=True))["bad_length"] == is_module
+    counters = dict(zip(BUS_COUNTERS, state.bus_counters[0].tolist(), strict=True))
+    assert counters["bad_length"] == is_module
+    assert counters["unknown"] == 1 + (not is_module)  # a kind that there is not, a module that there is not
 
 
 def stamped(driver: OpenPatchDriver, stamps: Sequence[int], received_ns: Sequence[int]) -> list[int]:

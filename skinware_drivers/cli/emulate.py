@@ -96,6 +96,8 @@ def _emulate(
 
         if not isinstance(bus, SerialBus):
             raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on serial lines; give pty or a port")
+        if getattr(options, "foreign_hz", 0):
+            raise ConfigurationError("--foreign-hz: nothing else hangs on a serial line")
         bus.use(framing)
     log = JsonLinesLog(log_path) if log_path else None
     try:

@@ -66,7 +66,7 @@ class VirtualCanBus(Bus):
         self.hardware = hardware
         self._clock = clock
         self._make_timer = make_timer
-        self._row = struct.Struct(f"=IBBH{payload_size}s")
+        self._row = struct.Struct(f"=IB3x{payload_size}s" if payload_size <= 64 else f"=II{payload_size}s")
         self._timer: Timer | None = None
         self._pending: list[WireFrame] = []
         self._due_ns: int | None = None
@@ -194,9 +194,9 @@ class VirtualCanBus(Bus):
         self._pending += frames
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
-        """Write all frames as rows of ``struct can_frame`` at once."""
+        """Write all frames as rows of :func:`skinware_drivers.bus.wire_dtype` at once."""
         pack = self._row.pack
-        rows = b"".join([pack(identifier, len(payload), 0, 0, payload) for _, identifier, payload in frames])
+        rows = b"".join([pack(identifier, len(payload), payload) for _, identifier, payload in frames])
         stop = batch.stop + len(frames)
         batch.wire[batch.stop : stop] = np.frombuffer(rows, batch.wire.dtype)
         batch.time_ns[batch.stop : stop] = [frame.time_ns for frame in frames]

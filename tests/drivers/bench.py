@@ -91,9 +91,10 @@ class Bench:
         self.log: list[msgspec.Struct] = []
         self.now_ns = 5_000_000_000_000
         self.hardware = case.devices(self.log, **faults)
-        self.bus = VirtualCanBus.with_hardware(self.hardware, clock=lambda: self.now_ns)
-        self.link = Link(self.bus)
         self.adapter = case.adapter()
+        size = self.adapter.payload_size
+        self.bus = VirtualCanBus.with_hardware(self.hardware, payload_size=size, clock=lambda: self.now_ns)
+        self.link = Link(self.bus)
         self.updates: list[tuple[int, int, list[int]]] = []
         self.notices: list[tuple[str, Notice]] = []
         self.patches: Sequence[Patch] = ()

@@ -174,7 +174,7 @@ def emulated_skin(
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver
     adapter = driver_class(msgspec.convert(dict(driver_options or {}), driver_class.Options, strict=False))
-    factory = emulator or (load_emulator(driver) if isinstance(driver, str) else None)
+    factory: Any = emulator or (load_emulator(driver) if isinstance(driver, str) else None)
     hardware: EmulatedHardware | None = None
     with ExitStack() as running:
         if not bus:

@@ -212,7 +212,7 @@ class Running(Rig):
 
         def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
             unwanted = offer(batch, rows)
-            self.answers += len(rows) if runner.decoder is None else len(rows) - len(unwanted)
+            self.answers += len(rows) if runner.generation is None else len(rows) - len(unwanted)
             return unwanted
 
         link.offer = offer_and_count  # type: ignore[method-assign]

@@ -109,6 +109,7 @@ class Emulator(Stage, Generic[OptionsT]):
     Attributes:
         Options: options; becomes those of ``skin-emulate`` and of ``--bus virtual?...``.
         full_scale: greatest value that a device can send.
+        lowest: least value that it can send.
         rest: value of a sensor that nobody touches.
         swing: what a firm press adds to it.
         devices: by number, once powered up.
@@ -116,6 +117,7 @@ class Emulator(Stage, Generic[OptionsT]):
 
     Options: ClassVar[type[EmulatorOptions]]
     full_scale: ClassVar[int]
+    lowest: ClassVar[int] = 0
     rest: ClassVar[int] = 0
     swing: ClassVar[int]
 
@@ -270,7 +272,7 @@ class Emulator(Stage, Generic[OptionsT]):
             return [self.rest] * self._n_values
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
         felt = self.swing * self._press[device.number].strength((time_ns - from_ns) * 1e-9)
-        return [min(max(self.rest + round(value), 0), self.full_scale) for value in felt.tolist()]
+        return [min(max(self.rest + round(value), self.lowest), self.full_scale) for value in felt.tolist()]
 
     def _delay(self, device: Device, time_ns: int) -> int:
         if not self.options.jitter_us:

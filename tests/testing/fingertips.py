@@ -98,6 +98,16 @@ class EmulatedFingertips(Emulator[EmulatorOptions]):
         return [(0x100 | device.number, struct.pack(">B3H", half, *values[3 * half : 3 * half + 3])) for half in (0, 1)]
 
 
+class EmulatedSigned(EmulatedFingertips):
+    """The same with values below 0."""
+
+    full_scale = 0x7FFF
+    lowest = -0x8000
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        return [(0x100 | device.number, struct.pack(">B3h", half, *values[3 * half : 3 * half + 3])) for half in (0, 1)]
+
+
 # Wrong in what frames mean
 
 

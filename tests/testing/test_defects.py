@@ -108,3 +108,13 @@ def test_it_is_found_and_named(driver: type[AnyAdapter], test: str, arguments: t
     suite.driver = driver  # type: ignore[misc, assignment]
     with pytest.raises(pytest.fail.Exception, match=words):
         getattr(suite, test)(*arguments)
+
+
+@pytest.mark.parametrize("test", [VALUES, "test_extreme_values"])
+def test_signs(test: str) -> None:
+    suite = TestFingertips()
+    suite.emulator, suite.driver = f.EmulatedSigned, f.Signed  # type: ignore[misc]
+    getattr(suite, test)()
+    suite.driver = f.Fingertips  # type: ignore[misc]
+    with pytest.raises(pytest.fail.Exception, match="the signed value as if it were unsigned"):
+        getattr(suite, test)()

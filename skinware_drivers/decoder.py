@@ -316,7 +316,7 @@ class Decoder:
 
     def _check_sequence(self, kind: int, payload: Bytes, module: Indices) -> None:
         stamp = self._frames[kind].stamp
-        if stamp is None:
+        if stamp is None or not len(module):
             return
         dtype = np.dtype(stamp.dtype)
         modulo = stamp.modulo or 1 << 8 * dtype.itemsize

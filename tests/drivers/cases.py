@@ -17,6 +17,7 @@ from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.xela import EmulatedXela
 from tests.drivers.bench import Case
+from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 
 
 def ten_strongest(values: Sequence[int]) -> list[int]:
@@ -46,6 +47,7 @@ CASES = [
     pytest.param(Case(CyskinCpmDriver, EmulatedCyskinCpm), id="cyskin_cpm"),
     pytest.param(Case(BarrettDriver, EmulatedBarrett), id="barrett"),
     pytest.param(Case(OpenPatchDriver, EmulatedOpenPatch), id="openpatch"),
+    pytest.param(Case(FdPatchDriver, EmulatedFdPatch), id="CAN FD, 29 bits"),
     pytest.param(
         Case(
             BarrettDriver, EmulatedBarrett, {"format": "top10", "nodes": (11, 14)}, {"nodes": (11, 14)}, ten_strongest

@@ -244,10 +244,22 @@ class Decoder:
         if len(rows):
             rows = rows[(entry[rows] < self._n_modules) | self._payload_names[self._addresses.candidates[slots[rows]]]]
             likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
+            ours_too = self._name_known_modules(likely, entry[rows], payload[rows], length[rows])
+            rows, likely = rows[ours_too], likely[ours_too]
             is_length = ~self._length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
         return kind, rows
+
+    def _name_known_modules(self, kind: Bytes, entry: Indices, payload: Bytes, length: Bytes) -> Flags:
+        """(n,) False for frames whose payload names a module, and one that is not known."""
+        known = np.ones(len(kind), bool)
+        for number, compiled in enumerate(self._kinds):
+            bits = compiled.frame.module_byte
+            if bits is not None and bits.byte is not None:
+                rows = np.flatnonzero((kind == number) & (length > bits.byte))
+                known[rows] = compiled.name_modules(entry[rows], payload[rows]) < self._n_modules
+        return known
 
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
         """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
@@ -316,7 +328,7 @@ class Decoder:
 
     def _check_sequence(self, kind: int, payload: Bytes, module: Indices) -> None:
         stamp = self._frames[kind].stamp
-        if stamp is None:
+        if stamp is None or not len(module):
             return
         dtype = np.dtype(stamp.dtype)
         modulo = stamp.modulo or 1 << 8 * dtype.itemsize

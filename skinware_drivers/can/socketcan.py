@@ -35,6 +35,8 @@ _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
+_CANFD_BRS = 0x01
+_FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
@@ -57,6 +59,9 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     timestamps: Annotated[
         Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
     ] = "auto"
+    bitrate_switch: Annotated[
+        Literal["on", "off"], msgspec.Meta(description="send the payload of CAN FD frames at the data bit rate")
+    ] = "on"
     filter: Annotated[
         Literal["on", "off"],
         msgspec.Meta(description="let the kernel leave out frames that the driver does not know; nobody counts them"),
@@ -223,14 +228,21 @@ class SocketCanBus(Bus):
             raise BusSendError(f"bus {self.channel} is opened to listen only")
         if self._socket is None:
             raise BusSendError(f"bus {self.channel} is not open")
-        size = 8 if len(payload) <= 8 else 64
-        frame = struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(size, b"\0")
+        frame = _classic_frame(identifier, payload) if len(payload) <= 8 else self._fd_frame(identifier, payload)
         try:
             self._socket.send(frame)
         except OSError as error:
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error.strerror})") from None
         self.counters.sent += 1
+
+    def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
+        """``struct canfd_frame``, filled up with zeros to the next length that CAN FD has."""
+        length = next((length for length in _FD_LENGTHS if length >= len(payload)), None)
+        if length is None:
+            raise BusSendError(f"bus {self.channel}: {len(payload)} bytes of payload; CAN FD carries {_FD_LENGTHS[-1]}")
+        flags = _CANFD_BRS if self._wanted.bitrate_switch == "on" else 0
+        return struct.pack("=IBB2x", identifier, length, flags) + payload.ljust(_FD_LENGTHS[-1], b"\0")
 
     def close(self) -> None:
         """Close the socket. Idempotent."""
@@ -335,3 +347,8 @@ def _why_not_bound(interface: str, error: OSError) -> BusNotAvailable:
         why = f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
         return BusNotAvailable(why, reason=BusReason.REFUSED)
     return BusNotAvailable(f"bus {interface}: cannot be opened ({error.strerror})", reason=BusReason.FAILED)
+
+
+def _classic_frame(identifier: int, payload: bytes) -> bytes:
+    """``struct can_frame``."""
+    return struct.pack("=IB3x", identifier, len(payload)) + payload.ljust(8, b"\0")

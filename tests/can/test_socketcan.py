@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import BusNotAvailable, BusSendError
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from tests.can.conftest import ip
 from tests.conftest import wait_until
@@ -59,6 +59,35 @@ def test_frames_arrive_whole_in_order_and_stamped(vcan: Callable[[], str]) -> No
     assert (bus.counters.frames, bus.counters.lost) == (600, 0)
     bus.close()
     bus.close()
+
+
+def test_fd_frames_and_29_bits_go_both_ways(vcan: Callable[[], str]) -> None:
+    interface = vcan()
+    ours, theirs = (SocketCanBus(interface, {"bitrate_switch": on}, payload_size=64) for on in ("on", "off"))
+    ours.open()
+    theirs.open()
+    batch = FrameBatch(20, 64)
+    sent = [(EXTENDED_FLAG | 0x18A5_C801, bytes(range(64))), (0x123, bytes(range(9))), (0x124, b"classic")]
+    for identifier, payload in sent:
+        ours.send(identifier, payload)
+    receive(theirs, batch, 3)
+    wire = batch.wire[:3]
+    assert wire["identifier"].tolist() == [identifier for identifier, _ in sent]
+    assert wire["length"].tolist() == [64, 12, 7]  # CAN FD has no nine bytes
+    assert [row["payload"][: row["length"]].tobytes() for row in wire] == [
+        sent[0][1],
+        sent[1][1] + bytes(3),
+        b"classic",
+    ]
+    assert [int(flags) & 1 for flags in wire["flags"]] == [1, 1, 0]  # bit rate switch
+    batch.clear()
+    theirs.send(0x125, bytes(20))
+    receive(ours, batch, 1)
+    assert (int(batch.wire["length"][0]), int(batch.wire["flags"][0]) & 1) == (20, 0)
+    with pytest.raises(BusSendError, match="65 bytes of payload; CAN FD carries 64"):
+        ours.send(0x123, bytes(65))
+    ours.close()
+    theirs.close()
 
 
 def test_drops_are_counted_exactly(vcan: Callable[[], str]) -> None:

@@ -325,7 +325,7 @@ def test_a_clock_that_stands_still_is_not_believed_for_long() -> None:
     assert all(time_ns - then <= 2 * 10**9 for time_ns, then in zip(received_ns, told, strict=True))
 
 
-NAMES = st.text(st.characters(codec="utf-8", categories=["L", "N"]), max_size=5)
+NAMES = st.text(st.characters(codec="utf-8", categories=["L", "N"]), max_size=4)
 REALS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 LIMITS = st.tuples(REALS, REALS).map(lambda pair: (min(pair), max(pair)))
 

@@ -13,12 +13,14 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from skinware import DriverReader, PatchState
+from skinware import DriverReader
+from skinware.realtime import now_ns
 from skinware_drivers.cli.emulate import emulate
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions
+from tests.conftest import wait_until
 from tests.openpatch import wire
 from tests.sdk.driving import driving_lines, read_until
 
@@ -130,7 +132,9 @@ def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
         stop.close()
 
 
-def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(tmp_path: Path) -> None:
+def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     link = tmp_path / "port"
     with running(emulated(pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1), link):
         driver = OpenPatchDriver(OpenPatchOptions(rate_hz=50))
@@ -139,8 +143,9 @@ def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(tmp_path: Path
             before = read_until(reader, lambda f: not f.status.any())
             assert len(set(before.values.tolist())) == 1
             assert before.structure.patch_name.tolist() == [b"emulated A"]
-            read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
-            read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE and not f.status.any())
+            wait_until(lambda: "emulated A has restarted" in caplog.text)
+            since_ns = now_ns()
+            read_until(reader, lambda f: bool((f.module_time_ns > since_ns).all()) and not f.status.any())
             assert reader.patch_counters(reader.read())[0]["sequence_lost"] == 0
 
 

@@ -208,3 +208,14 @@ def test_identifiers_that_cannot_be_matched_are_refused() -> None:
     ]
     with pytest.raises(ConfigurationError, match="a driver takes 200: run several"):
         Decoder(layouts, tables_of(patches(0), patches(0)))
+
+
+def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
+    frames = [
+        Frame(f"f{i}", (Identifier(0x100 + i),), (8,), Values(2, "<u2", 1, to=(i,)), stamp=Stamp(0, "<u2"))
+        for i in range(2)
+    ]
+    layout = Layout(frames, Cycle(["f0", "f1"], maximum_age_s=1.0))
+    decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
+    run(decoder, [(0, 0x101, numbers(1)), (0, 0x101, numbers(2))])
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2

@@ -184,10 +184,12 @@ def test_a_module_named_in_the_payload() -> None:
         (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(4)), (1, 0, 0)),
         (one(Values(0, "u1", 1), length=4, module=Bits(0, 4)), (0x100, bytes(3)), (1, 0, 0)),
         (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(4)), (1, 0, 0)),
-        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(3)), (1, 1, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, bytes(3)), (1, 0, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, b"\x07\0\0"), (0, 1, 0)),
+        (one(Values(1, "u1", 1), length=4, module=Bits(0, 8, byte=0)), (0x100, b""), (0, 1, 0)),
     ],
 )
-def test_frames_of_unknown_modules_are_unknown_whatever_their_length(
+def test_a_frame_of_a_wrong_length_or_an_unknown_module_is_counted_once(
     layout: Layout, frame: tuple[int, bytes], counted: tuple[int, int, int]
 ) -> None:
     decoder = decode(layout, [Module(taxels(1), key=7)], "u1", [frame])

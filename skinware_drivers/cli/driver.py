@@ -117,6 +117,7 @@ def command(
     bus_names = list(buses) or [bus.name for bus in settings.bus]
     if not bus_names:
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
+    _check_own_options(buses, settings)
     given = {key: text for key, text in driver_options.items() if text is not None}
 
     def line_of(bus_name: str, settings: DriverConfig) -> tuple[str, AnyAdapter, Bus]:
@@ -228,6 +229,17 @@ def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[i
     if realtime is None and not chosen:
         return None
     return Profile.from_text("normal" if realtime is None else realtime, cpus=chosen)
+
+
+def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
+    """Refuse a bus that would silently go without what the file says of its own buses."""
+    known = [bus.name for bus in settings.bus]
+    for name in buses:
+        if name not in known and any(bus.options for bus in settings.bus):
+            raise ConfigurationError(
+                f"--bus {name}: the file has options for {', '.join(known)} and none for this bus;"
+                " change the name there"
+            )
 
 
 def _read(path: str) -> DriverConfig:

@@ -188,6 +188,14 @@ def test_a_file_that_is_named_must_be_of_use(made: Made, capsys: pytest.CaptureF
     assert "a.xml:1: not XML" in capsys.readouterr().err
 
 
+def test_options_of_the_file_are_not_lost_to_another_bus(made: Made) -> None:
+    made.write("skin.xml", device())
+    assert call(made.folder, "-o", made.folder) == 0
+    done = run("skin-driver", "--config", str(made.folder / "torso_skin.toml"), "--bus", "virtual")
+    assert done.returncode == 2
+    assert "--bus virtual: the file has options for can0 and none for this bus; change the name there" in done.stderr
+
+
 def test_a_bus_that_is_not_filled_in_is_refused_by_the_driver(made: Made) -> None:
     made.write("skin.xml", device().replace("socketcan", "ecan"))
     assert call(made.folder, "-o", made.folder) == 0

@@ -138,6 +138,15 @@ def test_a_rate_for_all_holds_for_special_boards_too(hurry: None) -> None:
     assert again[:3] == [(0x207, "4d0014f0"), (0x208, "4d0014f0"), (0x208, "4d0214f0")]
 
 
+def test_a_listener_shows_what_it_hears_and_takes_only_kinds_from_the_configuration() -> None:
+    bus = emulated(boards=(7,), streaming=True, listen_only=True)
+    modules = (Kind(7, (1,), kind="palm", enabled=True), Kind(7, (2,), enabled=False))
+    options: dict[str, Any] = {"boards": (7,), "enabled": False, "modules": modules}
+    with driving(bus, listen_only=True, learn_s=0.3, **options), DriverReader("roboskin") as reader:
+        assert [bytes(kind) for kind in reader.structure.module_kind] == [b"triangle", b"palm"] + [b"triangle"] * 14
+        read_until(reader, lambda f: not f.status.any())
+
+
 def test_a_kind_alone_tells_the_board_nothing() -> None:
     set_up = BoardSetUp(RoboskinOptions(modules=(Kind(7, (1, 2), kind="palm"),)), 7)
     assert sent(set_up) == [bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022")]

@@ -253,6 +253,7 @@ class Chaos:
             self.crew.finish(process)
 
 
+@pytest.mark.alone
 def test_killed_drivers_readers_and_requesters(
     tmp_path: Path, namespace: Namespace, request: pytest.FixtureRequest
 ) -> None:

@@ -88,7 +88,6 @@ class Adapter(ABC, Generic[OptionsT]):
         patches: what hangs on each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
-        polls: what devices that only answer are asked, again and again, from ``start`` to ``stop``; may be a property.
     """
 
     medium: ClassVar[str]
@@ -98,7 +97,6 @@ class Adapter(ABC, Generic[OptionsT]):
     layout: Layout
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
-    polls: Sequence[Poll] = ()
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options
@@ -107,6 +105,11 @@ class Adapter(ABC, Generic[OptionsT]):
     def period_s(self) -> float:
         """Nominal time between two updates of a module, s."""
         return 0.02
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """What devices that only answer are asked, again and again, from ``start`` to ``stop``; asked for anew."""
+        return ()
 
     @property
     def payload_size(self) -> int:

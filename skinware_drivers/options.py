@@ -5,7 +5,7 @@ An options class is a ``msgspec.Struct`` whose fields carry a description, so th
     class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         boards: Annotated[tuple[int, ...], msgspec.Meta(description="board addresses")] = (7, 8)
 
-Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9``.
+Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9``; and any of them as ``0x710``.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from skinware.errors import ConfigurationError
 
 OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
 
+_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 _LONGEST_RANGE = 1 << 16
 _KINDS = {bool: "yes/no", int: "INTEGER", float: "NUMBER", str: "TEXT"}
@@ -124,6 +125,8 @@ def _split(text: str, plain: Any) -> Any:
     if plain is bool:
         word = text.strip().lower()
         return {"": True, "yes": True, "on": True, "no": False, "off": False}.get(word, word)
+    if plain is int:
+        return _number(text.strip())
     if get_origin(plain) not in (list, tuple):
         return text.strip()
     items = [item.strip() for item in text.split(",") if item.strip()]
@@ -133,13 +136,18 @@ def _split(text: str, plain: Any) -> Any:
     for item in items:
         match = _RANGE.fullmatch(item)
         if match is None:
-            numbers.append(item)
+            numbers.append(_number(item))
             continue
         first, last = int(match[1]), int(match[2])
         if not 0 <= last - first < _LONGEST_RANGE:
             raise ValueError(f"the range {item} does not go upwards, or is too long")
         numbers.extend(range(first, last + 1))
     return numbers
+
+
+def _number(text: str) -> str | int:
+    """A whole number that is written as 0x710 too."""
+    return int(text, 16) if _HEXADECIMAL.fullmatch(text) else text
 
 
 def _plain_type(hint: Any) -> Any:

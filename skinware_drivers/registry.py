@@ -46,18 +46,21 @@ def parse_bus_name(name: str) -> BusName:
     return BusName(interface, channel, options)
 
 
-def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False) -> Bus:
+def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, driver: str = DEFAULT_DRIVER) -> Bus:
     """The bus of a name, not opened yet.
 
     Args:
         name: ``[interface:]channel[?key=value&...]``.
         payload_size: longest payload that the layout knows.
         listen_only: refuse to send.
+        driver: whose devices the bus ``virtual`` emulates, if its name does not say.
 
     Raises:
         ConfigurationError: no such interface, or a bad option.
     """
     interface, channel, options = parse_bus_name(name)
+    if interface == "virtual":
+        channel = channel or driver
     transports = {entry.name: entry for entry in entry_points(group=TRANSPORTS)}
     if interface in transports:
         bus_class = transports[interface].load()

@@ -116,7 +116,7 @@ def command(
     lines = []
     for bus_name in bus_names:
         adapter = driver(_options(driver, settings, bus_name, given))
-        bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only)
+        bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
         lines.append((bus_name, adapter, bus))
     runner = Runner(
         driver_type,

@@ -56,8 +56,10 @@ class VirtualCanBus(Bus):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self._emulated = type(hardware).__name__
         if hardware is None:
-            emulator = load_emulator(channel or DEFAULT_EMULATOR)
+            self._emulated = channel or DEFAULT_EMULATOR
+            emulator = load_emulator(self._emulated)
             hardware = emulator(options_from_strings(emulator.Options, self.options))
         self.hardware = hardware
         self._clock = clock
@@ -145,7 +147,7 @@ class VirtualCanBus(Bus):
     @property
     def note(self) -> str:
         """That this is no real hardware."""
-        return f"emulated {self.channel or DEFAULT_EMULATOR}"
+        return f"emulated {self._emulated}"
 
     # Faults of the bus itself, for tests
 

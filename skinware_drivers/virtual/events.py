@@ -15,6 +15,8 @@ import msgspec
 from skinware.errors import ConfigurationError
 
 Half = Literal["head", "tail"]
+FrameDamage = Literal["lost", "truncated", "corrupted", "repeated", "unsent"]
+"""``unsent``: the device lost its power, or its queue was full; nobody heard it either."""
 
 
 def _snake(name: str) -> str:
@@ -36,6 +38,19 @@ class LostHalf(Event, frozen=True):
     half: Half
     reason: Literal["random", "overflow", "died", "restarted"]
     """``overflow``: the board's transmit queue was full, because the bus or the period was too short."""
+
+
+class FrameFault(Event, frozen=True):
+    """Something was wrong with one data frame of a small device."""
+
+    board: int
+    cycle: int
+    position: int
+    """Of the frame in its burst, from 0 (of ``unsent`` ones, in what the burst had become)."""
+    identifier: int
+    fault: FrameDamage
+    payload: str
+    """What went out (of lost ones: what would have gone), in hexadecimal digits."""
 
 
 class WrongLength(Event, frozen=True):
@@ -120,6 +135,12 @@ class CommandReceived(Event, frozen=True):
     """The boards that did, by the address they had before."""
 
 
+def spoilt_bursts(events: Iterable[msgspec.Struct]) -> set[tuple[int, int]]:
+    """The (board, cycle) of small devices of which a host cannot have got every frame intact."""
+    spoilt = {"lost", "truncated", "corrupted", "unsent"}
+    return {(e.board, e.cycle) for e in events if isinstance(e, FrameFault) and e.fault in spoilt}
+
+
 def damaged_cycles(events: Iterable[msgspec.Struct]) -> set[tuple[int, int, int]]:
     """The (board, triangle, cycle) of which a host cannot have got both halves intact."""
     return {(event.board, event.triangle, event.cycle) for event in events if isinstance(event, LostHalf | WrongLength)}
@@ -159,6 +180,8 @@ __all__ = [
     "CommandReceived",
     "Event",
     "ForeignFrame",
+    "FrameDamage",
+    "FrameFault",
     "Half",
     "JsonLinesLog",
     "LostHalf",
@@ -167,4 +190,5 @@ __all__ = [
     "TriangleFault",
     "WrongLength",
     "damaged_cycles",
+    "spoilt_bursts",
 ]

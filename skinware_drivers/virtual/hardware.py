@@ -81,7 +81,7 @@ def load_emulator(name: str) -> HardwareFactory:
     """
     known = {entry.name: entry for entry in entry_points(group=EMULATORS)}
     if name not in known:
-        raise ConfigurationError(f"unknown emulator {name!r}{nearest_name(name, known)}")
+        raise ConfigurationError(f"there is no emulator {name!r}{nearest_name(name, known)}")
     try:
         loaded: HardwareFactory = known[name].load()
     except (ImportError, AttributeError) as error:

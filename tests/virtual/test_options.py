@@ -45,6 +45,7 @@ def make(**texts: str) -> Options:
         ("", ()),
         ("7,,8,", (7, 8)),
         ("-3", (-3,)),
+        ("0x710,0xfF, 3", (0x710, 0xFF, 3)),
     ],
 )
 def test_lists_of_numbers(text: str, boards: tuple[int, ...]) -> None:
@@ -148,3 +149,9 @@ def test_nearest_name_without_any() -> None:
 def test_bad_options_of_the_emulator(options: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         RoboskinOptions(**options)  # type: ignore[arg-type]
+
+
+def test_hexadecimal_numbers() -> None:
+    assert make(count="0x1F").count == 0x1F
+    with pytest.raises(ConfigurationError, match="option count=0x1G"):
+        make(count="0x1G")

@@ -1,0 +1,58 @@
+"""CPM finger with CySkin technology on CAN: sixteen taxels in four frames.
+
+Wire format: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino`` (github.com/wngfra/can2wifi2ros, Apache-2.0). 1
+Mbit/s. Identifiers 0x405, 0x407, 0x409, 0x40B in this order, eight bytes each: four little-endian uint16. The i-th
+value of a set belongs to taxel ``ORDER[i]``. (Other programs of that author use the same table so; only a calibration
+script of his uses it the other way round.) A set is complete with 0x40B.
+
+Nothing numbers the sets and nothing is checked above CAN, so one lost frame loses the set: it is not shown. There is
+no command: the finger sends by itself. [INF]
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import msgspec
+import numpy as np
+
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, Values
+from skinware_drivers.options import check_options
+
+ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
+IDENTIFIERS = (0x405, 0x407, 0x409, 0x40B)
+QUARTERS = tuple(
+    Frame(f"{identifier:03X}", (Identifier(identifier),), (8,), Values(0, "<u2", 4, to=ORDER[4 * i : 4 * i + 4]))
+    for i, identifier in enumerate(IDENTIFIERS)
+)
+
+
+class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two sets, ms", ge=1)] = 20
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
+    """One finger on each bus. Sensor uid = taxel; raw counts, of which hosts take a baseline themselves."""
+
+    Options: ClassVar[type[msgspec.Struct]] = CyskinCpmOptions
+    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
+    dtype = np.uint16
+    patches = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
+
+    def __init__(self, options: CyskinCpmOptions) -> None:
+        super().__init__(options)
+        names = tuple(frame.name for frame in QUARTERS)
+        self.layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
+
+    @property
+    def period_s(self) -> float:
+        """As the options say."""
+        return self.options.period_ms / 1e3

@@ -1,0 +1,131 @@
+"""XELA uSkin on CAN: three-axis taxels, one frame for each.
+
+Wire format: ur-o2as ``o2as_xela_sensor.py`` (a 4x4 sensor; github.com/o2ac/ur-o2as) and uskin_can_drivers
+``src/can_communication.cpp`` (a 4x6 sensor; github.com/ARQ-CRISP/uskin_can_drivers). 1 Mbit/s. Start: identifier
+``0x200 | board``, ``07 00``; stop: ``07 01``. Data: eight bytes, byte 0 unused, then X, Y and Z as big-endian uint16,
+byte 7 unused.
+
+Which identifier means which taxel differs from model to model; both published schemes are known here:
+
+* consecutive (4x4 model): ``first_id + taxel``, first 0x710;
+* row_column (4x6 model): ``first_id | row << 4 | column``, first 0x100; taxel = column * rows + row.
+
+A message is not always a new sample: in a recording of 506 messages a second, taxels keep their values over many
+messages. [INF] Nothing on the wire tells the one from the other. There is no checksum, no sequence number, and no
+answer to any command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+import numpy as np
+
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link
+from skinware_drivers.options import check_options
+
+
+class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver, for every board of a bus."""
+
+    boards: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the boards, 1-15")] = (1,)
+    ids: Annotated[
+        Literal["consecutive", "row_column"],
+        msgspec.Meta(description="how identifiers name taxels: first + taxel, or first | row << 4 | column"),
+    ] = "consecutive"
+    first_id: Annotated[
+        tuple[int, ...], msgspec.Meta(description="identifier of the first taxel of each board, as 0x710")
+    ] = (0x710,)
+    rows: Annotated[int, msgspec.Meta(description="rows of taxels", ge=1, le=16)] = 4
+    columns: Annotated[int, msgspec.Meta(description="columns of taxels", ge=1, le=16)] = 4
+    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two messages of a taxel, ms", ge=1)] = 10
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if not self.boards or len(set(self.boards)) < len(self.boards) or not set(self.boards) <= set(range(1, 16)):
+            raise ConfigurationError(f"boards {self.boards}: give different numbers of 1 to 15")
+        if len(self.first_id) != len(self.boards):
+            raise ConfigurationError(f"{len(self.boards)} boards, but first_id has {len(self.first_id)}: give one each")
+        known: set[int] = set()
+        for board, first in zip(self.boards, self.first_id, strict=True):
+            block = _block(self.identifiers(first))
+            taken = {i for i in range(0x800) if i & block.mask == block.value}
+            if max(self.identifiers(first)) > 0x7FF:
+                raise ConfigurationError(f"board {board}: identifiers from {first:#x} on go beyond 0x7FF")
+            if taken & known:
+                raise ConfigurationError(f"board {board}: its identifiers from {first:#x} on mix with another board's")
+            known |= taken
+
+    def identifiers(self, first: int) -> list[int]:
+        """The identifier of each taxel of a board."""
+        if self.ids == "consecutive":
+            return [first + taxel for taxel in range(self.rows * self.columns)]
+        return [first | row << 4 | column for column in range(self.columns) for row in range(self.rows)]
+
+
+class XelaDriver(CanAdapter[XelaOptions]):
+    """uSkin boards. See this module's docstring for the wire, and ``XelaOptions`` for the options.
+
+    Each taxel is a module of three sensors of one uid = board << 16 | taxel: shear_x, shear_y, pressure. Values are
+    raw (idle about 32 to 37 thousand); forces are computed by the maker's closed server only.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]] = XelaOptions
+    types = tuple(t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE))
+    dtype = np.uint16
+
+    def __init__(self, options: XelaOptions) -> None:
+        super().__init__(options)
+        ids = {b: options.identifiers(first) for b, first in zip(options.boards, options.first_id, strict=True)}
+        self.patches = tuple(_patch(board, identifiers) for board, identifiers in ids.items())
+        axes = Values(offset=1, dtype=">u2", count=3)
+        self.layout = Layout(
+            tuple(
+                Frame(f"board {board}", (_block(identifiers),), (8,), axes, patch=board, module=Bits(0, 11))
+                for board, identifiers in ids.items()
+            )
+        )
+
+    @property
+    def period_s(self) -> float:
+        """As the options say."""
+        return self.options.period_ms / 1e3
+
+    async def start(self, link: Link) -> None:
+        """Command 07 00 to every board."""
+        for board in self.options.boards:
+            await link.send(0x200 | board, b"\x07\x00")
+
+    async def stop(self, link: Link) -> None:
+        """Command 07 01 to every board."""
+        for board in self.options.boards:
+            await link.send(0x200 | board, b"\x07\x01")
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Tell a silent board to start: there is no question that it would answer, but it may have lost its power."""
+        await link.send(0x200 | patch.key, b"\x07\x00")
+        return False
+
+
+def _patch(board: int, identifiers: Sequence[int]) -> Patch:
+    modules = [
+        Module(taxels(1, "shear_x", "shear_y", "pressure", first_uid=board << 16 | taxel), key=identifier, kind="taxel")
+        for taxel, identifier in enumerate(identifiers)
+    ]
+    return Patch(f"board {board}", modules, key=board)
+
+
+def _block(identifiers: Sequence[int]) -> Identifier:
+    """What all these identifiers have in common."""
+    differ = 0
+    for identifier in identifiers:
+        differ |= identifier ^ identifiers[0]
+    mask = 0x7FF & ~((1 << differ.bit_length()) - 1)
+    return Identifier(identifiers[0] & mask, mask)

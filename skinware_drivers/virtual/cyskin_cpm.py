@@ -1,0 +1,56 @@
+"""An emulated CPM finger with CySkin technology: it sends four frames a period from power-up, and hears nothing.
+
+Source: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino``.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+
+_SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
+"""Which of the sixteen values of a set is that of taxel 0, 1, 2 ..."""
+
+
+class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How fast it is."""
+
+    period_ms: Annotated[int, Meta(ge=1, description="time between two sets, ms")] = 20
+
+
+class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
+    """One finger, device 0; see :class:`skinware_drivers.virtual.emulator.Emulator`."""
+
+    Options: ClassVar[type[EmulatorOptions]] = EmulatedCyskinCpmOptions
+    full_scale = 0xFFFF
+    rest = 800
+    swing = 6_000
+    numbers = (0,)
+    identifiers = frozenset((0x405, 0x407, 0x409, 0x40B))
+
+    @property
+    def period_s(self) -> float:
+        """Of a set."""
+        return self.options.period_ms / 1e3
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """Sixteen taxels."""
+        return on_a_grid(16, 4)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """It sends by itself."""
+        self.start(device, now_ns)
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
+        """Four taxels a frame, in an order of its own."""
+        wire = [0] * 16
+        for taxel, at in enumerate(_SENT_AS):
+            wire[at] = values[taxel]
+        return [(0x405 + 2 * i, struct.pack("<4H", *wire[4 * i : 4 * i + 4])) for i in range(4)]

@@ -1,0 +1,343 @@
+"""Emulators of small devices: what a new one need not say.
+
+An emulator says which devices there are, which commands they obey, and which frames they send with which values; see
+:class:`Emulator`. What is felt, when frames go out, and what goes wrong with them is decided here, and written down
+exactly (:mod:`.events`). Emulators share no code and no table with the drivers that they are there to test.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.virtual import events
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.foreign import ForeignTraffic
+from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.press import Press, on_a_grid
+from skinware_drivers.virtual.stage import Actor, Stage
+from skinware_drivers.virtual.wire import Transmission, Transmitter
+
+OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
+CanFrame = tuple[int, bytes]
+"""Identifier and payload."""
+Source = Callable[[int, int], Sequence[int]]
+"""(number of the device, number of its burst) -> the values that it sends, whatever is felt."""
+
+_DATA = "data"
+_REPLY_NS = 200_000
+_LONGEST_QUEUE = 256
+_FOREIGN_IDENTIFIERS = 40
+
+
+class Device:
+    """One emulated device.
+
+    Attributes:
+        number: how the emulator's options name it.
+        memory: what commands have set; gone after a restart.
+        cycle: bursts sent since the first power-up; the number of the next one.
+        streams_from_ns: when it began to send by itself; None: it does not.
+    """
+
+    def __init__(self, number: int, emulator: Emulator[Any], transmitter: Transmitter, now_ns: int) -> None:
+        self.number = number
+        self.transmitter = transmitter
+        self.memory: dict[str, Any] = {}
+        self.cycle = 0
+        self.alive = True
+        self.ready_ns = now_ns
+        self.streams_from_ns: int | None = None
+        self._emulator = emulator
+        self._timers: dict[str, tuple[int, int]] = {}  # name -> next, period
+
+    def every(self, name: str, period_ns: int, first_ns: int) -> None:
+        """Have ``Emulator.on_timer`` called with ``name``, first at ``first_ns``."""
+        self._timers[name] = first_ns, period_ns
+
+    def stop(self, name: str) -> None:
+        """End that. Nothing happens if it never began."""
+        self._timers.pop(name, None)
+
+    def clear(self) -> None:
+        """Forget everything, as without power."""
+        self.memory = {}
+        self._timers = {}
+        self.streams_from_ns = None
+
+    # Actor
+
+    def next_event_ns(self) -> int | None:
+        """When ``run`` has something to do."""
+        return min((next_ns for next_ns, _ in self._timers.values()), default=None)
+
+    def run(self, now_ns: int) -> None:
+        """Do what is due."""
+        for name, (next_ns, period_ns) in list(self._timers.items()):
+            if next_ns <= now_ns and name in self._timers:
+                self._timers[name] = next_ns + period_ns, period_ns
+                self._emulator.on_timer(self, name, next_ns)
+
+    def skip_to(self, now_ns: int) -> int:
+        """Leave out what is due before ``now_ns``; cycles go on. Counts one frame for each."""
+        skipped = 0
+        for name, (next_ns, period_ns) in self._timers.items():
+            times = max(0, -((next_ns - now_ns) // period_ns))
+            self._timers[name] = next_ns + times * period_ns, period_ns
+            skipped += times
+            if name == _DATA:
+                self.cycle += times
+                self._emulator.counts["bursts"] += times
+        return skipped
+
+
+class Emulator(Stage, Generic[OptionsT]):
+    """Emulated devices on one bus. A subclass says what follows; faults and time are taken care of.
+
+    Args:
+        options: which devices, what they feel, and what is wrong with them.
+        log: takes the :mod:`.events`; a list will do.
+        source: the values of every burst, instead of what is felt.
+
+    Attributes:
+        Options: options; becomes those of ``skin-emulate`` and of ``--bus virtual?...``.
+        full_scale: greatest value that a device can send.
+        rest: value of a sensor that nobody touches.
+        swing: what a firm press adds to it.
+        devices: by number, once powered up.
+    """
+
+    Options: ClassVar[type[EmulatorOptions]]
+    full_scale: ClassVar[int]
+    rest: ClassVar[int] = 0
+    swing: ClassVar[int]
+
+    def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
+        super().__init__(log, ("lost", "repeated", "truncated", "corrupted", "foreign"))
+        self.options = options
+        self._source = source
+        self.devices: dict[int, Device] = {}
+        self._random: dict[int, np.random.Generator] = {}
+        self._press: dict[int, Press] = {}
+        for name in ("dead", "restart"):
+            for number in getattr(options, name):
+                if number not in self.numbers:
+                    known = ",".join(map(str, self.numbers))
+                    raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")
+
+    # What a subclass says
+
+    @property
+    @abstractmethod
+    def numbers(self) -> Sequence[int]:
+        """Numbers of the devices."""
+
+    @property
+    @abstractmethod
+    def period_s(self) -> float:
+        """Time from burst to burst of a device that sends by itself."""
+
+    @property
+    @abstractmethod
+    def identifiers(self) -> Collection[int]:
+        """Every identifier that the devices or their host can use: no foreign device does."""
+
+    @abstractmethod
+    def places(self) -> npt.NDArray[np.float64]:
+        """(n, 2) where the n values of a device are felt, 0 to 1; see :func:`.press.on_a_grid`."""
+
+    @abstractmethod
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        """What a device sends in one burst."""
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
+        """Take a command; tells whether the device obeyed or answered. By default it knows none."""
+        return False
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """What a device does once it has power; by default it streams, if the options want that."""
+        if self.options.streaming:
+            self.start(device, now_ns)
+
+    def on_timer(self, device: Device, name: str, time_ns: int) -> None:  # noqa: ARG002
+        """What a device does by itself; by default it has one timer, for its data."""
+        self.burst(device, time_ns)
+
+    # What a subclass may use
+
+    def start(self, device: Device, now_ns: int) -> None:
+        """Make a device send by itself, if it does not yet; each has a phase of its own."""
+        if device.streams_from_ns is None:
+            period_ns = round(self.period_s * 1e9)
+            device.streams_from_ns = now_ns
+            phase = float(np.random.default_rng([self.options.seed, device.number, 4]).uniform(0.02, 1))
+            device.every(_DATA, period_ns, now_ns + max(1, round(phase * period_ns)))
+
+    def stop(self, device: Device) -> None:
+        """Make it silent; what is on its way still goes out."""
+        device.streams_from_ns = None
+        device.stop(_DATA)
+
+    def reply(self, device: Device, frame: CanFrame, now_ns: int) -> None:
+        """Send one frame beside the data."""
+        device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
+
+    def burst(self, device: Device, time_ns: int) -> None:
+        """Send what is felt now; faults happen here."""
+        frames = list(self.frames(device, self._values(device, time_ns)))
+        delay_ns = self._delay(device, time_ns)
+        self._send(device, frames, time_ns, time_ns + delay_ns)
+        device.cycle += 1
+        self.counts["bursts"] += 1
+
+    # Faults at a moment of the caller's choice
+
+    def kill(self, number: int, now_ns: int) -> None:
+        """Make a device fall silent and deaf for good; what it had waiting for the wire is lost."""
+        self._die(self.devices[number], self.run_to(now_ns))
+        self.find_next_event()
+
+    def restart(self, number: int, now_ns: int) -> None:
+        """Cut a device's power for a moment (a dead one lives again): configuration lost, deaf for a while."""
+        self._restart(self.devices[number], self.run_to(now_ns))
+        self.find_next_event()
+
+    # Within
+
+    def power_up(self, now_ns: int) -> Sequence[Actor]:
+        """Make the devices."""
+        options = self.options
+        for number in self.numbers:
+            self.devices[number] = Device(number, self, self.wire.attach(), now_ns)
+            self._random[number] = np.random.default_rng([options.seed, number, 1])
+            self._press[number] = Press(options.seed, number, self.places())
+        for device in self.devices.values():
+            self.boot(device, now_ns)
+        for numbers, after_s, action in (
+            (options.dead, options.dead_after_s, self._die),
+            (options.restart, options.restart_after_s, self._restart),
+        ):
+            for number in numbers:
+                self.schedule(now_ns + round(after_s * 1e9), partial(action, self.devices[number]))
+        return [*self.devices.values(), *self._foreign(now_ns)]
+
+    def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
+        """Let every device hear a frame of the host."""
+        return [
+            device.number
+            for device in self.devices.values()
+            if device.alive and now_ns >= device.ready_ns and self.obey(device, identifier, payload, now_ns)
+        ]
+
+    def _foreign(self, now_ns: int) -> list[ForeignTraffic]:
+        if not self.options.foreign_hz:
+            return []
+        random = np.random.default_rng([self.options.seed, 2])
+        others = np.setdiff1d(np.arange(0x7FF), np.array(sorted(self.identifiers)))
+        identifiers = random.choice(others, min(_FOREIGN_IDENTIFIERS, len(others)), replace=False).tolist()
+        identifiers += [EXTENDED_FLAG | 0x1234_0000 | own for own in sorted(self.identifiers)[:4]]
+        hz = self.options.foreign_hz
+        return [ForeignTraffic(identifiers, hz, random, self.wire.attach(), self.log, self.counts, now_ns)]
+
+    def _values(self, device: Device, time_ns: int) -> list[int]:
+        if self._source is not None:
+            return list(self._source(device.number, device.cycle))
+        places = self.places()
+        if self.options.pattern == "cycle":
+            return [device.cycle % (self.full_scale + 1)] * len(places)
+        if self.options.pattern == "idle":
+            return [self.rest] * len(places)
+        from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
+        felt = self.swing * self._press[device.number].strength((time_ns - from_ns) * 1e-9)
+        return [min(max(self.rest + round(value), 0), self.full_scale) for value in felt.tolist()]
+
+    def _delay(self, device: Device, time_ns: int) -> int:
+        if not self.options.jitter_us:
+            return 0
+        delay_ns = int(self._random[device.number].integers(0, self.options.jitter_us, endpoint=True)) * 1000
+        if delay_ns:
+            self.log.append(
+                events.BurstDelayed(time_ns=time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+            )
+        return delay_ns
+
+    def _send(self, device: Device, frames: Sequence[CanFrame], time_ns: int, ready_ns: int) -> None:
+        options, random = self.options, self._random[device.number]
+        chances = (options.lose, options.truncate, options.corrupt, options.repeat)
+        hit = random.random((len(frames), len(chances))) < chances
+        identifiers: list[int] = []
+        payloads: list[bytes] = []
+        lost: set[int] = set()
+        for position, (identifier, payload) in enumerate(frames):
+            fault = _FAULTS[int(hit[position].argmax())] if hit[position].any() else None
+            if len(device.transmitter) + len(identifiers) >= _LONGEST_QUEUE:
+                fault = "unsent"
+            sent = payload
+            if fault == "truncated":
+                sent = payload[: int(random.integers(0, max(1, len(payload))))]
+            elif fault == "corrupted":
+                sent = random.bytes(len(payload))
+            if fault is not None:
+                self._note(device, time_ns, (device.cycle, position), (identifier, sent), fault)
+            if fault == "lost":
+                lost.add(len(identifiers))
+            times = {"unsent": 0, "repeated": 2}.get(fault or "", 1)
+            identifiers += [identifier] * times
+            payloads += [sent] * times
+        if identifiers:
+            device.transmitter.queue.append(Transmission(ready_ns, identifiers, payloads, lost, cycle=device.cycle))
+
+    def _die(self, device: Device, now_ns: int) -> None:
+        self._lose_power(device, now_ns)
+        self.log.append(events.BoardDied(time_ns=now_ns, board=device.number))
+
+    def _restart(self, device: Device, now_ns: int) -> None:
+        self._lose_power(device, now_ns)
+        ready_ns = now_ns + round(self.options.boot_s * 1e9)
+        self.log.append(events.BoardRestarted(time_ns=now_ns, board=device.number, ready_ns=ready_ns))
+        device.alive, device.ready_ns = True, ready_ns
+
+        def boot(time_ns: int) -> None:
+            if device.alive and device.ready_ns == ready_ns:  # else it lost its power again
+                self.boot(device, time_ns)
+
+        self.schedule(ready_ns, boot)
+
+    def _lose_power(self, device: Device, now_ns: int) -> None:
+        device.alive = False
+        for burst in device.transmitter.queue:
+            for at in range(burst.sent, len(burst.identifiers)):
+                if burst.cycle >= 0 and at not in burst.lost:
+                    frame = burst.identifiers[at], burst.payloads[at]
+                    self._note(device, now_ns, (burst.cycle, at), frame, "unsent")
+        device.transmitter.queue.clear()
+        device.clear()
+
+    def _note(
+        self, device: Device, time_ns: int, where: tuple[int, int], frame: CanFrame, fault: events.FrameDamage
+    ) -> None:
+        cycle, position = where
+        self.counts["lost" if fault == "unsent" else fault] += 1
+        self.log.append(
+            events.FrameFault(
+                time_ns=time_ns,
+                board=device.number,
+                cycle=cycle,
+                position=position,
+                identifier=frame[0],
+                fault=fault,
+                payload=frame[1].hex(),
+            )
+        )
+
+
+_FAULTS: tuple[events.FrameDamage, ...] = ("lost", "truncated", "corrupted", "repeated")
+
+__all__ = ["CanFrame", "Device", "Emulator", "EmulatorOptions", "Source", "on_a_grid"]

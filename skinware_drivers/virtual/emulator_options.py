@@ -1,0 +1,51 @@
+"""The options that every emulator of small devices has (imports nothing slow: ``--help`` shows them)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from skinware_drivers.options import check_options
+
+Probability = Annotated[float, Meta(ge=0, le=1)]
+Seconds = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0)]
+
+
+class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is felt and what goes wrong; an emulator adds which devices there are.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    pattern: Annotated[
+        Literal["touch", "idle", "cycle"],
+        Meta(description="what is felt: a wandering press, nothing, or each burst's number in every value"),
+    ] = "touch"
+    seed: Annotated[Count, Meta(description="another seed, another touch and other random faults")] = 0
+    streaming: Annotated[bool, Meta(description="send from power-up, as if a host had started the devices")] = False
+
+    lose: Annotated[Probability, Meta(description="probability of each data frame to get lost")] = 0.0
+    repeat: Annotated[Probability, Meta(description="probability of each data frame to come twice")] = 0.0
+    truncate: Annotated[Probability, Meta(description="probability of each data frame to end too early")] = 0.0
+    corrupt: Annotated[Probability, Meta(description="probability of each data frame to hold random bytes")] = 0.0
+    jitter_us: Annotated[Count, Meta(description="longest random delay of a burst, in microseconds")] = 0
+    foreign_hz: Annotated[float, Meta(ge=0, le=10_000, description="frames a second from other devices on the bus")] = (
+        0.0
+    )
+    dead: Annotated[tuple[int, ...], Meta(description="devices that die, after dead_after_s")] = ()
+    dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 2.0
+    restart: Annotated[
+        tuple[int, ...], Meta(description="devices that lose power for a moment, after restart_after_s")
+    ] = ()
+    restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
+    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted device hears nothing")] = 0.5
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+__all__ = ["EmulatorOptions"]

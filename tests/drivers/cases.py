@@ -1,0 +1,44 @@
+"""The drivers that are tested alike, each with its emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from skinware_drivers.can.barrett import BarrettDriver
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
+from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.virtual.barrett import EmulatedBarrett
+from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.xela import EmulatedXela
+from tests.drivers.bench import Case
+
+
+def ten_strongest(values: Sequence[int]) -> list[int]:
+    """In N/cm2; of equals, the first."""
+    weakest_last = sorted((-value, cell) for cell, value in enumerate(values))
+    listed = {cell for _, cell in weakest_last[:10]}
+    return [value // 256 if cell in listed else 0 for cell, value in enumerate(values)]
+
+
+CASES = [
+    pytest.param(Case(XelaDriver, EmulatedXela), id="xela"),
+    pytest.param(
+        Case(
+            XelaDriver,
+            EmulatedXela,
+            {"boards": (1, 3), "ids": "row_column", "first_id": (0x100, 0x200), "columns": 6},
+            {"boards": (1, 3), "model": "4x6"},
+        ),
+        id="xela 4x6",
+    ),
+    pytest.param(Case(CyskinCpmDriver, EmulatedCyskinCpm), id="cyskin_cpm"),
+    pytest.param(Case(BarrettDriver, EmulatedBarrett), id="barrett"),
+    pytest.param(
+        Case(
+            BarrettDriver, EmulatedBarrett, {"format": "top10", "nodes": (11, 14)}, {"nodes": (11, 14)}, ten_strongest
+        ),
+        id="barrett top 10",
+    ),
+]

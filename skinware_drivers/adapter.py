@@ -11,8 +11,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import ConfigurationError
 from skinware.sensor_types import SensorType
 from skinware.status import Status
+from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
@@ -80,7 +82,7 @@ class Adapter(ABC, Generic[OptionsT]):
     smallest dtype that holds each bus' own.
 
     Attributes:
-        medium: kind of bus: ``can``.
+        medium: kind of bus: ``can`` or ``serial``.
         Options: struct of the options; becomes command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
@@ -115,6 +117,15 @@ class Adapter(ABC, Generic[OptionsT]):
     def payload_size(self) -> int:
         """Longest payload that a bus must be able to receive. To be overridden where ``describe`` makes the layout."""
         return self.layout.payload_size
+
+    def fit(self, bus: Bus) -> None:
+        """Prepare a bus that is not open yet for what this driver expects of it.
+
+        Raises:
+            ConfigurationError: it is another kind of bus.
+        """
+        if bus.medium not in (None, self.medium):
+            raise ConfigurationError(f"{bus!r} is a {bus.medium} bus, {type(self).__name__} speaks {self.medium}")
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -128,9 +129,14 @@ class Bus(ABC):
         payload_size: the longest payload the driver's layout knows, 8 or 64 for CAN.
         listen_only: refuse every ``send``.
 
+    Attributes:
+        medium: kind of bus, as drivers name it; None: whatever the driver speaks.
+
     Raises:
         skinware.errors.ConfigurationError: an option is unknown or has a bad value.
     """
+
+    medium: ClassVar[str | None] = None
 
     def __init__(
         self,

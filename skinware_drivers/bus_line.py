@@ -50,6 +50,7 @@ class BusLine:
         self.ordinal = ordinal
         self.adapter = adapter
         self.bus = bus
+        adapter.fit(bus)
         self.link = Link(bus)
         self.patches: Sequence[Patch] | None = None
         self.state = BusState.CONNECTING

@@ -27,22 +27,25 @@ class BusName(NamedTuple):
 def parse_bus_name(name: str) -> BusName:
     """Take a bus' name apart.
 
-    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process, and python-can's interfaces
-    of names that are ours are ``can+virtual:`` and ``can+serial:``.
+    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process, ``/dev/ttyUSB0`` is
+    ``serial:/dev/ttyUSB0``, as are pyserial's URLs (``socket://host:port``), and python-can's interfaces of names
+    that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:
         ConfigurationError: empty, or options that are not ``key=value``.
     """
     address, _, query = name.partition("?")
     if not address:
-        raise ConfigurationError("a bus needs a name, such as vcan0, can0 or virtual")
+        raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
     try:
         options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if query else {}
     except ValueError:
         raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
     interface, colon, channel = address.partition(":")
-    if not colon:
-        interface, channel = ("virtual", "") if address == "virtual" else ("socketcan", address)
+    if address.startswith("/") or channel.startswith("//"):  # a device, or one of pyserial's URLs
+        interface, channel = "serial", address
+    elif not colon:
+        interface, channel = (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)
     return BusName(interface, channel, options)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 import threading
 from collections import deque
-from typing import Any
+from typing import Any, ClassVar
 
 import can
 
@@ -29,6 +29,8 @@ class PythonCanBus(Bus):
         interface: python-can's name of the interface.
         channel, options, payload_size, listen_only: as for :class:`skinware_drivers.bus.Bus`.
     """
+
+    medium: ClassVar[str] = "can"
 
     def __init__(
         self,

@@ -13,6 +13,7 @@ import os
 import socket
 import struct
 import time
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -63,6 +64,8 @@ class SocketCanBus(Bus):
     Options: ``buffer``: receive buffer in bytes, default 8 MiB. The bit rate is set where the interface is set up
     (``ip link set can0 type can bitrate 1000000``).
     """
+
+    medium: ClassVar[str] = "can"
 
     def __init__(
         self,

@@ -1,0 +1,44 @@
+"""The adapter that every driver of serial devices subclasses."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from skinware_drivers.adapter import Adapter, OptionsT
+from skinware_drivers.bus import Bus
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.framing import Encoding, Framing
+from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
+
+
+class SerialAdapter(Adapter[OptionsT]):
+    """One serial line of a driver; see :class:`skinware_drivers.adapter.Adapter`.
+
+    What the layout calls the identifier is a number in the header of the frames, if the framing names one, and 0
+    otherwise; the payload is the body.
+
+    Attributes:
+        framing: how frames lie in the stream.
+        commands: how commands are sent, if not in the same way (``Unframed()``: as they are).
+        baudrate: unless the bus' name says another.
+    """
+
+    medium: ClassVar[str] = "serial"
+    framing: Framing
+    commands: Encoding | None = None
+    baudrate: int = DEFAULT_BAUDRATE
+
+    @property
+    def payload_size(self) -> int:
+        """Longest payload: also answers to commands must fit."""
+        return max(self.layout.payload_size, -(-self.framing.maximum_body // 8) * 8)
+
+    def fit(self, bus: Bus) -> None:
+        """Tell the line what is on it.
+
+        Raises:
+            ConfigurationError: it is another kind of bus.
+        """
+        super().fit(bus)
+        if isinstance(bus, SerialBus):
+            bus.use(self.framing, self.commands, self.baudrate)

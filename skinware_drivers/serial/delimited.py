@@ -1,0 +1,184 @@
+"""Frames that end with a delimiter: lines, COBS, SLIP, and the stuffing of HDLC and PPP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.serial.checksums import Checksum
+from skinware_drivers.serial.framing import NOTHING, Field, Framed, Framer, Framing, check_body
+from skinware_drivers.serial.stuffing import Stuffing
+
+
+@dataclass(frozen=True)
+class Delimited(Framing):
+    """Frames that end with a delimiter: header, body and checksum, stuffed.
+
+    What is left of a frame that was damaged ends at the next delimiter, and the frame behind it is found.
+
+    Attributes:
+        stuffing: ``LINES``, ``COBS``, ``SLIP`` or ``HDLC``.
+        maximum_body: bytes of the longest body. Bodies that are longer are skipped.
+        minimum_body: bytes of the shortest. 0: empty lines are frames.
+        checksum: of header and body, at the end.
+        identifier: number in the header that tells kinds of frame apart.
+        header: bytes before the body; default: up to the end of ``identifier``.
+        trusts_first: what arrives before the first delimiter is a frame if it looks like one. Default: only with a
+            checksum; without one it may as well be the end of a frame.
+
+    Raises:
+        ConfigurationError: the identifier is not in the header, or the lengths are impossible.
+    """
+
+    stuffing: Stuffing
+    maximum_body: int
+    minimum_body: int = 1
+    checksum: Checksum | None = None
+    identifier: Field | None = None
+    header: int | None = None
+    trusts_first: bool | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.minimum_body <= self.maximum_body:
+            raise ConfigurationError(f"bodies of {self.minimum_body} to {self.maximum_body} bytes cannot be")
+        if self.identifier is not None and self.identifier.end > self.body_start:
+            raise ConfigurationError(f"the identifier is not within the header of {self.body_start} bytes")
+
+    @property
+    def body_start(self) -> int:
+        """Bytes before the body."""
+        if self.header is not None:
+            return self.header
+        return self.identifier.end if self.identifier is not None else 0
+
+    @property
+    def overhead(self) -> int:
+        """Bytes of header and checksum."""
+        return self.body_start + (self.checksum.size if self.checksum is not None else 0)
+
+    def framer(self) -> Framer:
+        """Something to feed a stream to."""
+        return DelimitedFramer(self)
+
+    def encode(self, identifier: int, payload: bytes) -> bytes:
+        """A frame as it is sent; the header is zero except for the identifier.
+
+        Raises:
+            ValueError: there is no such frame.
+        """
+        check_body(identifier, payload, self.identifier, self.minimum_body, self.maximum_body)
+        header = bytearray(self.body_start)
+        if self.identifier is not None:
+            self.identifier.put(header, identifier)
+        content = bytes(header) + payload
+        if self.checksum is not None:
+            content += self.checksum.to_bytes(content)
+        return self.stuffing.encode(content)
+
+
+class DelimitedFramer(Framer):
+    """Finds the frames of a stream with delimiters."""
+
+    def __init__(self, framing: Delimited) -> None:
+        super().__init__()
+        self._framing = framing
+        self._shortest = framing.minimum_body + framing.overhead
+        self._longest = framing.maximum_body + framing.overhead
+        self._longest_segment = framing.stuffing.longest(self._longest)
+        self._padding = bytes(self._longest_segment + 8)
+        self._delimiter = bytes([framing.stuffing.delimiter])
+        trusts_first = framing.checksum is not None if framing.trusts_first is None else framing.trusts_first
+        self._discarding = not trusts_first  # everything up to the next delimiter
+
+    def _find_few(self, stream: bytes) -> tuple[Framed, int]:
+        counters, framing = self.counters, self._framing
+        *segments, rest = stream.split(self._delimiter)
+        bodies: list[bytes] = []
+        identifiers: list[int] = []
+        ends: list[int] = []
+        end = self._before
+        for segment in segments:
+            end += len(segment) + 1
+            if self._discarding:
+                self._discarding = False
+                counters.skipped_bytes += len(segment) + 1
+                continue
+            content = framing.stuffing.decode(segment) if len(segment) <= self._longest_segment else None
+            if content == b"" and self._shortest:
+                counters.idle_bytes += len(segment) + 1
+                continue
+            if content is None or not self._shortest <= len(content) <= self._longest:
+                counters.refused += 1
+                counters.skipped_bytes += len(segment) + 1
+                continue
+            if framing.checksum is not None:
+                size = framing.checksum.size
+                if framing.checksum.to_bytes(content[:-size]) != content[-size:]:
+                    counters.checksum_errors += 1
+                    counters.skipped_bytes += len(segment) + 1
+                    continue
+                content = content[:-size]
+            counters.frame_bytes += len(segment) + 1
+            bodies.append(content[framing.body_start :])
+            identifiers.append(framing.identifier.of(content) if framing.identifier is not None else 0)
+            ends.append(end)
+        found = Framed.of_bodies(bodies, identifiers, ends) if bodies else NOTHING
+        return found, len(stream) - self._keep(len(rest))
+
+    def _find_many(self, stream: bytes) -> tuple[Framed, int]:
+        counters, framing = self.counters, self._framing
+        data = np.frombuffer(b"".join((self._padding, stream, self._padding)), np.uint8)
+        begin = len(self._padding)
+        segment_stop = np.flatnonzero(data[begin : begin + len(stream)] == framing.stuffing.delimiter) + begin
+        if not len(segment_stop):
+            return NOTHING, len(stream) - self._keep(len(stream))
+        segment_start = np.concatenate([[begin], segment_stop[:-1] + 1])
+        rest = begin + len(stream) - int(segment_stop[-1]) - 1
+        if self._discarding:
+            self._discarding = False
+            segment_start, segment_stop = segment_start[1:], segment_stop[1:]
+        frame_bytes, idle_bytes = 0, 0
+        size = segment_stop - segment_start
+        fits = size <= self._longest_segment
+        if not fits.all():
+            counters.refused += int((~fits).sum())
+            segment_start, segment_stop = segment_start[fits], segment_stop[fits]
+        data, start, stop, right = framing.stuffing.decode_many(data, segment_start, segment_stop)
+        size = stop - start
+        fits = right & (size >= self._shortest) & (size <= self._longest)
+        if not fits.all():
+            idle = right & (size == 0) & (self._shortest > 0)
+            idle_bytes = int((segment_stop - segment_start + 1)[idle].sum())
+            counters.refused += int((~fits & ~idle).sum())
+            segment_start, segment_stop = segment_start[fits], segment_stop[fits]
+            start, stop = start[fits], stop[fits]
+        if framing.checksum is not None and len(start):
+            stop = stop - framing.checksum.size
+            good = framing.checksum.read_many(data, stop) == framing.checksum.of_many(data, start, stop)
+            if not good.all():
+                counters.checksum_errors += int((~good).sum())
+                segment_start, segment_stop = segment_start[good], segment_stop[good]
+                start, stop = start[good], stop[good]
+        frame_bytes = int((segment_stop - segment_start + 1).sum())
+        counters.frame_bytes += frame_bytes
+        counters.idle_bytes += idle_bytes
+        counters.skipped_bytes += len(stream) - rest - frame_bytes - idle_bytes
+        identifier = framing.identifier.of_many(data, start) if framing.identifier is not None else start * 0
+        body = start + framing.body_start
+        found = Framed(data, body, stop - body, identifier, segment_stop + (1 - begin + self._before))
+        return found, len(stream) - self._keep(rest)
+
+    def _keep(self, rest: int) -> int:
+        """How many of the bytes behind the last delimiter are kept; none of a frame that is too long already."""
+        if not self._discarding and rest > self._longest_segment:
+            self._discarding = True
+            self.counters.refused += 1
+        if self._discarding:
+            self.counters.skipped_bytes += rest
+            return 0
+        return rest
+
+
+__all__ = ["Delimited", "DelimitedFramer"]

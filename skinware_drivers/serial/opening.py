@@ -1,0 +1,144 @@
+"""Which port a name means, and opening it: every refusal says what to do about it."""
+
+from __future__ import annotations
+
+import errno
+import grp
+import os
+from typing import Annotated, Any, Literal
+
+import msgspec
+import serial
+from msgspec import Meta
+from serial.tools import list_ports
+
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware_drivers.serial.ports import DescriptorPort, Port, ThreadedPort
+
+DEFAULT_BAUDRATE = 115_200
+_WRITE_TIMEOUT_S = 1.0
+_READ_TIMEOUT_S = 0.1
+
+
+class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a serial bus."""
+
+    baudrate: Annotated[int | None, Meta(ge=1, description="bits per second; default: what the driver says")] = None
+    serial_number: Annotated[str, Meta(description="of the USB device, in place of a path")] = ""
+    vid_pid: Annotated[str, Meta(description="vendor and product of the USB device, as 0483:5700")] = ""
+    parity: Annotated[Literal["none", "even", "odd"], Meta(description="parity bit")] = "none"
+    stop_bits: Annotated[Literal[1, 2], Meta(description="stop bits")] = 1
+    rtscts: Annotated[bool, Meta(description="hardware flow control")] = False
+    low_latency: Annotated[bool, Meta(description="ask the adapter to hand on bytes at once")] = True
+
+
+def find_port(channel: str, options: SerialOptions) -> str:
+    """The path or URL that is meant now: a USB device may have another path than the last time.
+
+    Raises:
+        BusNotAvailable: no such device is plugged in, or several are.
+        ConfigurationError: nothing says which port, or too much does.
+    """
+    if not options.serial_number and not options.vid_pid:
+        if not channel:
+            raise ConfigurationError("which serial port? serial:/dev/ttyUSB0, or serial:?serial_number=...")
+        return channel
+    if channel:
+        raise ConfigurationError(f"serial:{channel}: give a path, or serial_number and vid_pid, not both")
+    wanted = []
+    ports = list(list_ports.comports())
+    for port in ports:
+        usb = "" if port.vid is None else f"{port.vid:04x}:{port.pid:04x}"
+        if options.serial_number in ("", port.serial_number) and options.vid_pid.lower() in ("", usb):
+            wanted.append(port)
+    if len(wanted) == 1:
+        return str(wanted[0].device)
+    what = " and ".join(
+        text
+        for text, given in (
+            (f"serial number {options.serial_number}", options.serial_number),
+            (f"VID:PID {options.vid_pid}", options.vid_pid),
+        )
+        if given
+    )
+    if wanted:
+        numbers = ", ".join(f"{port.device} (serial_number={port.serial_number})" for port in wanted)
+        raise BusNotAvailable(f"{len(wanted)} serial ports have {what}: {numbers}; say which")
+    raise BusNotAvailable(f"no serial port has {what}; {_known_ports(ports)}")
+
+
+def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
+    """Open a port for us alone.
+
+    Args:
+        path: device path or pyserial's URL.
+        options: of the bus.
+        baudrate: bits per second.
+
+    Raises:
+        BusNotAvailable: not there, not permitted, taken, or no serial port at all.
+        ConfigurationError: pyserial knows no such URL, or the port has no such setting.
+    """
+    is_url = "://" in path
+    try:
+        line = serial.serial_for_url(
+            path,
+            do_not_open=True,
+            baudrate=baudrate,
+            parity={"none": "N", "even": "E", "odd": "O"}[options.parity],
+            stopbits=options.stop_bits,
+            rtscts=options.rtscts,
+            exclusive=None if is_url else True,
+            timeout=_READ_TIMEOUT_S,
+            write_timeout=_WRITE_TIMEOUT_S,
+        )
+    except (serial.SerialException, ValueError) as error:
+        raise ConfigurationError(f"{path}: {error}") from None
+    try:
+        line.open()
+    except (OSError, ValueError, EOFError) as error:  # SerialException is an OSError
+        raise _refusal(path, error, baudrate) from None
+    if not is_url or path.startswith("socket://"):
+        port: Port = DescriptorPort(path, line)
+    else:
+        port = ThreadedPort(path, line)
+    if options.low_latency and not is_url and not os.path.realpath(path).startswith("/dev/pts/"):
+        port.note = _low_latency(path, line)
+    return port
+
+
+def _low_latency(path: str, line: Any) -> str:
+    try:
+        line.set_low_latency_mode(True)
+    except (ValueError, OSError, NotImplementedError):
+        return f"{path}: no low-latency mode; an adapter may hold back bytes for some milliseconds"
+    return ""
+
+
+def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | ConfigurationError:
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
+        return BusNotAvailable(f"no serial port {path}; {_known_ports(list(list_ports.comports()))}")
+    if number in (errno.EACCES, errno.EPERM):
+        group = _group_of(path)
+        return BusNotAvailable(f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again")
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return BusNotAvailable(f"{path}: another program has it open; which one: fuser -v {path}")
+    if isinstance(error, ValueError) and "baud" in str(error).lower():
+        return ConfigurationError(f"{path}: it cannot do {baudrate} baud")
+    return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}")
+
+
+def _group_of(path: str) -> str:
+    try:
+        return grp.getgrgid(os.stat(path).st_gid).gr_name
+    except (OSError, KeyError):
+        return "dialout"
+
+
+def _known_ports(ports: list[Any]) -> str:
+    known = [f"{port.device} ({port.description})" if port.vid else port.device for port in ports]
+    return f"there are: {', '.join(known)}" if known else "there is none at all"
+
+
+__all__ = ["DEFAULT_BAUDRATE", "SerialOptions", "find_port", "open_port"]

@@ -1,0 +1,285 @@
+"""Bytes in and out: a tty, a socket, one of pyserial's other URLs, or the end of a pseudo terminal for emulators."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import termios
+import threading
+import tty
+from abc import ABC, abstractmethod
+from collections import deque
+from typing import Any
+
+from skinware.errors import BusNotAvailable
+
+_MOST_THREADED = 1 << 16
+"""Bytes that a port with threads holds in each direction."""
+_THREAD_TURN_S = 0.1
+
+
+class Port(ABC):
+    """An open serial line; no call blocks.
+
+    Attributes:
+        note: what a person should know about it.
+    """
+
+    note = ""
+
+    @abstractmethod
+    def fileno(self) -> int:
+        """A descriptor that is readable when there is something to read."""
+
+    @abstractmethod
+    def read(self, size: int) -> bytes:
+        """Up to ``size`` bytes; none if there are none.
+
+        Raises:
+            BusNotAvailable: it is gone.
+        """
+
+    @abstractmethod
+    def write(self, data: bytes) -> int:
+        """Write what can be written now; gives how many bytes that were.
+
+        Raises:
+            OSError: it is gone.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of it. Idempotent."""
+
+
+class DescriptorPort(Port):
+    """A tty or a socket.
+
+    Args:
+        name: for messages.
+        serial: pyserial's object, which stays the owner.
+    """
+
+    def __init__(self, name: str, serial: Any) -> None:
+        self._name = name
+        self._serial = serial
+        self._fd: int = serial.fileno()
+        os.set_blocking(self._fd, False)
+        self._is_tty = os.isatty(self._fd)
+        if self._is_tty:
+            _wait_for_one_byte(self._fd)
+            with contextlib.suppress(OSError):
+                fcntl.ioctl(self._fd, termios.TIOCEXCL)
+
+    def fileno(self) -> int:
+        """The descriptor itself."""
+        return self._fd
+
+    def read(self, size: int) -> bytes:
+        """Up to ``size`` bytes; none if there are none.
+
+        Raises:
+            BusNotAvailable: unplugged, or the other end has closed.
+        """
+        try:
+            data = os.read(self._fd, size)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise BusNotAvailable(f"{self._name} went away ({error.strerror}): unplugged?") from None
+        if not data:
+            raise BusNotAvailable(f"{self._name} went away (readable, but nothing comes): unplugged?")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Write what fits into the kernel's buffer."""
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Let go of it."""
+        if self._serial is not None:
+            if self._is_tty:
+                with contextlib.suppress(OSError):
+                    fcntl.ioctl(self._fd, termios.TIOCNXCL)
+            self._serial.close()
+            self._serial = None
+
+
+class ThreadedPort(Port):
+    """A port that has no descriptor to wait for (``rfc2217://``, ``loop://``, ``spy://`` ...): two threads serve it.
+
+    Args:
+        name: for messages.
+        serial: pyserial's object, with short timeouts.
+    """
+
+    def __init__(self, name: str, serial: Any) -> None:
+        self._name = name
+        self._serial = serial
+        self._received: deque[bytes] = deque()
+        self._to_send: deque[bytes] = deque()
+        self._changed = threading.Condition()
+        self._failure = ""
+        self._closing = False
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._threads = [
+            threading.Thread(target=self._work, args=(work,), name=f"{name} {what}", daemon=True)
+            for what, work in (("reader", self._read_on), ("writer", self._write_on))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def fileno(self) -> int:
+        """An eventfd."""
+        return self._event
+
+    def read(self, size: int) -> bytes:
+        """Up to ``size`` bytes, as the thread has them.
+
+        Raises:
+            BusNotAvailable: the thread could not go on.
+        """
+        with self._changed:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._event)
+            if not self._received and self._failure:
+                raise BusNotAvailable(f"{self._name} went away ({self._failure})")
+            taken = b"".join(self._received)
+            self._received.clear()
+            if len(taken) > size:
+                self._received.append(taken[size:])
+            if self._received or self._failure:
+                os.eventfd_write(self._event, 1)
+            self._changed.notify_all()
+        return taken[:size]
+
+    def write(self, data: bytes) -> int:
+        """Hand bytes to the thread, as many as it still takes."""
+        with self._changed:
+            if self._failure:
+                raise OSError(self._failure)
+            taken = data[: max(0, _MOST_THREADED - sum(map(len, self._to_send)))]
+            if taken:
+                self._to_send.append(taken)
+                self._changed.notify_all()
+        return len(taken)
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._closing:
+            return
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+        self._serial.close()
+        os.close(self._event)
+
+    def _work(self, work: Any) -> None:
+        try:
+            while not self._closing:
+                work()
+        except Exception as error:  # noqa: BLE001  (pyserial's handlers raise what their libraries raise)
+            with self._changed:
+                self._failure = str(error) or type(error).__name__
+                os.eventfd_write(self._event, 1)
+
+    def _read_on(self) -> None:
+        data = self._serial.read(1)
+        if data:
+            data += self._serial.read(min(self._serial.in_waiting, _MOST_THREADED))
+        with self._changed:
+            if data:
+                self._received.append(bytes(data))
+                os.eventfd_write(self._event, 1)
+            while sum(map(len, self._received)) >= _MOST_THREADED and not self._closing:
+                self._changed.wait(_THREAD_TURN_S)
+
+    def _write_on(self) -> None:
+        with self._changed:
+            while not self._to_send and not self._closing and not self._failure:
+                self._changed.wait(_THREAD_TURN_S)
+            data = self._to_send.popleft() if self._to_send else b""
+        if data:
+            self._serial.write(data)
+
+
+class PtyPort(Port):
+    """The device's end of a pseudo terminal: what programs open as a serial port.
+
+    Args:
+        link: a symbolic link to the port; replaced if it is one.
+
+    Attributes:
+        path: the port.
+
+    Raises:
+        BusNotAvailable: no pseudo terminal, or the link cannot be made.
+    """
+
+    def __init__(self, link: str = "") -> None:
+        self._link = link
+        try:
+            self._fd, self._other = os.openpty()  # the other end stays open, so that programs can come and go
+        except OSError as error:
+            raise BusNotAvailable(f"no pseudo terminal: {error.strerror}") from None
+        self.path = os.ttyname(self._other)
+        tty.setraw(self._other)
+        os.set_blocking(self._fd, False)
+        self.note = f"serial port {self.path}"
+        if link:
+            try:
+                if os.path.islink(link):
+                    os.unlink(link)
+                os.symlink(self.path, link)
+            except OSError as error:
+                self._link = ""
+                self.close()
+                raise BusNotAvailable(f"cannot make the link {link}: {error.strerror}") from None
+            self.note += f", {link}"
+
+    def fileno(self) -> int:
+        """The master's descriptor."""
+        return self._fd
+
+    def read(self, size: int) -> bytes:
+        """What programs have written to the port."""
+        try:
+            return os.read(self._fd, size)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise BusNotAvailable(f"{self.path} went away ({error.strerror})") from None
+
+    def write(self, data: bytes) -> int:
+        """What fits into the kernel's buffer; nobody may be reading."""
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+
+    def close(self) -> None:
+        """Take the port away."""
+        if self._fd < 0:
+            return
+        if self._link and os.path.islink(self._link) and os.readlink(self._link) == self.path:
+            os.unlink(self._link)
+        os.close(self._fd)
+        os.close(self._other)
+        self._fd = -1
+
+
+def _wait_for_one_byte(fd: int) -> None:
+    """Make a read of nothing fail rather than return nothing, which then means that the device is gone."""
+    with contextlib.suppress(termios.error):
+        settings = termios.tcgetattr(fd)
+        settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
+        termios.tcsetattr(fd, termios.TCSANOW, settings)
+
+
+__all__ = ["DescriptorPort", "Port", "PtyPort", "ThreadedPort"]

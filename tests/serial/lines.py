@@ -1,0 +1,225 @@
+"""Devices on pseudo terminals, and drivers of them that run in a thread."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import select
+import threading
+import tty
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.adapter import NoOptions
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.runner import Runner
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.checksums import CRC16_XMODEM
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.stuffing import COBS
+from tests.conftest import wait_until
+
+FRAMING = Delimited(COBS, maximum_body=64, checksum=CRC16_XMODEM, identifier=Field(0))
+DATA, ASK, ANSWER = 1, 0x10, 0x11
+N_TAXELS = 12
+
+
+class Line:
+    """A device at the end of a pseudo terminal.
+
+    Attributes:
+        path: what a driver opens.
+    """
+
+    def __init__(self) -> None:
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        self.path = os.ttyname(slave)
+        self._slave = slave  # kept open until a driver has it, or nothing could be written
+        os.set_blocking(self.master, False)
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        while data:
+            select.select([], [self.master], [], 10)
+            data = data[os.write(self.master, data) :]
+
+    def read(self, size: int = 65536) -> bytes:
+        """What the driver has sent, after waiting for something."""
+        ready, _, _ = select.select([self.master], [], [], 10)
+        assert ready, "the driver sends nothing"
+        return os.read(self.master, size)
+
+    def unplug(self) -> None:
+        """Go away."""
+        for fd in (self.master, self._slave):
+            if fd >= 0:
+                os.close(fd)
+        self.master = self._slave = -1
+
+
+@contextmanager
+def line() -> Iterator[Line]:
+    device = Line()
+    try:
+        yield device
+    finally:
+        device.unplug()
+
+
+@contextmanager
+def opened(path: str, framing: Framing = FRAMING, **more: Any) -> Iterator[SerialBus]:
+    """An open bus on a port."""
+    bus = SerialBus(path, more.pop("options", None), payload_size=64, **more)
+    bus.use(framing)
+    bus.open()
+    try:
+        yield bus
+    finally:
+        bus.close()
+
+
+def is_readable(bus: SerialBus, timeout_s: float = 0.0) -> bool:
+    return bool(select.select([bus.fileno()], [], [], timeout_s)[0])
+
+
+def receive(bus: SerialBus, count: int, capacity: int = 4096) -> list[tuple[int, bytes, int]]:
+    """(identifier, payload, time_ns) of the next frames."""
+    batch = FrameBatch(capacity, 64)
+    found: list[tuple[int, bytes, int]] = []
+
+    def take() -> bool:
+        if is_readable(bus, 0.05):
+            batch.clear()
+            bus.receive(batch, 3)
+            assert (batch.bus[batch.start : batch.stop] == 3).all()
+            for row, time_ns in zip(batch.wire[: batch.stop], batch.time_ns[: batch.stop].tolist(), strict=True):
+                found.append((int(row["identifier"]), row["payload"][: row["length"]].tobytes(), time_ns))
+        return len(found) >= count
+
+    wait_until(take)
+    return found
+
+
+def data_frame(value: int) -> bytes:
+    """A frame of taxels that all have one value."""
+    return FRAMING.encode(DATA, np.full(N_TAXELS, value, "<u2").tobytes())
+
+
+class FingertipDriver(SerialAdapter[NoOptions]):
+    """A fingertip that tells its number when it is asked, and then sends frames."""
+
+    framing = FRAMING
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint16
+    layout = Layout([Frame("taxels", [Identifier(DATA)], [2 * N_TAXELS], Values(0, "<u2", N_TAXELS))])
+
+    @property
+    def period_s(self) -> float:
+        return 0.01
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        reply = await link.request(ASK, b"who", Match(ANSWER, prefix=b"I am "), timeout_s=0.2)
+        return [Patch(reply.payload[5:].decode(), [Module(taxels(N_TAXELS))])]
+
+
+class Device(threading.Thread):
+    """Answers, and sends frames with a value that counts up, until it is stopped."""
+
+    def __init__(self, where: Line, name: str = "tip1", flood: bytes = b"") -> None:
+        super().__init__(daemon=True)
+        self._line = where
+        self._name = b"I am " + name.encode()
+        self._flood = flood
+        self._ending = threading.Event()
+        self.value = 0
+
+    def run(self) -> None:
+        heard = b""
+        while not self._ending.wait(0 if self._flood else 0.005):
+            try:
+                if select.select([self._line.master], [], [], 0)[0]:
+                    heard += os.read(self._line.master, 4096)
+                if FRAMING.encode(ASK, b"who") in heard:
+                    heard = b""
+                    os.write(self._line.master, FRAMING.encode(ANSWER, self._name))
+                self.value += 1
+                os.write(self._line.master, self._flood or data_frame(self.value & 0xFFFF))
+            except BlockingIOError:
+                self._ending.wait(0.001)
+
+    def stop(self) -> None:
+        self._ending.set()
+        self.join(10)
+        assert not self.is_alive()
+
+
+@contextmanager
+def device(where: Line, name: str = "tip1", flood: bytes = b"") -> Iterator[Device]:
+    running = Device(where, name, flood)
+    running.start()
+    try:
+        yield running
+    finally:
+        running.stop()
+
+
+@contextmanager
+def driving(*ports: str) -> Iterator[Runner]:
+    """A driver of some ports, in a thread."""
+    buses = [SerialBus(port, payload_size=64) for port in ports]
+    made: list[Runner] = []
+    failures: list[BaseException] = []
+    loops: list[asyncio.AbstractEventLoop] = []
+    started = threading.Event()
+
+    async def run() -> None:
+        loops.append(asyncio.get_running_loop())
+        lines = [(f"line{i}", FingertipDriver(NoOptions()), bus) for i, bus in enumerate(buses)]
+        made.append(Runner("fingertip", lines, name="fingertip", slots=64))
+        started.set()
+        await made[0].run()
+
+    def work() -> None:
+        try:
+            asyncio.run(run())
+        except BaseException as error:  # noqa: BLE001  (shown to the test)
+            failures.append(error)
+            started.set()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        assert started.wait(30)
+        yield made[0]
+    finally:
+        if thread.is_alive() and made:
+            loops[0].call_soon_threadsafe(made[0].stop)
+        thread.join(30)
+        assert not thread.is_alive(), "the driver did not stop"
+        if failures:
+            raise failures[0]
+
+
+class Usb:
+    """USB serial ports as the system lists them; ``plug`` and ``unplug`` change it."""
+
+    def __init__(self) -> None:
+        self.ports: list[Any] = []
+
+    def plug(self, path: str | Path, serial_number: str = "", vid: int = 0x0483, pid: int = 0x5700) -> None:
+        from serial.tools.list_ports_common import ListPortInfo
+
+        port = ListPortInfo(str(path), skip_link_detection=True)
+        port.serial_number, port.vid, port.pid, port.description = serial_number, vid, pid, "skin"
+        self.ports.append(port)

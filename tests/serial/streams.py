@@ -1,0 +1,117 @@
+"""Streams for tests: frames, damage, and everything between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple
+from itertools import pairwise
+from typing import NamedTuple
+
+from hypothesis import strategies as st
+
+from skinware_drivers.serial import framing as framing_module
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Framer, Framing
+from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.stuffing import LINES
+from tests.serial.framings import Example
+
+
+class Found(NamedTuple):
+    """A frame that was found."""
+
+    identifier: int
+    body: bytes
+    end: int
+
+
+def feed(framer: Framer, chunks: Iterable[bytes]) -> list[Found]:
+    """What a framer finds in a stream; holds its books against what came in after every chunk."""
+    found: list[Found] = []
+    fed = 0
+    for chunk in chunks:
+        frames = framer.feed(chunk)
+        fed += len(chunk)
+        found += map(Found, frames.identifier.tolist(), frames.bodies(), frames.end.tolist())
+        counters = framer.counters
+        accounted = counters.frame_bytes + counters.idle_bytes + counters.skipped_bytes
+        assert counters.bytes_in == fed == accounted + framer.pending, counters
+        assert counters.frames == len(found)
+        assert framer.pending <= held_at_most(framer)
+    return found
+
+
+def held_at_most(framer: Framer) -> int:
+    """The bound on what a framer may hold back."""
+    framing = getattr(framer, "_framing")  # noqa: B009
+    if isinstance(framing, Packet):
+        return 2 * framing.longest + len(framing.sync)
+    assert isinstance(framing, Delimited)
+    return framing.stuffing.longest(framing.maximum_body + framing.overhead)
+
+
+def cut(stream: bytes, places: Sequence[int]) -> list[bytes]:
+    """A stream in pieces."""
+    edges = [0, *sorted({place for place in places if 0 < place < len(stream)}), len(stream)]
+    return [stream[a:b] for a, b in pairwise(edges)]
+
+
+def outcome(
+    framing: Framing, chunks: Iterable[bytes], many_bytes: int | None = None
+) -> tuple[list[Found], tuple[int, ...], int]:
+    """Everything that can be seen of a framer after a stream.
+
+    Args:
+        framing: what to look for.
+        chunks: the stream.
+        many_bytes: from how many bytes on it works with numpy; default: as always.
+    """
+    before = framing_module.MANY_BYTES
+    framing_module.MANY_BYTES = before if many_bytes is None else many_bytes
+    try:
+        framer = framing.framer()
+        found = feed(framer, chunks)
+    finally:
+        framing_module.MANY_BYTES = before
+    return found, astuple(framer.counters), framer.pending
+
+
+def bodies(example: Example) -> st.SearchStrategy[bytes]:
+    """Bodies that frames can have, with many of the bytes that mean something on the wire."""
+    is_text = isinstance(example.framing, Delimited) and example.framing.stuffing is LINES
+    special = [0x20, 0x2C] if is_text else [0, 0x0D, 0x55, 0x7D, 0x7E, 0xAA, 0xC0, 0xDB, 0xFF]
+    byte = st.one_of(st.sampled_from(special), st.integers(0x20 if is_text else 0, 0xFF))
+    sizes = example.body_sizes()
+    short = [size for size in sizes if size <= 40] or [sizes[0]]
+
+    def of_size(size: int) -> st.SearchStrategy[bytes]:
+        if size <= 40:
+            return st.lists(byte, min_size=size, max_size=size).map(bytes)
+        return st.lists(byte, min_size=1, max_size=9).map(lambda part: bytes((part * size)[:size]))
+
+    return st.one_of(st.sampled_from(short), st.sampled_from(sizes)).flatmap(of_size)
+
+
+def frames(example: Example) -> st.SearchStrategy[tuple[int, bytes, bytes]]:
+    """(identifier, body, frame)."""
+    parts = st.tuples(st.sampled_from(example.identifiers), bodies(example))
+    return parts.map(lambda part: (*part, example.framing.encode(*part)))
+
+
+def noise(example: Example) -> st.SearchStrategy[bytes]:
+    """Bytes that are not meant to be a frame: anything, pieces of frames, and beginnings."""
+    framing = example.framing
+    some = st.binary(max_size=60)
+    pieces = st.tuples(frames(example), st.integers(0, 30), st.integers(0, 200)).map(lambda p: p[0][2][p[1] : p[2]])
+    if isinstance(framing, Packet):
+        sync = bytes(byte if isinstance(byte, int) else min(byte) for byte in framing.sync)
+        return st.one_of(some, pieces, st.tuples(st.just(sync), some).map(b"".join))
+    assert isinstance(framing, Delimited)
+    delimiter = bytes([framing.stuffing.delimiter])
+    return st.one_of(some, pieces, st.integers(1, 4).map(lambda n: n * delimiter))
+
+
+def streams(example: Example) -> st.SearchStrategy[bytes]:
+    """Frames and noise in any order."""
+    part = st.one_of(frames(example).map(lambda frame: frame[2]), noise(example))
+    return st.lists(part, max_size=12).map(b"".join)

@@ -1,0 +1,100 @@
+"""Checksums against the check values of the usual catalogues, one by one and many at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.serial.checksums import (
+    CRC8,
+    CRC16_CCITT_FALSE,
+    CRC16_MODBUS,
+    CRC16_WEISS,
+    CRC16_X25,
+    CRC16_XMODEM,
+    CRC32,
+    CRC32C,
+    LRC,
+    SUM8,
+    XOR,
+    Checksum,
+    Crc,
+    Sum,
+    Xor,
+)
+
+CHECK = b"123456789"
+KNOWN: list[tuple[Checksum, int]] = [
+    (CRC8, 0xF4),
+    (CRC16_XMODEM, 0x31C3),
+    (CRC16_CCITT_FALSE, 0x29B1),
+    (CRC16_MODBUS, 0x4B37),
+    (CRC16_X25, 0x906E),
+    (CRC32, 0xCBF43926),
+    (CRC32C, 0xE3069283),
+    (CRC16_WEISS, 0x6EB4),
+    (Crc(width=12, polynomial=0x80F, reflected_out=True), 0xDAF),  # CRC-12/UMTS
+    (Crc(width=24, polynomial=0x864CFB, init=0xB704CE), 0x21CF02),  # CRC-24/OPENPGP
+    (Crc(width=16, polynomial=0x1021, init=0x89EC, reflected_in=True, reflected_out=True), 0x26B1),  # TMS37157
+    (Crc(width=8, polynomial=0x31, reflected_in=True, reflected_out=True), 0xA1),  # CRC-8/MAXIM-DOW
+    (SUM8, sum(CHECK) & 0xFF),
+    (LRC, -sum(CHECK) & 0xFF),
+    (Sum(width=16), sum(CHECK)),
+    (XOR, 0x31),
+    (Xor(init=0xFF), 0xCE),
+]
+
+
+@pytest.mark.parametrize(("checksum", "value"), KNOWN)
+def test_check_values(checksum: Checksum, value: int) -> None:
+    assert checksum.of(CHECK) == value
+    assert checksum.to_bytes(CHECK) == value.to_bytes(checksum.size, "little")
+
+
+@pytest.mark.parametrize(("checksum", "value"), KNOWN)
+@settings(max_examples=8)
+@given(data=st.data())
+def test_many_at_once_are_as_one_by_one(checksum: Checksum, value: int, data: st.DataObject) -> None:
+    pieces = data.draw(st.lists(st.one_of(st.binary(max_size=80), st.just(CHECK), st.just(b"")), min_size=1))
+    pieces += [
+        seed * times for seed, times in data.draw(st.lists(st.tuples(st.binary(max_size=9), st.integers(1, 99))))
+    ]
+    longest = max(map(len, pieces))
+    buffer = np.frombuffer(bytes(longest) + b"".join(pieces) + bytes(4), np.uint8)
+    stop = longest + np.cumsum([len(piece) for piece in pieces])
+    start = stop - [len(piece) for piece in pieces]
+    assert checksum.of_many(buffer, start, stop).tolist() == [checksum.of(piece) for piece in pieces]
+
+
+@pytest.mark.parametrize("crc", [CRC16_WEISS, CRC16_MODBUS, CRC32C, CRC8])
+@pytest.mark.parametrize("size", [64, 65, 127, 128, 129, 1000, 3088])
+def test_long_data_is_as_byte_by_byte(crc: Crc, size: int) -> None:
+    data = np.random.default_rng(size).bytes(size)
+    state = crc._first_state
+    for byte in data:
+        state = crc._step(state, byte)
+    assert crc.of(data) == crc._finish(state)
+
+
+def test_weiss_vectors() -> None:
+    """Commands as the devices' public drivers send them, and the residue."""
+    assert CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 21 03 00 00 0A 00")).hex() == "dab5"
+    assert CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 30 00 00")).hex() == "cacf"
+    assert CRC16_WEISS.to_bytes(bytes.fromhex("03 03 00 81 1E 00")).hex() == "2c76"
+    assert CRC16_WEISS.of(CHECK + CRC16_WEISS.to_bytes(CHECK)) == 0
+
+
+def test_order_and_reading() -> None:
+    big = CRC16_XMODEM.with_order("big")
+    assert big.to_bytes(CHECK) == b"\x31\xc3"
+    buffer = np.frombuffer(b"\x31\xc3\x31\xc3", np.uint8)
+    assert big.read_many(buffer, np.array([0, 2])).tolist() == [0x31C3, 0x31C3]
+    assert CRC16_XMODEM.read_many(buffer, np.array([1])).tolist() == [0x31C3]
+
+
+def test_widths_that_cannot_be_had() -> None:
+    with pytest.raises(ConfigurationError, match="8 to 32"):
+        Crc(width=64, polynomial=0x1B)

@@ -33,6 +33,10 @@ class Match(NamedTuple):
     mask: int = 0x7FF
     prefix: bytes = b""
 
+    def fits(self, frame: Reply) -> bool:
+        """Whether a frame is such an answer."""
+        return frame.identifier & self.mask == self.value and frame.payload.startswith(self.prefix)
+
 
 class Heard(NamedTuple):
     """What a listener tells frames apart by."""
@@ -50,7 +54,7 @@ class Link:
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self._waiters: list[tuple[Match, asyncio.Queue[Reply]]] = []
+        self._waiters: list[tuple[tuple[Match, ...], asyncio.Queue[Reply]]] = []
         self._heard: Counter[Heard] | None = None
 
     @property
@@ -87,11 +91,12 @@ class Link:
             BusSendError: as ``send``.
         """
         queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entry = (reply, queue)
+        entry = ((reply,), queue)
         self._waiters.append(entry)
         try:
             await self.send(identifier, payload)
-            return await asyncio.wait_for(queue.get(), timeout_s)
+            async with asyncio.timeout(timeout_s):  # wait_for of Python 3.11 may swallow a cancellation
+                return await queue.get()
         except TimeoutError:
             raise HandshakeTimeout(
                 f"{self.bus_name}: no answer to {identifier:03X} [{payload.hex(' ').upper()}] within {timeout_s:g} s"
@@ -106,7 +111,7 @@ class Link:
             BusSendError: as ``send``.
         """
         queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entry = (reply, queue)
+        entry = ((reply,), queue)
         self._waiters.append(entry)
         try:
             await self.send(identifier, payload)
@@ -129,13 +134,12 @@ class Link:
     def follow(self, *matches: Match) -> Iterator[asyncio.Queue[Reply]]:
         """Hear every frame that matches, in order of arrival, in a queue."""
         queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entries = [(match, queue) for match in matches]
-        self._waiters += entries
+        entry = (matches, queue)
+        self._waiters.append(entry)
         try:
             yield queue
         finally:
-            for entry in entries:
-                self._waiters.remove(entry)
+            self._waiters.remove(entry)
 
     async def sleep(self, duration_s: float) -> None:
         """Let time pass; the bus keeps being read."""
@@ -152,15 +156,23 @@ class Link:
             self._heard.update(
                 Heard(*row) for row in zip(identifier.tolist(), first.tolist(), length.tolist(), strict=True)
             )
-        for match, queue in self._waiters:
-            for number in np.flatnonzero((identifier & match.mask) == match.value).tolist():
+        for matches, queue in self._waiters:
+            for number in np.flatnonzero(_any_match(matches, identifier)).tolist():
                 row = rows[number]
                 wire = batch.wire[row]
                 payload = wire["payload"][: min(int(wire["length"]), batch.payload_size)].tobytes()
-                if payload.startswith(match.prefix):
+                reply = Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload)
+                if any(match.fits(reply) for match in matches):
                     expected[number] = True
-                    queue.put_nowait(Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload))
+                    queue.put_nowait(reply)
         return rows[~expected]
+
+
+def _any_match(matches: Sequence[Match], identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
+    found = np.zeros(len(identifier), bool)
+    for match in matches:
+        found |= (identifier & match.mask) == match.value
+    return found
 
 
 def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:

@@ -177,8 +177,9 @@ class Runner:
                 if line.lost.is_set():
                     await line.reopen()
                 await self._recover_silent_patches(line)
-                with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(line.lost.wait(), self._silence_ns / NS_PER_S)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(self._silence_ns / NS_PER_S):
+                        await line.lost.wait()
         finally:
             for task in beside:
                 task.cancel()

@@ -126,6 +126,7 @@ class Emulator(Stage, Generic[OptionsT]):
         self.devices: dict[int, Device] = {}
         self._random: dict[int, np.random.Generator] = {}
         self._press: dict[int, Press] = {}
+        self._n_values = 0
         for name in ("dead", "restart"):
             for number in getattr(options, name):
                 if number not in self.numbers:
@@ -172,10 +173,10 @@ class Emulator(Stage, Generic[OptionsT]):
 
     # What a subclass may use
 
-    def start(self, device: Device, now_ns: int) -> None:
+    def start(self, device: Device, now_ns: int, period_s: float | None = None) -> None:
         """Make a device send by itself, if it does not yet; each has a phase of its own."""
         if device.streams_from_ns is None:
-            period_ns = round(self.period_s * 1e9)
+            period_ns = round((period_s or self.period_s) * 1e9)
             device.streams_from_ns = now_ns
             phase = float(np.random.default_rng([self.options.seed, device.number, 4]).uniform(0.02, 1))
             device.every(_DATA, period_ns, now_ns + max(1, round(phase * period_ns)))
@@ -213,11 +214,12 @@ class Emulator(Stage, Generic[OptionsT]):
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
         """Make the devices."""
-        options = self.options
+        options, places = self.options, self.places()
+        self._n_values = len(places)
         for number in self.numbers:
             self.devices[number] = Device(number, self, self.wire.attach(), now_ns)
             self._random[number] = np.random.default_rng([options.seed, number, 1])
-            self._press[number] = Press(options.seed, number, self.places())
+            self._press[number] = Press(options.seed, number, places)
         for device in self.devices.values():
             self.boot(device, now_ns)
         for numbers, after_s, action in (
@@ -249,11 +251,10 @@ class Emulator(Stage, Generic[OptionsT]):
     def _values(self, device: Device, time_ns: int) -> list[int]:
         if self._source is not None:
             return list(self._source(device.number, device.cycle))
-        places = self.places()
         if self.options.pattern == "cycle":
-            return [device.cycle % (self.full_scale + 1)] * len(places)
+            return [device.cycle % (self.full_scale + 1)] * self._n_values
         if self.options.pattern == "idle":
-            return [self.rest] * len(places)
+            return [self.rest] * self._n_values
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
         felt = self.swing * self._press[device.number].strength((time_ns - from_ns) * 1e-9)
         return [min(max(self.rest + round(value), 0), self.full_scale) for value in felt.tolist()]

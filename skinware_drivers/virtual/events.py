@@ -90,6 +90,13 @@ class BoardSilenced(Event, frozen=True):
     board: int
 
 
+class ErrorReported(Event, frozen=True):
+    """A device reported an error (CANopen EMCY), or with code 0 that it has none."""
+
+    board: int
+    code: int
+
+
 class Recalibrated(Event, frozen=True):
     """A board took new baselines for all of its triangles: values jump without notice."""
 
@@ -178,6 +185,7 @@ __all__ = [
     "BoardSilenced",
     "BurstDelayed",
     "CommandReceived",
+    "ErrorReported",
     "Event",
     "ForeignFrame",
     "FrameDamage",

@@ -94,6 +94,14 @@ class Bench:
 
     async def __aenter__(self) -> Self:
         self.bus.open()
+        try:
+            await self._set_up()
+        except BaseException:
+            self.bus.close()
+            raise
+        return self
+
+    async def _set_up(self) -> None:
         self.patches = await self.during(self.adapter.describe(self.link))
         adapter = self.adapter
         tables = assemble([("bus", self.patches)], adapter.types, adapter.dtype)
@@ -102,7 +110,6 @@ class Bench:
         self._attending = asyncio.create_task(adapter.attend(self.link, self._tell))
         await self.during(adapter.configure(self.link))
         await self.during(adapter.start(self.link))
-        return self
 
     async def __aexit__(self, *raised: object) -> None:
         if self._attending is not None:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import pytest
 
 from skinware_drivers.can.barrett import BarrettDriver
+from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.virtual.barrett import EmulatedBarrett
+from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.xela import EmulatedXela
 from tests.drivers.bench import Case
@@ -22,7 +24,13 @@ def ten_strongest(values: Sequence[int]) -> list[int]:
     return [value // 256 if cell in listed else 0 for cell, value in enumerate(values)]
 
 
+def with_temperature(values: Sequence[int]) -> list[int]:
+    """The example patch also sends that it has 25.0 degrees."""
+    return [*values, 250]
+
+
 CASES = [
+    pytest.param(Case(CanopenDriver, EmulatedCanopen, shown=with_temperature), id="canopen"),
     pytest.param(Case(XelaDriver, EmulatedXela), id="xela"),
     pytest.param(
         Case(

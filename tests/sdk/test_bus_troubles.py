@@ -231,4 +231,4 @@ def test_what_a_bus_counts_and_notes_is_told(caplog: pytest.LogCaptureFixture) -
         told = running.status()["buses"]
         assert [[row[name] for name in names] for row in told] == [[0, 0, 0, 0], [3, 5, 2, 1]]
         assert shown[1]["sent"] == 4
-    assert caplog.text.count("emulated roboskin") == 2  # the note of a bus
+    assert caplog.text.count("emulated EmulatedRoboskin") == 2  # the note of a bus

@@ -1,0 +1,239 @@
+"""What the TPDOs of CANopen devices carry, made into a layout that the decoder takes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import CATALOGUE, SensorType
+from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
+
+log = logging.getLogger("skinware.driver")
+
+_NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One mapped object: where it is in the object dictionary, and its length."""
+
+    index: int
+    subindex: int
+    bits: int
+
+    @staticmethod
+    def from_number(number: int) -> Entry:
+        """Of an entry of 0x1A00 ff.: index << 16 | subindex << 8 | bits."""
+        return Entry(number >> 16, number >> 8 & 0xFF, number & 0xFF)
+
+
+@dataclass(frozen=True)
+class Tpdo:
+    """One TPDO.
+
+    Attributes:
+        number: from 1.
+        identifier: of its frames, with ``EXTENDED_FLAG`` if that has 29 bits.
+        transmission: transmission type: 0 to 240 upon SYNC, 254 and 255 by event or event timer.
+        entries: what is mapped, in order.
+    """
+
+    number: int
+    identifier: int
+    transmission: int
+    entries: tuple[Entry, ...]
+
+    @staticmethod
+    def make(number: int, cob_id: int, transmission: int, entries: Iterable[int]) -> Tpdo | None:
+        """Of the numbers in the object dictionary; None if it is not in use."""
+        mapped = tuple(Entry.from_number(entry) for entry in entries)
+        if cob_id & _NOT_IN_USE or not mapped:
+            return None
+        extended = bool(cob_id & _IS_EXTENDED)
+        identifier = cob_id & 0x1FFF_FFFF | EXTENDED_FLAG if extended else cob_id & 0x7FF
+        return Tpdo(number, identifier, transmission, mapped)
+
+    @property
+    def length(self) -> int:
+        """Bytes."""
+        return -(-sum(entry.bits for entry in self.entries) // 8)
+
+
+def default_tpdos(dictionary: ObjectDictionary) -> list[Tpdo]:
+    """The TPDOs of a device that nobody has changed, as its EDS says."""
+
+    def number(index: int, subindex: int) -> int:
+        variable = dictionary.get_variable(index, subindex)
+        value = None if variable is None else variable.value if variable.value is not None else variable.default
+        return value if isinstance(value, int) else 0
+
+    found = []
+    for tpdo in tpdo_numbers(dictionary):
+        mapping = 0x1A00 + tpdo - 1
+        entries = [number(mapping, sub) for sub in range(1, number(mapping, 0) + 1)]
+        found.append(Tpdo.make(tpdo, number(mapping - 0x200, 1), number(mapping - 0x200, 2), entries))
+    return [tpdo for tpdo in found if tpdo is not None]
+
+
+def tpdo_numbers(dictionary: ObjectDictionary) -> list[int]:
+    """Which TPDOs a device can have, from 1."""
+    return [i + 1 for i in range(512) if 0x1800 + i in dictionary and 0x1A00 + i in dictionary]
+
+
+class PdoMap:
+    """The frames, types and patches of all nodes of a bus.
+
+    Args:
+        dictionary: what the mapped objects are; of any node.
+        nodes: TPDOs by node id.
+        default_type: what an object is whose name says no type.
+
+    Attributes:
+        layout, types, dtype, patches: as an adapter has them.
+
+    Raises:
+        ConfigurationError: nothing that is mapped is a number, or sensors of one type differ in scale.
+    """
+
+    def __init__(self, dictionary: ObjectDictionary, nodes: Mapping[int, Sequence[Tpdo]], default_type: str) -> None:
+        self._dictionary = dictionary
+        self._default_type = default_type
+        self._sensors = {entry: self._variable(entry) for entry in _all_entries(nodes)}
+        known = [variable for variable in self._sensors.values() if variable is not None]
+        if not known:
+            raise ConfigurationError("none of the objects that are mapped into TPDOs is a number that the EDS knows")
+        self.dtype = _common_dtype(known)
+        self.types = self._types(known)
+        self.layout = Layout(tuple(self._frames(nodes)))
+        self.patches = tuple(
+            Patch(f"node {node}", [self._module(node, tpdo) for tpdo in tpdos], key=node)
+            for node, tpdos in nodes.items()
+        )
+
+    def _variable(self, entry: Entry) -> ODVariable | None:
+        """The sensor behind a mapped object; None for what is no sensor."""
+        variable = self._dictionary.get_variable(entry.index, entry.subindex)
+        if variable is not None and entry.bits <= 32 and variable.data_type in datatypes.NUMBER_TYPES:
+            return variable
+        if entry.index >= 0x20:  # below: gaps
+            log.warning("object %04X:%d is mapped, but no number of at most 32 bits", entry.index, entry.subindex)
+        return None
+
+    def _type_name(self, variable: ODVariable) -> str:
+        name = variable.qualname.lower().replace(" ", "_")
+        return next((known for known in CATALOGUE if known in name), self._default_type)
+
+    def _types(self, variables: Sequence[ODVariable]) -> list[SensorType]:
+        types = []
+        by_name = sorted(variables, key=self._type_name)
+        for name, group in groupby(by_name, key=self._type_name):
+            same = list(group)
+            if len({(variable.factor, variable.unit) for variable in same}) > 1:
+                raise ConfigurationError(f"the EDS gives sensors of type {name} different factors or units")
+            limits = [_limits(variable) for variable in same]
+            ends = [same[0].factor * limit for low, high in limits for limit in (low, high)]
+            unit = same[0].unit or "counts"
+            types.append(
+                CATALOGUE[name].measured(unit=unit, scale=same[0].factor, minimum=min(ends), maximum=max(ends))
+            )
+        return types
+
+    def _module(self, node: int, tpdo: Tpdo) -> Module:
+        channels = []
+        for entry in tpdo.entries:
+            variable = self._sensors[entry]
+            uid = node << 24 | entry.index << 8 | entry.subindex
+            channels.append(None if variable is None else Sensor(self._type_name(variable), uid))
+        return Module(channels, key=tpdo.number, kind="tpdo")
+
+    def _frames(self, nodes: Mapping[int, Sequence[Tpdo]]) -> Iterable[Frame]:
+        """One kind of frame for all nodes whose TPDO is alike and follows the predefined identifiers, else each own."""
+        alike: dict[tuple[Any, ...], list[int]] = {}
+        bases: dict[int, set[tuple[Any, ...]]] = {}
+        for node, tpdos in nodes.items():
+            for tpdo in tpdos:
+                base = tpdo.identifier - node
+                key = (base, tpdo.number, tpdo.entries)
+                alike.setdefault(key, []).append(node)
+                bases.setdefault(base, set()).add(key)
+        for (base, number, entries), of_nodes in alike.items():
+            tpdo = Tpdo(number, base, 0, entries)
+            if base & 0x7F == 0 and base < EXTENDED_FLAG and len(bases[base]) == 1:
+                yield self._frame(tpdo, f"TPDO {number}", Identifier(base, 0x780), Bits(0, 7))
+                continue
+            for node in of_nodes:
+                identifier = base + node
+                extended = identifier >= EXTENDED_FLAG
+                exact = Identifier(identifier & 0x1FFF_FFFF, extended=extended)
+                yield self._frame(tpdo, f"TPDO {number} of node {node}", exact, node)
+
+    def _frame(self, tpdo: Tpdo, name: str, identifier: Identifier, patch: Bits | int) -> Frame:
+        return Frame(name, (identifier,), (tpdo.length,), tuple(self._runs(tpdo)), patch=patch, module=tpdo.number)
+
+    def _runs(self, tpdo: Tpdo) -> Iterable[Values]:
+        """Entries of one format that follow each other; little-endian, as CiA 301 packs them."""
+        bit, channel = 0, 0
+        for (bits, kind), group in groupby(tpdo.entries, key=lambda entry: (entry.bits, self._kind(entry))):
+            count = len(list(group))
+            if kind:
+                to = tuple(range(channel, channel + count))
+                if kind == "f" and (bit % 8 or bits != 32):
+                    raise ConfigurationError(f"TPDO {tpdo.number}: a REAL32 must begin with a byte")
+                if bit % 8 == 0 and bits in (8, 16, 32):
+                    yield Values(bit // 8, f"<{kind}{bits // 8}", count, to)
+                else:
+                    yield Values(bit // 8, Packed(bits, "little", kind == "i", skip=bit % 8), count, to)
+            bit, channel = bit + bits * count, channel + count
+
+    def _kind(self, entry: Entry) -> str:
+        """Kind of numpy dtype; empty for what is no sensor."""
+        variable = self._sensors[entry]
+        if variable is None:
+            return ""
+        if variable.data_type in datatypes.FLOAT_TYPES:
+            return "f"
+        return "i" if variable.data_type in datatypes.SIGNED_TYPES else "u"
+
+
+def _all_entries(nodes: Mapping[int, Sequence[Tpdo]]) -> list[Entry]:
+    return list(dict.fromkeys(entry for tpdos in nodes.values() for tpdo in tpdos for entry in tpdo.entries))
+
+
+def _capacity(variable: ODVariable) -> tuple[float, float]:
+    """Least and greatest raw value of a data type."""
+    if variable.data_type in datatypes.FLOAT_TYPES:
+        return -np.inf, np.inf
+    bits = len(variable)
+    if variable.data_type in datatypes.SIGNED_TYPES:
+        return -(1 << bits - 1), (1 << bits - 1) - 1
+    return 0, (1 << bits) - 1
+
+
+def _limits(variable: ODVariable) -> tuple[float, float]:
+    """Least and greatest raw value: the EDS' limits, else what the data type can hold."""
+    low, high = _capacity(variable)
+    return low if variable.min is None else variable.min, high if variable.max is None else variable.max
+
+
+def _common_dtype(variables: Sequence[ODVariable]) -> np.dtype[Any]:
+    """The smallest dtype of a service that holds whatever they may send, limits or not.
+
+    Only UNSIGNED32 is taken by its limits, as a service has no such dtype; without any it becomes float32, which is
+    exact to 24 bits.
+    """
+    ranges = [_limits(v) if v.data_type == datatypes.UNSIGNED32 else _capacity(v) for v in variables]
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    for dtype in (np.uint8, np.int16, np.uint16, np.int32):
+        info = np.iinfo(dtype)
+        if info.min <= low and high <= info.max:
+            return np.dtype(dtype)
+    return np.dtype(np.float32)

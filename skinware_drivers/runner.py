@@ -33,7 +33,8 @@ from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Pub
 log = logging.getLogger("skinware.driver")
 
 _BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
-_TURNS = 8  # batches per wake-up before handshakes and timers get their turn
+_TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
+_REST, _LONGEST_REST_S = 4, 0.005  # after a take: so many times its duration, while more arrives (decision 0006)
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
 
@@ -90,6 +91,7 @@ class Runner:
         self._failure: BaseException | None = None
         self._built = asyncio.Condition()
         self._timer: asyncio.TimerHandle | None = None
+        self._rest: asyncio.TimerHandle | None = None
         self._known_patch_state = np.zeros(0, np.uint8)
         self._join_requested = asyncio.Event()
         self._begun_ns = 0  # the present generation
@@ -155,8 +157,9 @@ class Runner:
         for line in self.lines:
             await line.stop()
         loop.remove_reader(self._epoll.fileno())
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._rest):
+            if timer is not None:
+                timer.cancel()
         for line in self.lines:
             line.bus.close()
         self._epoll.close()
@@ -303,10 +306,22 @@ class Runner:
     # -- data -----------------------------------------------------------------------------------------------------
 
     def _on_readable(self) -> None:
-        for _ in range(_TURNS):
+        """Take what has arrived, then let more arrive before the next look: a batch costs little more than a frame."""
+        loop = asyncio.get_running_loop()
+        begun_ns = now_ns()
+        if self._take_frames():
+            loop.remove_reader(self._epoll.fileno())
+            rest_s = min(_REST * (now_ns() - begun_ns) / NS_PER_S, _LONGEST_REST_S)
+            self._rest = loop.call_later(rest_s, self._on_readable)
+        else:
+            loop.add_reader(self._epoll.fileno(), self._on_readable)
+
+    def _take_frames(self) -> bool:
+        """Take all that has arrived; whether there was anything."""
+        for turn in range(_TURNS):
             events = self._epoll.poll(0)
             if not events:
-                break
+                return turn > 0
             if self.decoder is not None:
                 self.decoder.put_back(self._batch)
             else:
@@ -321,7 +336,11 @@ class Runner:
                         line.heard_ns = time_ns
                 except BusNotAvailable as error:
                     line.lose(error)
+            is_behind = not self._batch.free
             self._digest()
+            if not is_behind:
+                break
+        return True
 
     def _digest(self) -> None:
         batch = self._batch
@@ -341,7 +360,7 @@ class Runner:
     def _publish_when_due(self) -> None:
         if self.publisher is None:
             return
-        self._on_readable()  # what has arrived comes first: this may be late
+        self._take_frames()  # what has arrived comes first: this may be late
         self._update_bus_states()
         self.publisher.publish_if_due()
         self._log_patches()

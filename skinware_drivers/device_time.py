@@ -1,0 +1,183 @@
+"""Stamps of a device's own clock, told in ours: when a sample was taken, and not when its frame got through.
+
+A frame is received some time after it was stamped, never before, and the shortest delay varies little, while USB and
+busy computers add milliseconds to others and half a second to a few. So the line that lies under all points (stamp,
+time of receipt) and as close to them as it can be tells the rate of the device's clock, and its offset up to the
+shortest delay (S. B. Moon, P. Skelly, D. Towsley, "Estimation and Removal of Clock Skew from Network Delay
+Measurements", 1999). What comes late does not move it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import NS_PER_S
+
+Times = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.floating[Any]]
+
+_PART_NS = NS_PER_S
+"""One point is kept for each such part of the window: the one that came with the least delay."""
+_RECENT_PARTS = 10
+"""The offset is that of the least delay among so many."""
+_LEAST_SPAN_NS = 2 * NS_PER_S
+"""Before that, the device's clock is taken to go as ours."""
+_JUMP_NS = NS_PER_S / 20
+"""A stamp that lies so far in the future shows that the device's clock was set."""
+
+
+class DeviceClock:
+    """Brings the stamps of one device onto CLOCK_MONOTONIC.
+
+    The times never lie after the receipt, and never go back. After ``restarts`` (a stamp that goes back, or that lies
+    in the future) nothing that was known of the clock counts any more.
+
+    A gap in the stream, or a frame that is late, may be as long as half the time in which the stamps wrap around; the
+    time of receipt tells how often they did meanwhile.
+
+    Args:
+        unit_s: seconds per count.
+        modulo: the stamps wrap to 0 here.
+        window_s: how much of the past counts. Shorter follows changes of temperature faster, longer is steadier.
+        maximum_drift: most that the device's clock can be fast or slow, as a fraction.
+
+    Attributes:
+        restarts: how often the device's clock began anew.
+        repeated: stamps that were equal to the one before.
+    """
+
+    def __init__(
+        self, unit_s: float, modulo: int = 1 << 32, *, window_s: float = 60.0, maximum_drift: float = 500e-6
+    ) -> None:
+        self._unit_ns = unit_s * NS_PER_S
+        self._modulo = modulo
+        self._maximum_drift = maximum_drift
+        self._points: deque[tuple[int, float, float]] = deque(maxlen=max(3, round(window_s * NS_PER_S / _PART_NS)))
+        self._origin_ns = 0
+        self._ticks = 0
+        self._stamp = -1
+        self._received_ns = 0
+        self._told_ns = -(1 << 63)
+        self._slope = 0.0
+        self._offset_ns = 0.0
+        self.restarts = 0
+        self.repeated = 0
+
+    @property
+    def drift(self) -> float:
+        """How much slower than ours the device's clock is found to go, as a fraction; 0 until it is known."""
+        return self._slope
+
+    def convert(self, stamps: npt.ArrayLike, received_ns: npt.ArrayLike) -> Times:
+        """When frames were stamped.
+
+        Args:
+            stamps: (n,) whole numbers as the device sent them, in the order in which they were received.
+            received_ns: (n,) int64, CLOCK_MONOTONIC ns, not descending.
+
+        Returns:
+            (n,) int64, CLOCK_MONOTONIC ns.
+        """
+        raw, received = np.asarray(stamps).astype(np.int64), np.asarray(received_ns, np.int64)
+        told = received.copy()
+        if not len(raw):
+            return told
+        is_first = self._stamp < 0
+        if is_first:
+            self._begin(int(raw[0]), int(received[0]))
+        step = self._steps(raw, received)
+        self.repeated += int((step == 0).sum()) - is_first
+        edges = [0, *np.flatnonzero(step < 0).tolist(), len(raw)]
+        for number, (start, stop) in enumerate(pairwise(edges)):
+            if number:
+                self._restart(raw, received, step, start)
+            while start < stop:
+                start = self._convert_part(raw, received, step, told, start, stop)
+        self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
+        np.maximum.accumulate(np.maximum(told, self._told_ns), out=told)
+        np.minimum(told, received, out=told)
+        self._told_ns = int(told[-1])
+        return told
+
+    def _steps(self, raw: Times, received: Times) -> Times:
+        """(n,) counts since the stamp before, with as many turns as fit the time that has passed."""
+        difference = np.diff(raw, prepend=self._stamp)
+        passed = np.diff(received, prepend=self._received_ns) / self._unit_ns
+        turns = np.rint((passed - difference) / self._modulo).astype(np.int64)
+        return difference + turns * self._modulo
+
+    def _begin(self, stamp: int, received_ns: int) -> None:
+        self._points.clear()
+        self._origin_ns, self._received_ns, self._stamp = received_ns, received_ns, stamp
+        self._ticks = 0
+        self._slope = self._offset_ns = 0.0
+
+    def _restart(self, raw: Times, received: Times, step: Times, at: int) -> None:
+        self.restarts += 1
+        self._begin(int(raw[at]), int(received[at]))
+        step[at] = 0
+
+    def _convert_part(self, raw: Times, received: Times, step: Times, told: Times, start: int, stop: int) -> int:
+        """Convert up to a jump into the future; gives where to go on."""
+        ticks = self._ticks + np.cumsum(step[start:stop])
+        device_ns: Floats = ticks * self._unit_ns
+        delay_ns: Floats = (received[start:stop] - self._origin_ns) - device_ns
+        future = np.flatnonzero(delay_ns - self._line(device_ns) < -_JUMP_NS)
+        if len(future):
+            stop = start + int(future[0])
+            device_ns, delay_ns = device_ns[: int(future[0])], delay_ns[: int(future[0])]
+        if stop > start:
+            self._learn(received[start:stop], device_ns, delay_ns)
+            told[start:stop] = self._origin_ns + np.rint(device_ns + self._line(device_ns)).astype(np.int64)
+            self._ticks = int(ticks[stop - start - 1])
+        if len(future):
+            self._restart(raw, received, step, stop)
+        return stop
+
+    def _line(self, device_ns: Floats) -> Floats:
+        return self._offset_ns + self._slope * device_ns
+
+    def _learn(self, received: Times, device_ns: Floats, delay_ns: Floats) -> None:
+        """Keep the points of least delay, and put the line under them."""
+        above = delay_ns - self._slope * device_ns
+        parts = received // _PART_NS
+        edges = np.flatnonzero(np.diff(parts, prepend=-1))
+        for start, stop in zip(edges.tolist(), [*edges[1:].tolist(), len(parts)], strict=True):
+            best = start + int(np.argmin(above[start:stop]))
+            point = int(parts[start]), float(device_ns[best]), float(delay_ns[best])
+            if not self._points or self._points[-1][0] != point[0]:
+                self._points.append(point)
+                self._fit_slope()
+            elif above[best] < self._points[-1][2] - self._slope * self._points[-1][1]:
+                self._points[-1] = point
+        recent = self._points[-1][0] - _RECENT_PARTS
+        self._offset_ns = min(y - self._slope * x for part, x, y in self._points if part > recent)
+
+    def _fit_slope(self) -> None:
+        """The slope of the edge under the middle of the points, of their lower convex hull."""
+        whole = list(self._points)[:-1]  # of the newest part, the best may be yet to come
+        if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_NS:
+            return
+        hull: list[tuple[float, float]] = []
+        for _, x, y in whole:
+            while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
+                hull.pop()
+            hull.append((x, y))
+        middle = sum(x for _, x, _ in whole) / len(whole)
+        right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
+        (x0, y0), (x1, y1) = hull[right - 1], hull[right]
+        slope = (y1 - y0) / (x1 - x0)
+        self._slope = min(max(slope, -self._maximum_drift), self._maximum_drift)
+
+
+def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
+    """Whether the second point lies on or above the line from the first to the third."""
+    return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])
+
+
+__all__ = ["DeviceClock"]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_DRIVER = "roboskin"
 _EMULATED = "skin-emulate.options"
+_LONGEST_COMMAND = {"can": 8, "serial": 4096}
 _EXIT_FAILED, _EXIT_CONFIGURATION, _EXIT_NO_BUS = 1, 2, 3
 
 
@@ -84,12 +85,16 @@ def _emulate(
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus
     from skinware_drivers.virtual.events import JsonLinesLog
-    from skinware_drivers.virtual.hardware import load_emulator
+    from skinware_drivers.virtual.hardware import load_emulator, medium_of
 
     emulator = load_emulator(driver)
+    medium = medium_of(emulator)
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
-    bus = make_bus(bus_name, payload_size=8)
+    bus = make_bus(bus_name, payload_size=_LONGEST_COMMAND[medium])
+    if bus.medium not in (None, medium):
+        such = "vcan0" if medium == "can" else f"pty:/tmp/{driver}"
+        raise ConfigurationError(f"{bus_name} is a {bus.medium} bus, {driver} lives on {medium}: --bus {such}")
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)

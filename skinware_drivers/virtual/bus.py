@@ -14,7 +14,7 @@ from skinware.errors import BusError, BusNotAvailable, BusSendError
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, load_emulator
-from skinware_drivers.virtual.timer import MonotonicTimer
+from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 DEFAULT_EMULATOR = "roboskin"
 
@@ -40,7 +40,8 @@ class VirtualCanBus(Bus):
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
-        clock: tells CLOCK_MONOTONIC ns. Another clock moves the hardware; ``fileno`` knows only the real one.
+        clock: tells CLOCK_MONOTONIC ns.
+        make_timer: makes what ``fileno`` stands for; another clock needs another timer.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
@@ -55,6 +56,7 @@ class VirtualCanBus(Bus):
         listen_only: bool = False,
         hardware: EmulatedHardware | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
+        make_timer: Callable[[], Timer] = MonotonicTimer,
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self._emulated = type(hardware).__name__
@@ -64,7 +66,8 @@ class VirtualCanBus(Bus):
             hardware = emulator(options_from_strings(emulator.Options, self.options))
         self.hardware = hardware
         self._clock = clock
-        self._timer: MonotonicTimer | None = None
+        self._make_timer = make_timer
+        self._timer: Timer | None = None
         self._pending: list[WireFrame] = []
         self._due_ns: int | None = None
         self._present = True
@@ -78,9 +81,17 @@ class VirtualCanBus(Bus):
         payload_size: int = 8,
         listen_only: bool = False,
         clock: Callable[[], int] = time.monotonic_ns,
+        make_timer: Callable[[], Timer] = MonotonicTimer,
     ) -> Self:
         """A bus with devices of the caller's, for tests."""
-        return cls("", payload_size=payload_size, listen_only=listen_only, hardware=hardware, clock=clock)
+        return cls(
+            "",
+            payload_size=payload_size,
+            listen_only=listen_only,
+            hardware=hardware,
+            clock=clock,
+            make_timer=make_timer,
+        )
 
     # Bus
 
@@ -94,7 +105,7 @@ class VirtualCanBus(Bus):
         if not self._present:
             raise BusNotAvailable(f"{self!r}: the emulated interface is away")
         if self._timer is None:
-            self._timer = MonotonicTimer()
+            self._timer = self._make_timer()
             self.hardware.skip(self._clock())
             self._wake_when_due()
 

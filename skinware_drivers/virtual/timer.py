@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from typing import Protocol
 
 from skinware.errors import PlatformError
 
@@ -21,6 +22,16 @@ class _Timespec(ctypes.Structure):
 
 class _Itimerspec(ctypes.Structure):
     _fields_ = (("it_interval", _Timespec), ("it_value", _Timespec))
+
+
+class Timer(Protocol):
+    """A descriptor that becomes readable at a moment."""
+
+    def fileno(self) -> int: ...  # noqa: D102
+
+    def wake_at(self, time_ns: int | None) -> None: ...  # noqa: D102
+
+    def close(self) -> None: ...  # noqa: D102
 
 
 class MonotonicTimer:
@@ -68,4 +79,4 @@ class MonotonicTimer:
             self._fd = -1
 
 
-__all__ = ["MonotonicTimer"]
+__all__ = ["MonotonicTimer", "Timer"]

@@ -1,0 +1,271 @@
+"""What a driver showed, against what its devices felt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, sensor_name
+
+Values = npt.NDArray[np.int64]
+_LATE_NS = 6_000_000
+"""By so much the truth's times can be late: buses hand out together what came within 4 ms."""
+_LAGS = 3
+_ENOUGH = 0.9
+_MOST_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Update:
+    """A module that a frame shows anew.
+
+    Attributes:
+        frame: number of the frame in the record.
+        module: the module.
+        burst: number of the burst of its device that it shows; None: of none.
+    """
+
+    frame: int
+    module: int
+    burst: int | None
+
+
+class Comparison:
+    """Every update that a driver showed, and the burst that it is.
+
+    Args:
+        rig: a driver that ran.
+
+    Attributes:
+        updates: in order.
+    """
+
+    def __init__(self, rig: Running) -> None:
+        self.rig = rig
+        require(rig.record.frames, "nothing was published")
+        self.structure = rig.record.frames[-1].structure
+        n = rig.truth.n_values
+        require(
+            self.structure.n_sensors == rig.n_values,
+            f"the driver declares {self.structure.n_sensors} sensors, the devices have {rig.n_values}"
+            f" ({len(rig.numbers)} with {n} each): is a module missing, or a channel that is no sensor?",
+        )
+        self._sensors = [np.flatnonzero(self.structure.sensor_module == m) for m in range(self.structure.n_modules)]
+        self._device = [int(sensors[0]) // n for sensors in self._sensors]
+        for module, sensors in enumerate(self._sensors):
+            if int(sensors[-1]) // n != self._device[module]:
+                defect(f"module {module} shows sensors of two devices: one device is one patch, in the same order")
+        self._felt = [
+            np.array([burst.values for burst in rig.truth.bursts.get(number, [])]).reshape(-1, n)
+            for number in rig.numbers
+        ]
+        self._felt_ns = [
+            np.array([burst.time_ns for burst in rig.truth.bursts.get(number, [])]) for number in rig.numbers
+        ]
+        self.updates = [update for module in range(self.structure.n_modules) for update in self._of_module(module)]
+        self.updates.sort(key=lambda update: update.frame)
+
+    @property
+    def wrong(self) -> list[Update]:
+        """Updates with values that no burst had, or had too long ago."""
+        return [update for update in self.updates if update.burst is None]
+
+    def bursts_shown(self, module: int) -> list[int]:
+        """Of its device, in the order in which they were shown."""
+        return [u.burst for u in self.updates if u.module == module and u.burst is not None]
+
+    def require_right(self, because: str = "") -> None:
+        """Every update is a burst of its device, newer than the one before; a defect says what else it may be."""
+        wrong = self.wrong
+        if not wrong:
+            return
+        if because:
+            update = wrong[0]
+            sensors = self._sensors[update.module]
+            shown = self.rig.record.frames[update.frame].values[sensors][:8].tolist()
+            defect(
+                f"{because}: {len(wrong)} updates show values that were never sent together, the first for module"
+                f" {update.module}: {shown}; it is shown as fresh"
+            )
+        bad = sorted({int(s) for u in wrong for s in self._wrong_sensors(u)})
+        reasons = [f"{sensor_name(self.structure, sensor)}: {self._explain(sensor)}" for sensor in bad[:_MOST_NAMED]]
+        more = f"\n... and {len(bad) - _MOST_NAMED} more" if len(bad) > _MOST_NAMED else ""
+        defect(
+            f"{len(bad)} of {self.structure.n_sensors} sensors show values that they did not feel:\n"
+            + "\n".join(reasons)
+            + more
+        )
+
+    def require_complete(self, spare: Callable[[int], bool] = lambda _time_ns: False, because: str = "") -> None:
+        """Every burst was shown, from the first one shown on, but for those around a moment that is to be spared.
+
+        Args:
+            spare: tells whether a burst of that time need not be shown.
+            because: what went wrong on the wire, for the message.
+        """
+        end_ns = self.rig.record.times_ns[-1] - 2 * self.rig.period_ns - _LATE_NS
+        for module in range(self.structure.n_modules):
+            shown = self.bursts_shown(module)
+            name = f"module {module} ({sensor_name(self.structure, int(self._sensors[module][0]))})"
+            require(shown, f"{name} was never shown{because}: does a frame of the layout belong to it?")
+            times_ns = self._felt_ns[self._device[module]]
+            missing = [
+                burst
+                for burst in range(shown[0], len(times_ns))
+                if burst not in set(shown) and times_ns[burst] < end_ns and not spare(int(times_ns[burst]))
+            ]
+            if missing:
+                defect(
+                    f"{name}: {len(missing)} of {len(times_ns) - shown[0]} bursts that came through whole were not"
+                    f" shown{because}, the first {times_ns[missing[0]] / 1e9 - 5000:.3f} s after power-up; counters:"
+                    f" { {k: v for k, v in self.rig.counters().items() if v} }"
+                )
+
+    def spoilt(self) -> Callable[[int], bool]:
+        """Whether something happened on the wire to a burst of that time, or may have."""
+        damaged_ns = np.array(sorted(damage.time_ns for damage in self.rig.wire.damages))
+        reach_ns = self.rig.period_ns + _LATE_NS
+
+        def is_spoilt(time_ns: int) -> bool:
+            first = np.searchsorted(damaged_ns, time_ns - _LATE_NS - 1)
+            return bool(first < len(damaged_ns) and damaged_ns[first] <= time_ns + reach_ns)
+
+        return is_spoilt
+
+    # -- finding ------------------------------------------------------------------------------------------------
+
+    def _of_module(self, module: int) -> list[Update]:
+        frames, times_ns = self.rig.record.frames, self.rig.record.times_ns
+        sensors, device = self._sensors[module], self._device[module]
+        felt, felt_ns = self._felt[device], self._felt_ns[device]
+        columns = sensors - device * self.rig.truth.n_values
+        found: list[Update] = []
+        before_ns, last = 0, -1
+        for number, frame in enumerate(frames):
+            stamp_ns = int(frame.module_time_ns[module])
+            status = frame.status[sensors]
+            good = (status & ~np.uint8(SHOWN_ANYWAY)) == 0
+            if stamp_ns == before_ns or not good.any():
+                continue
+            before_ns = stamp_ns
+            until = int(np.searchsorted(felt_ns, times_ns[number], side="right"))
+            part = felt[last + 1 : until][:, columns[good]]
+            match = (part == _as_numbers(frame.values[sensors[good]])).all(axis=1)
+            burst = last + 1 + int(match.argmax()) if match.any() else None
+            if burst is None and last >= 0 and (felt[last, columns[good]] == frame.values[sensors[good]]).all():
+                continue  # the same burst once more: its frames came twice
+            last = last if burst is None else burst
+            found.append(Update(number, module, burst))
+        return found
+
+    # -- explaining ---------------------------------------------------------------------------------------------
+
+    def _wrong_sensors(self, update: Update) -> Values:
+        """The sensors of an update that differ from the burst of its time (of the last few, the likeliest)."""
+        sensors, device = self._sensors[update.module], self._device[update.module]
+        shown = _as_numbers(self.rig.record.frames[update.frame].values[sensors])
+        until = self._newest_burst(device, update.frame)
+        rows = self._felt[device][max(0, until - _LAGS + 1) : until + 1]
+        if not len(rows):
+            return sensors
+        different = rows[:, sensors - device * self.rig.truth.n_values] != shown
+        wrong: Values = sensors[different[int(different.sum(axis=1).argmin())]]
+        return wrong
+
+    def _newest_burst(self, device: int, frame: int) -> int:
+        return int(np.searchsorted(self._felt_ns[device], self.rig.record.times_ns[frame], side="right")) - 1
+
+    def _explain(self, sensor: int) -> str:
+        """What a sensor shows instead of what it feels."""
+        structure, n = self.structure, self.rig.truth.n_values
+        module = int(structure.sensor_module[sensor])
+        device = self._device[module]
+        updates = [u for u in self.updates if u.module == module]
+        frames = [u.frame for u in updates]
+        shown = _as_numbers(np.array([self.rig.record.frames[f].values[sensor] for f in frames]))
+        own = sensor - device * n
+        bits = int(np.max(self.rig.devices.full_scale)).bit_length()
+        newest = np.array([self._newest_burst(device, f) for f in frames])
+        for lag in range(_LAGS):
+            rows = newest - lag
+            usable = rows >= 0
+            if not usable.any():
+                continue
+            felt, seen = self._felt[device][rows[usable]], shown[usable]
+            for words, look, change in transforms(bits):
+                match = (change(felt) == seen[:, np.newaxis]).mean(axis=0)
+                if match[own] >= _ENOUGH:
+                    if words:
+                        return f"shows {words} — {look}"
+                    return self._explain_age(lag)
+                other = int(match.argmax())
+                if match[other] >= _ENOUGH and len(seen) > 2:
+                    whose = sensor_name(structure, device * n + other)
+                    step = other - own
+                    by = f" (off by {step:+d})" if abs(step) <= 2 else ""
+                    with_words = f"{words} of " if words else ""
+                    look = look or "look at `offset` and `to` of the layout, and at the order of the structure"
+                    return f"shows {with_words}what {whose} feels{by} — {look}"
+        if len(shown) > 2 and (shown == shown[0]).all():
+            return f"always shows {shown[0]} — is it written at all?"
+        example = self._felt[device][newest[-1], own]
+        return f"shows {shown[-1]} where {example} was felt — look at `offset`, `dtype` and `bits` of the layout"
+
+    @staticmethod
+    def _explain_age(lag: int) -> str:
+        if lag:
+            return f"shows what it felt {lag} bursts before the rest of its module — are frames of two bursts mixed?"
+        return "is right by itself, but other sensors of its module are not of the same burst"
+
+
+def _as_numbers(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+
+
+def transforms(bits: int) -> list[tuple[str, str, Callable[[Values], Values]]]:
+    """What drivers do to values by mistake: in words, what to look at, and how."""
+    full, whole = (1 << bits) - 1, 8 * -(-bits // 8)
+    order = "look at the byte order of the dtype (`<` or `>`)"
+    sign = "look at the sign of the dtype (`u` or `i`, `signed`)"
+    offset = "look at `offset` of the layout: it is one byte off"
+
+    def swapped(v: Values) -> Values:
+        return (v & 0xFF) << 8 | v >> 8 & 0xFF
+
+    def beside(v: Values, step: int) -> Values:
+        return np.roll(v, -step, axis=1)
+
+    return [
+        ("", "", lambda v: v),
+        ("the value with its two bytes swapped", order, swapped),
+        ("the value with its two bytes swapped, as signed", order, lambda v: _signed(swapped(v), 16)),
+        ("the value with its four bytes reversed", order, lambda v: v.astype(">u4").view("<u4").astype(np.int64)),
+        ("the unsigned value as if it were signed", sign, lambda v: _signed(v, bits)),
+        ("the unsigned value as if it were signed", sign, lambda v: _signed(v, whole)),
+        ("the signed value as if it were unsigned", sign, lambda v: v & full),
+        ("the signed value as if it were unsigned", sign, lambda v: v & ((1 << whole) - 1)),
+        ("the value upside down", "look at inversions", lambda v: full - v),
+        ("only the low byte", "look at the dtype: it is too narrow", lambda v: v & 0xFF),
+        ("only the high byte", "look at the dtype: it is too narrow", lambda v: v >> 8),
+        ("twice the value", "look at shifts: it is one bit off", lambda v: v << 1 & full),
+        ("half the value", "look at shifts: it is one bit off", lambda v: v >> 1),
+        ("the value 8 bits too high", "look at shifts and at the dtype", lambda v: v << 8 & 0xFFFF),
+        ("the value 4 bits too high", "look at `skip` and `bits`", lambda v: v << 4 & 0xFFFF),
+        ("the value 4 bits too low", "look at `skip` and `bits`", lambda v: v >> 4),
+        ("bytes of two values", offset, lambda v: (v & 0xFF) << 8 | beside(v, 1) >> 8),
+        ("bytes of two values", offset, lambda v: (beside(v, -1) & 0xFF) << 8 | v >> 8),
+        ("bytes of two values", offset, lambda v: v >> 8 | (beside(v, 1) & 0xFF) << 8),
+        ("bytes of two values", offset, lambda v: beside(v, -1) >> 8 | (v & 0xFF) << 8),
+    ]
+
+
+def _signed(v: Values, bits: int) -> Values:
+    return np.where(v >= 1 << (bits - 1), v - (1 << bits), v)
+
+
+__all__ = ["Comparison", "Update"]

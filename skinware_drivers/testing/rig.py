@@ -1,0 +1,339 @@
+"""A driver on emulated devices, in time that the test owns: set up, watched, and compared with what was sent."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_service import DriverFrame, DriverReader
+from skinware.errors import ServiceTimeout, StructureChanged
+from skinware.status import BusState, PatchState, Status
+from skinware.structure import Structure
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.link import Link
+from skinware_drivers.runner import Runner
+from skinware_drivers.testing.clock import HandClock, run_in_its_time
+from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.wire import EmulatedBus, EmulatedSerialBus, Interference, Pattern, Truth, make_bus
+
+T = TypeVar("T")
+NAME = "driver_under_test"
+_BUS = "bus"
+_SLOTS = 64
+_LONGEST_START_S = 30.0
+SHOWN_ANYWAY = int(Status.SUSPECT | Status.OUT_OF_RANGE)
+"""Status bits of values that are shown as they were sent."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A driver and its devices; see :class:`skinware_drivers.testing.conformance.DriverConformance`."""
+
+    driver: type[AnyAdapter]
+    emulator: Any
+    driver_options: Mapping[str, Any]
+    emulator_options: Mapping[str, Any]
+    shown: Callable[[Sequence[int]], Sequence[int]]
+
+    def adapter(self) -> AnyAdapter:
+        """The driver's object for one bus."""
+        return self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
+
+    def options(self, **more: Any) -> Any:
+        """Options of the devices; of ``more``, those that they have."""
+        known = self.emulator.Options.__struct_fields__
+        given = {**self.emulator_options, **{name: value for name, value in more.items() if name in known}}
+        return msgspec.convert(given, self.emulator.Options, strict=False)
+
+
+class Recorder:
+    """Every frame that a driver publishes, in order, as a user's program reads it.
+
+    Attributes:
+        frames: what was published.
+        times_ns: when.
+        keep: whether to keep them; else only the newest.
+        count: of all that were published.
+    """
+
+    def __init__(self, clock: HandClock) -> None:
+        self.frames: list[DriverFrame] = []
+        self.times_ns: list[int] = []
+        self.keep = True
+        self.count = 0
+        self.reader: DriverReader | None = None
+        self._clock = clock
+
+    def look(self, runner: Runner) -> None:
+        """Take what was published."""
+        if self.reader is None:
+            if runner.writer is None:
+                return
+            self.reader = DriverReader(runner.name)
+        while True:
+            last = self.frames[-1].position if self.frames else None
+            newest = self.reader.latest
+            if newest is None or newest == last:
+                return
+            try:
+                frame = next(self.reader.in_order(timeout_s=0))
+            except ServiceTimeout:
+                return
+            except StructureChanged:
+                self.reader.reattach()
+                continue
+            if not self.keep:
+                self.frames.clear()
+                self.times_ns.clear()
+            self.count += 1
+            self.frames.append(frame)
+            self.times_ns.append(self._clock.now_ns)
+
+    def close(self) -> None:
+        """Let go of the reader."""
+        if self.reader is not None:
+            self.reader.close()
+
+
+class Rig:
+    """One driver on one bus of devices. Everything happens in the time of ``clock``.
+
+    Attributes:
+        clock: the time.
+        adapter: the driver.
+        devices: the emulated hardware.
+        truth: what it was told to feel.
+        wire: what is between the two.
+        bus: the bus.
+    """
+
+    def __init__(
+        self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **emulated: Any
+    ) -> None:
+        self.case = case
+        self.clock = clock
+        self.adapter = case.adapter()
+        options = case.options(**emulated)
+        n_values = len(case.emulator(options).places())
+        self.truth = Truth(clock, n_values, pattern, case.shown)
+        self.devices = case.emulator(options, log=None, source=self.truth)
+        self.numbers: list[int] = list(self.devices.numbers)
+        self.wire = Interference(self.devices)
+        self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
+
+    @property
+    def period_ns(self) -> int:
+        """Nominal time between two updates."""
+        return round(self.adapter.period_s * 1e9)
+
+    @property
+    def n_values(self) -> int:
+        """Of all devices."""
+        return self.truth.n_values * len(self.numbers)
+
+
+class Handshakes(Rig):
+    """A rig without a runner: the test calls what it likes of the adapter, and frames reach whoever waits for them."""
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self.link = Link(self.bus)
+
+    async def __aenter__(self) -> Self:
+        self.adapter.fit(self.bus)
+        self.open()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Open the bus."""
+        self.bus.open()
+        asyncio.get_running_loop().add_reader(self.bus.fileno(), self._hear)
+
+    def close(self) -> None:
+        """Close the bus."""
+        if self.bus.fileno() >= 0:
+            asyncio.get_running_loop().remove_reader(self.bus.fileno())
+        self.bus.close()
+
+    def _hear(self) -> None:
+        batch = FrameBatch(4096, self.bus.payload_size)
+        self.bus.receive(batch, 0)
+        self.link.offer(batch, np.arange(batch.start, batch.stop))
+
+
+class Running(Rig):
+    """A rig whose driver runs as ``skin-driver`` runs it, as long as the ``async with`` lasts.
+
+    Attributes:
+        record: what it publishes.
+        answers: frames that its handshakes took, and those that came before it knew what is there.
+    """
+
+    def __init__(self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
+        super().__init__(case, clock, pattern, listen_only=listen_only, **more)
+        self.record = Recorder(clock)
+        self.answers = 0
+        self.runner: Runner | None = None
+        self._listen_only = listen_only
+        self._task: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        self.runner = Runner(
+            NAME, [(_BUS, self.adapter, self.bus)], name=NAME, listen_only=self._listen_only, slots=_SLOTS
+        )
+        self._task = asyncio.create_task(self.runner.run())
+        self.clock.before_passing.append(self._look)
+        self._count_answers(self.runner)
+        return self
+
+    def _count_answers(self, runner: Runner) -> None:
+        """Count the frames that were answers to handshakes, which no counter tells."""
+        link = runner.lines[0].link
+        offer = link.offer
+
+        def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+            unwanted = offer(batch, rows)
+            self.answers += len(rows) if runner.decoder is None else len(rows) - len(unwanted)
+            return unwanted
+
+        link.offer = offer_and_count  # type: ignore[method-assign]
+
+    async def __aexit__(self, *raised: object) -> None:
+        await self.stop()
+
+    async def stop(self) -> None:
+        """Stop the driver as ``skin-driver`` does; what it raised is raised here."""
+        if self.runner is None or self._task is None:
+            return
+        runner, task, self._task = self.runner, self._task, None
+        runner.stop()
+        try:
+            await task
+        finally:
+            self.clock.before_passing.remove(self._look)
+            self.record.close()
+            self.runner = None
+
+    def _look(self) -> None:
+        if self.runner is not None:
+            self.record.look(self.runner)
+
+    async def sleep(self, duration_s: float) -> None:
+        """Let time pass; fails if the driver ends meanwhile."""
+        await asyncio.sleep(duration_s)
+        if self._task is not None and self._task.done():
+            error = self._task.exception()
+            defect(f"the driver ended by itself: {type(error).__name__}: {error}" if error else "the driver ended")
+
+    async def until(
+        self, condition: Callable[[DriverFrame], object], why_not: str, within_s: float = _LONGEST_START_S
+    ) -> DriverFrame:
+        """Let time pass until a published frame fulfils a condition; a defect if none does."""
+        record, end_ns = self.record, self.clock.now_ns + round(within_s * 1e9)
+        seen = record.count
+        while True:
+            for frame in record.frames[len(record.frames) - (record.count - seen) :]:
+                if condition(frame):
+                    return frame
+            seen = record.count
+            require(self.clock.now_ns < end_ns, why_not)
+            await self.sleep(min(self.adapter.period_s / 2, 0.05))
+
+    async def until_fresh(self, within_s: float = _LONGEST_START_S) -> DriverFrame:
+        """Until every sensor was seen and none is stale."""
+        try:
+            return await self.until(is_fresh, "", within_s)
+        except BaseException:
+            self._explain_why_not_fresh(within_s)
+            raise
+
+    def _explain_why_not_fresh(self, within_s: float) -> None:
+        within = f"after {within_s:g} s of emulated data"
+        if not self.record.frames:
+            if self.wire.frames:
+                defect(f"nothing was published {within}, though the devices sent {self.wire.frames} frames")
+            defect(f"nothing was published {within}: the devices sent no frame; the driver: {self.sent_in_words()}")
+        frame = self.record.frames[-1]
+        if not self.truth.bursts:
+            defect(f"the devices sent no data {within}: did `start` tell them to? It sent: {self.sent_in_words()}")
+        missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
+        counters = {k: v for k, v in self.counters().items() if v and k in ("unknown", "bad_length", "bad_content")}
+        never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))
+        named = ", ".join(sensor_name(frame.structure, sensor) for sensor in (never if len(never) else missing)[:3])
+        what = "was never seen" if len(never) else "is not fresh"
+        count = len(never) if len(never) else len(missing)
+        defect(
+            f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}. No frame of the"
+            " layout writes them: is a frame, a module or a channel missing, or are two channels `to` one?"
+            f" Frames that the layout did not take: {counters or 'none'}"
+        )
+
+    def counters(self) -> dict[str, int]:
+        """Counters of the bus and those of all patches together, as of now; none before there is a structure."""
+        if self.runner is None:
+            return {}
+        status = self.runner.status()
+        counters: dict[str, int] = {}
+        for part in (*status["buses"], *status.get("patches", ())):
+            for name, count in part.items():
+                if isinstance(count, int):
+                    counters[name] = counters.get(name, 0) + count
+        return counters
+
+    def sent_in_words(self) -> str:
+        """The first and the last frames that the driver sent."""
+        sent = [f"{identifier:X} [{payload.hex(' ')}]" for identifier, payload in self.wire.sent]
+        return ", ".join(sent if len(sent) <= 6 else [*sent[:3], "...", *sent[-3:]]) or "nothing"
+
+    def first_patch_of(self, number: int) -> int:
+        """The patch that shows the first value of a device."""
+        structure = self.record.frames[-1].structure
+        return int(structure.sensor_patch[self.numbers.index(number) * self.truth.n_values])
+
+
+def is_fresh(frame: DriverFrame) -> bool:
+    """Whether every sensor is good, or at least shown."""
+    return not (frame.status & ~np.uint8(SHOWN_ANYWAY)).any()
+
+
+def is_live(frame: DriverFrame) -> bool:
+    """Whether bus and patches are all live."""
+    return bool((frame.patch_state == PatchState.LIVE).all() and (frame.bus_state == BusState.LIVE).all())
+
+
+def sensor_name(structure: Structure, sensor: int) -> str:
+    """For people."""
+    patch = bytes(structure.patch_name[structure.sensor_patch[sensor]]).decode()
+    module = int(structure.sensor_module[sensor])
+    type_name = next(t.name for t in structure.types if t.id == structure.sensor_type[sensor])
+    return f"sensor {sensor} ({type_name}, {patch!r}, module {module}, uid {int(structure.sensor_uid[sensor]):#x})"
+
+
+def play(scenario: Callable[[HandClock], Coroutine[Any, Any, T]]) -> T:
+    """Run a scenario in time of its own."""
+    clock = HandClock()
+    return run_in_its_time(clock, lambda: scenario(clock))
+
+
+__all__ = [
+    "SHOWN_ANYWAY",
+    "Case",
+    "EmulatedSerialBus",
+    "Handshakes",
+    "Recorder",
+    "Running",
+    "is_fresh",
+    "is_live",
+    "play",
+    "sensor_name",
+]

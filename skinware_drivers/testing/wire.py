@@ -1,0 +1,292 @@
+"""What is between emulated devices and the driver under test: the truth of what was sent, and faults on the way.
+
+The emulator itself need not know of any fault.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BusNotAvailable
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.testing.clock import HandClock, HandTimer
+from skinware_drivers.testing.defect import defect
+from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+
+Fault = Literal["lost", "repeated", "truncated", "garbage", "noise"]
+"""Of a frame: gone, twice, cut short, random bytes instead of its own, random bytes before it (serial lines)."""
+Values = npt.NDArray[np.int64]
+Pattern = Callable[[int, int, int], Values]
+"""(number of the device, number of its burst, number of values) -> what its sensors feel."""
+_FOREIGN_NS = 3_000_000
+
+
+@dataclass(frozen=True)
+class Burst:
+    """One sample of all sensors of a device, as the emulator was told to feel it.
+
+    Attributes:
+        time_ns: when the emulator asked for it, at the latest.
+        values: (n,) what was felt, as far as the protocol can tell.
+    """
+
+    time_ns: int
+    values: Values
+
+
+class Truth:
+    """The source of an emulator's values, which remembers them.
+
+    Args:
+        clock: the time.
+        n_values: values of each device.
+        pattern: what is felt.
+        shown: of what was felt, what the protocol can tell.
+    """
+
+    def __init__(
+        self, clock: HandClock, n_values: int, pattern: Pattern, shown: Callable[[Sequence[int]], Sequence[int]]
+    ) -> None:
+        self.pattern = pattern
+        self.n_values = n_values
+        self.bursts: dict[int, list[Burst]] = {}
+        self.remember = True
+        self._clock = clock
+        self._shown = shown
+
+    def __call__(self, number: int, cycle: int) -> Sequence[int]:
+        """What a device feels now."""
+        felt: list[int] = self.pattern(number, cycle, self.n_values).tolist()
+        if self.remember:
+            burst = Burst(self._clock.now_ns, np.array(self._shown(felt)))
+            self.bursts.setdefault(number, []).append(burst)
+        return felt
+
+
+@dataclass(frozen=True)
+class Damage:
+    """What was done to one frame on the wire."""
+
+    time_ns: int
+    fault: Fault
+    payload: bytes
+
+
+@dataclass
+class Interference:
+    """Devices as the driver gets to hear them.
+
+    Attributes:
+        hardware: the devices.
+        fault: what happens to some of the frames; None: nothing.
+        every_ns: to one frame after so much time, on average.
+        silent: nothing comes through, in either direction.
+        foreign: identifiers of frames of other devices that come beside the data.
+        keep: which frames come through.
+        damages: what was done.
+        frames: frames that came through, since the devices have power.
+        foreign_sent: frames of other devices among them.
+        sent: what the driver sent to the devices.
+    """
+
+    hardware: EmulatedHardware
+    fault: Fault | None = None
+    every_ns: int = 0
+    silent: bool = False
+    foreign: Sequence[int] = ()
+    keep: Callable[[int, bytes], bool] = lambda _identifier, _payload: True
+    damages: list[Damage] = field(default_factory=list)
+    frames: int = 0
+    foreign_sent: int = 0
+    sent: list[tuple[int, bytes]] = field(default_factory=list)
+    identifiers: dict[int, int] = field(default_factory=dict)
+    _random: random.Random = field(default_factory=lambda: random.Random(1))
+    _next_ns: int = 0
+    _next_foreign_ns: int = 0
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        """What the driver sends."""
+        self.sent.append((identifier, payload))
+        if not self.silent:
+            self.hardware.receive(identifier, payload, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        """When the next frame may come."""
+        due_ns = self.hardware.next_due_ns()
+        if not self.foreign:
+            return due_ns
+        return self._next_foreign_ns if due_ns is None else min(due_ns, self._next_foreign_ns)
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        """What comes through."""
+        frames = [frame for frame in self.hardware.emit(now_ns) if self.keep(frame.identifier, frame.payload)]
+        if self.silent:
+            return []
+        if self.fault is not None:
+            frames = [damaged for frame in frames for damaged in self._damage(frame)]
+        if self.foreign:
+            frames = self._among_others(frames, now_ns)
+        for frame in frames:
+            self.identifiers[frame.identifier] = self.identifiers.get(frame.identifier, 0) + 1
+        self.frames += len(frames)
+        return frames
+
+    def skip(self, now_ns: int) -> int:
+        """Let the devices run on with nobody listening."""
+        self._next_foreign_ns = now_ns
+        return self.hardware.skip(now_ns)
+
+    def totals(self) -> dict[str, int]:
+        """Of the devices."""
+        return self.hardware.totals()
+
+    def _damage(self, frame: WireFrame) -> list[WireFrame]:
+        if frame.time_ns < self._next_ns or not frame.payload:
+            return [frame]
+        if not self._next_ns:  # the first time, only decide when
+            self._next_ns = frame.time_ns + self._pause_ns()
+            return [frame]
+        self._next_ns = frame.time_ns + self._pause_ns()
+        payload, times = frame.payload, 1
+        if self.fault == "lost":
+            times = 0
+        elif self.fault == "repeated":
+            times = 2
+        elif self.fault == "truncated":
+            payload = payload[: self._random.randrange(len(payload))]
+        elif self.fault == "noise":
+            payload = self._random.randbytes(1 + self._random.randrange(8)) + payload
+        else:
+            payload = self._random.randbytes(len(payload))
+        self.damages.append(Damage(frame.time_ns, self.fault or "lost", payload))
+        return [WireFrame(frame.time_ns, frame.identifier, payload)] * times
+
+    def _pause_ns(self) -> int:
+        return round(self.every_ns * self._random.uniform(0.6, 1.4))
+
+    def _among_others(self, frames: list[WireFrame], now_ns: int) -> list[WireFrame]:
+        others = []
+        while self._next_foreign_ns <= now_ns:
+            payload = self._random.randbytes(self._random.randrange(9))
+            others.append(WireFrame(self._next_foreign_ns, self._random.choice(self.foreign), payload))
+            self._next_foreign_ns += round(_FOREIGN_NS * self._random.uniform(0.3, 1.7))
+        self.foreign_sent += len(others)
+        return sorted([*frames, *others], key=lambda frame: frame.time_ns)
+
+
+class _EmulatedPort(Port):
+    """A serial line whose other end is emulated: the payloads of its frames are the bytes on the line."""
+
+    def __init__(self, hardware: EmulatedHardware, clock: HandClock) -> None:
+        self._hardware = hardware
+        self._clock = clock
+        self._timer: HandTimer = clock.timer()
+        self._bytes = b""
+        self.present = True
+        hardware.skip(clock())
+        self._wake()
+
+    def fileno(self) -> int:
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:
+        if not self.present:
+            raise BusNotAvailable("the emulated line went away: unplugged?")
+        self._bytes += b"".join(frame.payload for frame in self._hardware.emit(self._clock()))
+        data, self._bytes = self._bytes[:size], self._bytes[size:]
+        self._wake()
+        return data
+
+    def write(self, data: bytes) -> int:
+        if not self.present:
+            raise OSError("unplugged")
+        self._hardware.receive(0, data, self._clock())
+        self._wake()
+        return len(data)
+
+    def close(self) -> None:
+        self._timer.close()
+
+    def wake(self) -> None:
+        """Have it read at once."""
+        self._timer.wake_at(0)
+
+    def _wake(self) -> None:
+        self._timer.wake_at(0 if self._bytes else self._hardware.next_due_ns())
+
+
+class EmulatedSerialBus(SerialBus):
+    """A serial line with emulated devices, in a clock's time."""
+
+    def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
+        super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
+        self._hardware = hardware
+        self._clock = clock
+        self._present = True
+        self._emulated: _EmulatedPort | None = None
+
+    def _open_port(self) -> Port:
+        if not self._present:
+            raise BusNotAvailable("the emulated line is away")
+        self._emulated = _EmulatedPort(self._hardware, self._clock)
+        return self._emulated
+
+    def vanish(self) -> None:
+        """Go away, as if unplugged."""
+        self._present = False
+        if self._emulated is not None:
+            self._emulated.present = False
+            self._emulated.wake()
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`."""
+        self._present = True
+
+
+EmulatedBus = VirtualCanBus | EmulatedSerialBus
+
+
+def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
+    """An emulated bus of the medium that a driver speaks."""
+    if adapter.medium == "can":
+        return VirtualCanBus.with_hardware(
+            hardware,
+            payload_size=adapter.payload_size,
+            listen_only=listen_only,
+            clock=clock,
+            make_timer=clock.timer,
+        )
+    if adapter.medium == "serial":
+        return EmulatedSerialBus(hardware, clock, adapter.payload_size, listen_only)
+    return defect(f"{type(adapter).__name__}: there is no emulated bus of the medium {adapter.medium!r}")
+
+
+def foreign_identifiers(own: Collection[int]) -> list[int]:
+    """Identifiers that none of the devices uses, of 11 and of 29 bits."""
+    others = [i for i in range(0x7FF) if i not in own]
+    extended = [EXTENDED_FLAG | 0x1234_0000 | i for i in (1, 0x710)]
+    return random.Random(2).sample(others, min(40, len(others))) + [i for i in extended if i not in own]
+
+
+__all__ = [
+    "Burst",
+    "Damage",
+    "EmulatedBus",
+    "EmulatedSerialBus",
+    "Fault",
+    "Interference",
+    "Pattern",
+    "Truth",
+    "foreign_identifiers",
+    "make_bus",
+]

@@ -1,0 +1,100 @@
+"""Every driver that ships, on its emulated devices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.can.barrett import BarrettDriver
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.barrett import EmulatedBarrett
+from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.xela import EmulatedXela
+
+
+class TestXela(DriverConformance):
+    driver = XelaDriver
+    emulator = EmulatedXela
+
+
+class TestXela4x6(DriverConformance):
+    driver = XelaDriver
+    emulator = EmulatedXela
+    driver_options: ClassVar[Mapping[str, Any]] = {
+        "boards": (1, 3),
+        "ids": "row_column",
+        "first_id": (0x100, 0x200),
+        "columns": 6,
+    }
+    emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (1, 3), "model": "4x6"}
+
+
+class TestCyskinCpm(DriverConformance):
+    driver = CyskinCpmDriver
+    emulator = EmulatedCyskinCpm
+
+
+class TestBarrett(DriverConformance):
+    driver = BarrettDriver
+    emulator = EmulatedBarrett
+
+
+class TestBarrettTop10(DriverConformance):
+    driver = BarrettDriver
+    emulator = EmulatedBarrett
+    driver_options: ClassVar[Mapping[str, Any]] = {"format": "top10", "nodes": (11, 14)}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"nodes": (11, 14)}
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        """In N/cm2; of equals, the first."""
+        weakest_last = sorted((-value, cell) for cell, value in enumerate(felt))
+        listed = {cell for _, cell in weakest_last[:10]}
+        return [value // 256 if cell in listed else 0 for cell, value in enumerate(felt)]
+
+
+class EmulatedTriangles(EmulatedRoboskin):
+    """Boards whose sixteen triangles have twelve channels each."""
+
+    full_scale = 0xFF
+
+    def __init__(
+        self,
+        options: RoboskinOptions,
+        *,
+        log: EventLog | None = None,
+        source: Callable[[int, int], Sequence[int]] | None = None,
+    ) -> None:
+        felt: dict[int, tuple[int, Sequence[int]]] = {}
+
+        def of_triangle(board: int, triangle: int, cycle: int, _time_ns: int) -> Sequence[int]:
+            assert source is not None
+            if board not in felt or felt[board][0] != cycle:
+                felt[board] = cycle, source(board, cycle)
+            return felt[board][1][12 * triangle : 12 * triangle + 12]
+
+        super().__init__(options, log=log, source=of_triangle)
+        self.numbers = options.boards
+
+    def places(self) -> npt.NDArray[Any]:
+        return np.zeros((192, 2))
+
+
+class TestRoboskin(DriverConformance):
+    driver = RoboskinDriver
+    emulator = EmulatedTriangles
+
+
+class TestRoboskinMtb3(DriverConformance):
+    driver = RoboskinDriver
+    emulator = EmulatedTriangles
+    driver_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4)}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4), "mtb3": (3,)}

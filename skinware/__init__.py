@@ -17,10 +17,11 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin, SkinLayout, Snapshot
-from skinware.status import BusState, PatchState, Status
+from skinware.status import BusReason, BusState, PatchState, Status
 from skinware.structure import Structure
 
 __all__ = [
+    "BusReason",
     "BusState",
     "Column",
     "DriverFrame",

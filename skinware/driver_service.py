@@ -1,7 +1,8 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
-Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_counters``,
-``patch_counters``. Static columns: the structure's tables, ``driver_type`` and the names of the counters.
+Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
+``bus_since_ns``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``, ``patch_age_counts``. Static columns:
+the structure's tables, ``driver_type`` and the names of the counters.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import _segment
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
+from skinware.memory.statistics import BUCKETS
 from skinware.service import DEFAULT_SLOTS, Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
@@ -59,6 +61,33 @@ class DriverFrame(Frame):
     def bus_state(self) -> npt.NDArray[np.uint8]:
         """(n_buses,) uint8, :class:`skinware.status.BusState`."""
         return self.column("bus_state")
+
+    @property
+    def bus_reason(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not tell."""
+        return self._told("bus_reason", (len(self.structure.buses),), np.uint8)
+
+    @property
+    def bus_since_ns(self) -> npt.NDArray[np.int64]:
+        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
+        return self._told("bus_since_ns", (len(self.structure.buses),), np.int64)
+
+    @property
+    def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
+        """(n_patches, BUCKETS) uint64: histogram of the time between two updates of a module, for every patch.
+
+        The buckets are those of :class:`skinware.memory.statistics.Histogram`; all 0 where the driver does not tell.
+        """
+        return self._told("patch_interval_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+
+    @property
+    def patch_age_counts(self) -> npt.NDArray[np.uint64]:
+        """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published, likewise."""
+        return self._told("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+
+    def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """A column that a driver need not have."""
+        return self.column(name).reshape(shape) if name in self._columns else np.zeros(shape, dtype)
 
     def physical(self, type_name: str) -> npt.NDArray[np.float32]:
         """(n,) float32: values of all sensors of a type, in the type's unit, in the order of ``structure.index``."""
@@ -194,8 +223,12 @@ class DriverWriter:
             "module_time_ns": ("<i8", structure.n_modules),
             "patch_state": ("u1", structure.n_patches),
             "bus_state": ("u1", len(structure.buses)),
+            "bus_reason": ("u1", len(structure.buses)),
+            "bus_since_ns": ("<i8", len(structure.buses)),
             "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
             "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
+            "patch_interval_counts": ("<u8", structure.n_patches * BUCKETS),
+            "patch_age_counts": ("<u8", structure.n_patches * BUCKETS),
         }
 
     def _static(self) -> dict[str, npt.NDArray[Any]]:
@@ -259,6 +292,9 @@ class DriverReader(ServiceReader[DriverFrame]):
                 "patch_state": structure.n_patches,
                 "bus_state": len(structure.buses),
             }
+            optional = {"bus_reason": len(structure.buses), "bus_since_ns": len(structure.buses)}
+            optional |= dict.fromkeys(("patch_interval_counts", "patch_age_counts"), structure.n_patches * BUCKETS)
+            expected |= {name: count for name, count in optional.items() if name in columns}
             for name, count in expected.items():
                 if columns[name].count != count:
                     raise StructureError(f"{columns[name].count} {name} for {count} rows of the structure")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from skinware.status import BusReason
+
 
 class SkinwareError(Exception):
     """Base of every error that Skinware raises on purpose."""
@@ -96,11 +98,13 @@ class BusNotAvailable(BusError):
 
     Attributes:
         is_down: the interface is there, but down; otherwise it is not there (or not for us).
+        reason: why, for programs; default: down or not there.
     """
 
-    def __init__(self, message: str, *, is_down: bool = False) -> None:
+    def __init__(self, message: str, *, is_down: bool = False, reason: BusReason | None = None) -> None:
         super().__init__(message)
         self.is_down = is_down
+        self.reason = (BusReason.INTERFACE_DOWN if is_down else BusReason.INTERFACE_GONE) if reason is None else reason
 
 
 class BusSendError(BusError):

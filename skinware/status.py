@@ -47,6 +47,35 @@ class BusState(enum.IntEnum):
     SILENT = 2
     """Open, but nothing came for longer than the driver's silence limit."""
     DOWN = 3
-    """The interface exists but is down; the driver waits for it."""
+    """The interface exists but is down, or its controller is off the bus; the driver waits for it."""
     GONE = 4
     """The interface vanished; it is opened again as soon as it is back."""
+
+
+class BusReason(enum.IntEnum):
+    """Why a bus is in its state; of a live one, what is nevertheless wrong with it."""
+
+    NONE = 0
+    """Nothing is wrong, or nothing more is known."""
+    NOTHING_HEARD = 1
+    """Open and in order, but no frame came for longer than the driver's silence limit."""
+    INTERFACE_DOWN = 2
+    """The interface was set down."""
+    INTERFACE_GONE = 3
+    """There is no such interface (any more)."""
+    REFUSED = 4
+    """This user may not use it."""
+    FAILED = 5
+    """The interface or its library failed in another way, say because the adapter was unplugged."""
+    BUS_OFF = 6
+    """The controller met so many errors in sending that it took itself off the wire."""
+    ERROR_PASSIVE = 7
+    """The controller met many errors and may only whisper: nobody acknowledges, or the wire is bad."""
+    ERROR_WARNING = 8
+    """The controller meets errors more often than it should."""
+    OVERFLOW = 9
+    """The controller lost frames, as the machine did not fetch them in time."""
+    NO_ACKNOWLEDGEMENT = 10
+    """Nobody on the wire acknowledges what is sent."""
+    BUS_ERRORS = 11
+    """The controller hears broken frames: another bit rate, missing termination, bad wires."""

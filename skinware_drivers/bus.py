@@ -13,6 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from skinware.status import BusReason
+
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h)."""
 REMOTE_FLAG = 0x4000_0000
@@ -55,6 +57,7 @@ class FrameBatch:
         start: first valid row. The rows before it are headroom, into which the decoder puts frames that
             it still holds from the batch before.
         stop: one past the last valid row.
+        limit: rows before it may be filled: buses that share a batch must not crowd each other out.
     """
 
     def __init__(self, capacity: int, payload_size: int = 8, headroom: int = 0) -> None:
@@ -65,6 +68,7 @@ class FrameBatch:
         self.time_ns = np.zeros(self.capacity, np.int64)
         self.bus = np.zeros(self.capacity, np.uint16)
         self.start = self.stop = headroom
+        self.limit = self.capacity
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -72,11 +76,12 @@ class FrameBatch:
     @property
     def free(self) -> int:
         """Rows that a bus may still fill."""
-        return self.capacity - self.stop
+        return self.limit - self.stop
 
     def clear(self) -> None:
         """Forget all rows; the memory stays."""
         self.start = self.stop = self.headroom
+        self.limit = self.capacity
 
     def append(self, bus: int, time_ns: int, identifier: int, payload: bytes) -> None:
         """Add one frame: the slow path of buses that hand out frames one by one.
@@ -114,10 +119,17 @@ class BusCounters:
     """Sends that the interface refused."""
     polls_missed: int = 0
     """Polls of devices that only answer which could not be sent in time."""
+    overflows: int = 0
+    """How often the controller told that it had lost frames."""
+    bus_offs: int = 0
+    """How often the controller left the wire."""
 
 
 class Bus(ABC):
     """One link to hardware.
+
+    Attributes:
+        opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
 
     Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
     down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and
@@ -137,6 +149,7 @@ class Bus(ABC):
     """
 
     medium: ClassVar[str | None] = None
+    opens_slowly: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -186,6 +199,21 @@ class Bus(ABC):
     @abstractmethod
     def close(self) -> None:
         """Let go of the wire. Idempotent."""
+
+    def check(self) -> None:  # noqa: B027  (nothing to look after is the default)
+        """Look after a bus from which nothing comes, twice a second: a loss need not show in ``receive``.
+
+        Raises:
+            skinware.errors.BusNotAvailable: the interface is down or away.
+        """
+
+    def reason(self, time_ns: int) -> BusReason:  # noqa: ARG002
+        """What is wrong with the open bus as of now, as far as its hardware tells.
+
+        Args:
+            time_ns: now, CLOCK_MONOTONIC ns.
+        """
+        return BusReason.NONE
 
     @property
     def note(self) -> str:

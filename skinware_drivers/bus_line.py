@@ -8,11 +8,12 @@ import logging
 import select
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 
-from skinware.errors import BusError, BusNotAvailable
+from skinware.errors import BusError, BusNotAvailable, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState
+from skinware.status import BusReason, BusState
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 
@@ -20,6 +21,7 @@ log = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _STOP_TIMEOUT_S = 2.0
+_CHECK_PAUSE_NS = NS_PER_S // 2
 
 
 class BusLine:
@@ -36,6 +38,8 @@ class BusLine:
         link: handshakes on it.
         patches: what was found on it, None until it was asked.
         state: what the bus is doing.
+        reason: why, or what is wrong with it though frames come.
+        since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
         started: its devices have been told to send.
@@ -54,6 +58,8 @@ class BusLine:
         self.link = Link(bus)
         self.patches: Sequence[Patch] | None = None
         self.state = BusState.CONNECTING
+        self.reason = BusReason.NONE
+        self.since_ns = now_ns()
         self.heard_ns = 0
         self.opened_ns = 0
         self.started = False
@@ -62,6 +68,10 @@ class BusLine:
         self.suspects: set[int] = set()
         self.revived_ns = 0
         self._epoll = epoll
+        self._news = BusNews()
+        self._noted = ""
+        self._checked_ns = 0
+        self._was_heard = False
 
     def open(self) -> None:
         """Open the bus.
@@ -70,17 +80,21 @@ class BusLine:
             BusNotAvailable: it cannot be opened now.
         """
         self.bus.open()
+        self._is_open()
+
+    def _is_open(self) -> None:
         self._epoll.register(self.bus.fileno(), select.EPOLLIN)
-        self.state = BusState.SILENT
+        self._become(BusState.SILENT, self.bus.reason(now_ns()))
         self.opened_ns = now_ns()
         self.lost.clear()
-        if self.bus.note:
+        if self.bus.note and self.bus.note != self._noted:
             log.warning("%s", self.bus.note)
+            self._noted = self.bus.note
 
     def lose(self, error: BusNotAvailable) -> None:
         """Close it because it went away; ``reopen`` waits for it."""
-        self.state = BusState.DOWN if error.is_down else BusState.GONE
-        log.warning("%s; waiting for it to come back", str(error))  # a record that kept the error would keep us
+        self._become(BusState.DOWN if error.is_down else BusState.GONE, error.reason)
+        self._news.tell(f"{error}; waiting for it to come back")
         with contextlib.suppress(OSError):
             self._epoll.unregister(self.bus.fileno())
         self.bus.close()
@@ -90,19 +104,83 @@ class BusLine:
         """Wait until a lost bus is back."""
         for pause_s in _pauses():
             await asyncio.sleep(pause_s)
+            self._news.catch_up()
             try:
-                self.open()
-            except BusNotAvailable as error:
-                self.state = BusState.DOWN if error.is_down else BusState.GONE
+                await self._open_again()
+            except (BusNotAvailable, ConfigurationError, OSError) as error:
+                self._still_away(error)
             else:
-                log.warning("bus %s is back", self.name)
+                self._news.tell(f"bus {self.name} is back")
                 return
 
+    async def _open_again(self) -> None:
+        if self.bus.opens_slowly:  # the other buses go on meanwhile
+            opening = asyncio.ensure_future(asyncio.to_thread(self.bus.open))
+            try:
+                await asyncio.shield(opening)
+            finally:
+                await asyncio.gather(opening, return_exceptions=True)
+        else:
+            self.bus.open()
+        self._is_open()
+
+    def _still_away(self, error: Exception) -> None:
+        if isinstance(error, BusNotAvailable):
+            state, reason = (BusState.DOWN if error.is_down else BusState.GONE), error.reason
+        else:
+            state, reason = BusState.GONE, BusReason.FAILED
+        if self._become(state, reason):
+            self._news.tell(f"{error}; waiting for it to come back")
+
     def look(self, silence_ns: int) -> None:
-        """Tell a living bus from one that says nothing."""
-        if self.bus.fileno() >= 0:
-            silent = now_ns() - self.heard_ns > max(NS_PER_S // 2, silence_ns)
-            self.state = BusState.SILENT if silent else BusState.LIVE
+        """Tell a living bus from one that says nothing, is off the wire, or is gone."""
+        if self.bus.fileno() < 0:
+            return
+        time_ns = now_ns()
+        self._news.catch_up()
+        before, reason = (self.state, self.reason), self.bus.reason(time_ns)
+        if reason == BusReason.BUS_OFF:
+            self._become(BusState.DOWN, reason)
+        elif time_ns - self.heard_ns > max(NS_PER_S // 2, silence_ns):
+            self._become(BusState.SILENT, reason or BusReason.NOTHING_HEARD)
+        else:
+            self._become(BusState.LIVE, reason)
+        if before != (self.state, self.reason):
+            self._tell(*before)
+        if self.state != BusState.LIVE or self.reason:
+            self._check(time_ns)
+
+    def _check(self, time_ns: int) -> None:
+        """Ask a bus that is not in order whether it is still there, now and then."""
+        if time_ns - self._checked_ns < _CHECK_PAUSE_NS or self.lost.is_set():
+            return
+        self._checked_ns = time_ns
+        try:
+            self.bus.check()
+        except BusNotAvailable as error:
+            self.lose(error)
+
+    def _become(self, state: BusState, reason: BusReason) -> bool:
+        """Returns whether it was in another state, or for another reason."""
+        if (state, reason) == (self.state, self.reason):
+            return False
+        self.state, self.reason, self.since_ns = state, reason, now_ns()
+        return True
+
+    def _tell(self, state: BusState, reason: BusReason) -> None:
+        """What the change from this state and reason means."""
+        if self.reason == BusReason.NOTHING_HEARD:
+            if state == BusState.LIVE:
+                self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
+        elif self.reason:
+            if self.reason != reason:
+                self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
+        elif reason == BusReason.NOTHING_HEARD:
+            if self._was_heard:
+                self._news.tell(f"bus {self.name}: frames come again")
+        elif reason:
+            self._news.tell(f"bus {self.name}: in order again (was {reason_text(reason)})")
+        self._was_heard |= self.state == BusState.LIVE
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
         """Ask what hangs on it, for as long as it takes.
@@ -121,6 +199,7 @@ class BusLine:
             except BusError as error:
                 self.patches = ()
                 why = str(error)
+                self._check(now_ns())
             await described()
             if self.patches:
                 return
@@ -139,7 +218,8 @@ class BusLine:
                     await self.adapter.configure(self.link)
                     await self.adapter.start(self.link)
             except BusError as error:
-                log.warning("%s: set-up failed: %s; trying again", self.name, str(error))
+                self._news.tell(f"{self.name}: set-up failed: {error}; trying again")
+                self._check(now_ns())
             else:
                 self.started = True
                 return

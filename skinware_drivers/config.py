@@ -38,6 +38,10 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     options: dict[str, Any] = {}
 
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ConfigurationError("a bus has no name yet: fill in the interface that it is, as can0")
+
 
 class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole file.

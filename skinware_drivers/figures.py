@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from skinware.driver_service import DriverWriter
+from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
 from skinware.status import PatchState
 from skinware_drivers.bus_line import BusLine
@@ -18,12 +19,12 @@ def figures(
 ) -> dict[str, Any]:
     """State and counters of every bus and patch; only the buses' states as long as nothing is published."""
     if writer is None or decoder is None or publisher is None:
-        return {"sequence": 0, "buses": [{"name": line.name, "state": line.state.name.lower()} for line in lines]}
+        return {"sequence": 0, "buses": [_bus(line) for line in lines]}
     structure, state, time_ns = decoder.tables.structure, decoder.state, now_ns()
     buses = []
     for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
         counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
-        buses.append({"name": line.name, "state": line.state.name.lower(), **counters})
+        buses.append({**_bus(line), **counters})
     patches = []
     for patch in range(structure.n_patches):
         last_ns = int(state.patch_time_ns[patch])
@@ -34,7 +35,20 @@ def figures(
                 "bus": lines[int(structure.patch_bus[patch])].name,
                 "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
                 "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
+                "interval": _bounds(publisher.timing.intervals[patch].tolist()),
+                "age": _bounds(publisher.timing.ages[patch].tolist()),
                 **counters,
             }
         )
     return {"sequence": writer.sequence, "buses": buses, "patches": patches}
+
+
+def _bus(line: BusLine) -> dict[str, Any]:
+    state_age_s = round((now_ns() - line.since_ns) / 1e9, 3)
+    reason = line.reason.name.lower() if line.reason else None
+    return {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
+
+
+def _bounds(counts: list[int]) -> dict[str, int | None]:
+    histogram = Histogram(counts)
+    return {"p50_ns": histogram.quantile_ns(0.5), "p99_ns": histogram.quantile_ns(0.99)}

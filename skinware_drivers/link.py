@@ -95,7 +95,7 @@ class Link:
         self._waiters.append(entry)
         try:
             await self.send(identifier, payload)
-            async with asyncio.timeout(timeout_s):  # wait_for of Python 3.11 may swallow a cancellation
+            async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
                 return await queue.get()
         except TimeoutError:
             raise HandshakeTimeout(

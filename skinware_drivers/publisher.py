@@ -15,9 +15,20 @@ from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
 from skinware_drivers.bus import BusCounters
 from skinware_drivers.decoder import Decoder
+from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = ("frames", "lost", "errors", "refused", "sent", "send_failures", "polls_missed")
+OWN_BUS_COUNTERS = (
+    "frames",
+    "lost",
+    "errors",
+    "refused",
+    "sent",
+    "send_failures",
+    "polls_missed",
+    "overflows",
+    "bus_offs",
+)
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
@@ -86,6 +97,7 @@ class Publisher:
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
         self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show)
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
+        self.timing = PatchTiming(structure)
         self._behind = np.zeros(structure.n_modules, bool)
         self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
         self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
@@ -93,6 +105,8 @@ class Publisher:
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
+        self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
+        self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -162,14 +176,19 @@ class Publisher:
 
     def _write(self, time_ns: int) -> None:
         state = self._state
+        self.timing.count(state.updated, state.module_time_ns, time_ns)
         columns = self._writer.begin()
         columns["values"][:] = state.values
         columns["module_time_ns"][:] = state.module_time_ns
         self._fill_status(columns["status"], time_ns)
         columns["patch_state"][:] = self.patch_state
         columns["bus_state"][:] = self.bus_state
+        columns["bus_reason"][:] = self.bus_reason
+        columns["bus_since_ns"][:] = self.bus_since_ns
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
+        columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)
+        columns["patch_age_counts"][:] = self.timing.ages.reshape(-1)
         self._writer.commit(state.newest_ns or time_ns)
         if self._desk is not None and self._desk.waited_for:
             self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)
@@ -182,8 +201,17 @@ class Publisher:
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         for row, c in zip(self._counts, self.bus_counters, strict=True):
-            own = c.frames, c.lost, c.error_frames, c.refused, c.sent, c.send_failures, c.polls_missed
-            row[: len(OWN_BUS_COUNTERS)] = own
+            row[: len(OWN_BUS_COUNTERS)] = (
+                c.frames,
+                c.lost,
+                c.error_frames,
+                c.refused,
+                c.sent,
+                c.send_failures,
+                c.polls_missed,
+                c.overflows,
+                c.bus_offs,
+            )
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 

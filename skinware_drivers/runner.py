@@ -181,6 +181,7 @@ class Runner:
                     await line.reopen()
                 await self._recover_silent_patches(line)
                 with contextlib.suppress(TimeoutError):
+                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
                     async with asyncio.timeout(self._silence_ns / NS_PER_S):
                         await line.lost.wait()
         finally:
@@ -309,38 +310,40 @@ class Runner:
         """Take what has arrived, then let more arrive before the next look: a batch costs little more than a frame."""
         loop = asyncio.get_running_loop()
         begun_ns = now_ns()
-        if self._take_frames():
+        taken = self._take_frames()
+        if taken == "nothing":
+            loop.add_reader(self._epoll.fileno(), self._on_readable)
+        else:
             loop.remove_reader(self._epoll.fileno())
             rest_s = min(_REST * (now_ns() - begun_ns) / NS_PER_S, _LONGEST_REST_S)
-            self._rest = loop.call_later(rest_s, self._on_readable)
-        else:
-            loop.add_reader(self._epoll.fileno(), self._on_readable)
+            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
 
-    def _take_frames(self) -> bool:
-        """Take all that has arrived; whether there was anything."""
+    def _take_frames(self) -> Literal["nothing", "all", "some"]:
+        """Take what has arrived, of every bus its share."""
         for turn in range(_TURNS):
             events = self._epoll.poll(0)
             if not events:
-                return turn > 0
+                return "all" if turn else "nothing"
             if self.decoder is not None:
                 self.decoder.put_back(self._batch)
             else:
                 self._batch.clear()
             time_ns = now_ns()
-            for fd, _ in events:
-                line = next((line for line in self.lines if line.bus.fileno() == fd), None)
-                if line is None:
-                    continue
+            is_behind = False
+            batch, by_fd = self._batch, {line.bus.fileno(): line for line in self.lines}
+            ready = [by_fd[fd] for fd, _ in events if fd in by_fd]
+            for number, line in enumerate(ready):
+                batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
                 try:
-                    if line.bus.receive(self._batch, line.ordinal):
+                    if line.bus.receive(batch, line.ordinal):
                         line.heard_ns = time_ns
+                        is_behind |= not batch.free
                 except BusNotAvailable as error:
                     line.lose(error)
-            is_behind = not self._batch.free
             self._digest()
             if not is_behind:
-                break
-        return True
+                return "all"
+        return "some"
 
     def _digest(self) -> None:
         batch = self._batch
@@ -384,6 +387,8 @@ class Runner:
             line.look(self._silence_ns)
             if self.publisher is not None:
                 self.publisher.bus_state[line.ordinal] = line.state
+                self.publisher.bus_reason[line.ordinal] = line.reason
+                self.publisher.bus_since_ns[line.ordinal] = line.since_ns
 
     @property
     def _silence_ns(self) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState, PatchState, Status
+from skinware.status import BusReason, BusState, PatchState, Status
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -25,6 +25,7 @@ _LEAST_SILENCE_NS = NS_PER_S
 _SILENT_PERIODS = 5
 _PATCH_STATES = {int(state): state.name.lower() for state in PatchState}
 _BUS_STATES = {int(state): state.name.lower() for state in BusState}
+_BUS_REASONS = {int(reason): reason.name.lower() for reason in BusReason}
 
 
 def life_of(service: ServiceReader[Any], newest: Frame | None) -> str:
@@ -139,3 +140,8 @@ def patch_state_name(state: int) -> str:
 def bus_state_name(state: int) -> str:
     """Name of a :class:`BusState`; a number that this version does not know stays a number."""
     return _BUS_STATES.get(state, str(state))
+
+
+def bus_reason_name(reason: int) -> str | None:
+    """Name of a :class:`BusReason`, None for ``NONE``; a number that this version does not know stays a number."""
+    return _BUS_REASONS.get(reason, str(reason)) if reason else None

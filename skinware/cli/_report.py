@@ -7,13 +7,22 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from skinware.cli._health import bus_state_name, life_of, patch_ages_ns, patch_state_name, rate_now_hz, status_now
+from skinware.cli._health import (
+    bus_reason_name,
+    bus_state_name,
+    life_of,
+    patch_ages_ns,
+    patch_state_name,
+    rate_now_hz,
+    status_now,
+)
 from skinware.driver_service import KIND, DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.memory.statistics import WriterStatistics
+from skinware.memory.statistics import Histogram, WriterStatistics
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 
 FrameT = TypeVar("FrameT", bound=Frame)
@@ -118,11 +127,11 @@ def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
         name: {"count": s.count, "best_ns": s.best_ns, "mean_ns": round(s.mean_ns), "worst_ns": s.worst_ns}
         for name, s in (("wall", of.wall), ("cpu", of.cpu))
     }
-    histograms = {
-        name: {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
-        for name, h in (("age", of.age), ("lateness", of.lateness))
-    }
-    return spreads | histograms
+    return spreads | {"age": _histogram(of.age), "lateness": _histogram(of.lateness)}
+
+
+def _histogram(h: Histogram) -> dict[str, Any]:
+    return {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
 
 
 def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
@@ -159,12 +168,18 @@ def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[st
 def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, Any]]:
     if frame is None:
         return [{"name": name, "state": None} for name in driver.structure.buses]
-    return [
-        _with_counters({"name": name, "state": bus_state_name(state)}, counters)
-        for name, state, counters in zip(
-            frame.structure.buses, frame.bus_state.tolist(), driver.bus_counters(frame), strict=True
-        )
-    ]
+    time_ns = now_ns()
+    entries = []
+    for bus, counters in enumerate(driver.bus_counters(frame)):
+        since_ns = int(frame.bus_since_ns[bus])
+        own = {
+            "name": frame.structure.buses[bus],
+            "state": bus_state_name(int(frame.bus_state[bus])),
+            "reason": bus_reason_name(int(frame.bus_reason[bus])),
+            "state_age_s": round((time_ns - since_ns) / NS_PER_S, 3) if since_ns else None,
+        }
+        entries.append(_with_counters(own, counters))
+    return entries
 
 
 def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list[dict[str, Any]]:
@@ -185,6 +200,8 @@ def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list
         entry["state"] = patch_state_name(int(frame.patch_state[patch]))
         entry["age_ms"] = None if age_ns is None else round(age_ns / 1e6, 3)
         entry["fresh"] = fresh[patch]
+        entry["interval"] = _histogram(Histogram(frame.patch_interval_counts[patch].tolist()))
+        entry["age"] = _histogram(Histogram(frame.patch_age_counts[patch].tolist()))
     return [
         _with_counters(entry, counters) for entry, counters in zip(entries, driver.patch_counters(frame), strict=True)
     ]

@@ -14,6 +14,7 @@ from skinware.cli._health import (
     STARTING,
     WITHOUT_NEWS,
     SkinHealth,
+    bus_reason_name,
     bus_state_name,
     patch_ages_ns,
     patch_state_name,
@@ -79,8 +80,10 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
     rows = [first]
     for bus, counters in enumerate(reader.bus_counters(frame)):
         state = bus_state_name(int(frame.bus_state[bus]))
+        reason = bus_reason_name(int(frame.bus_reason[bus]))
         lost, others = count_text(counters.get("lost")), counters_text(counters, besides=_OWN_COLUMNS)
-        cells = (f"  {structure.buses[bus]}", was + state, "", "", "", lost, "", others)
+        told = f"{reason.replace('_', '-')}  {others}".rstrip() if reason else others
+        cells = (f"  {structure.buses[bus]}", was + state, "", "", "", lost, "", told)
         rows.append(Row(RowKey(name, BUS, bus), cells, was + state, counters))
         rows += [patches[patch] for patch in np.flatnonzero(structure.patch_bus == bus).tolist()]
     return rows

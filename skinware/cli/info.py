@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
 
 _WATCH_PERIOD_S = 1.0
+_OF_A_BUS = {"reason": "reason", "for": "state_age_s"}
+"""What is shown of a bus where it is told: the column's title and the key in the report."""
+_OF_A_PATCH = {"99 % apart": "interval", "99 % aged": "age"}
+"""Likewise: bounds of the time between two updates of a module, and of an update's age when it was published."""
 _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
@@ -78,26 +82,30 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
+    told = {title: key for title, key in _OF_A_BUS.items() if any(bus.get(key) is not None for bus in driver["buses"])}
+    timed = _OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
+    timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     lines = [
         f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
         f"sensors: {', '.join(units)}",
         "",
         *_counter_table(
             driver["buses"],
-            ("bus", "state"),
-            lambda bus: (bus["name"], _state(driver, bus)),
+            ("bus", "state", *told),
+            lambda bus: (bus["name"], _state(driver, bus), *(_told_text(bus[key]) for key in told.values())),
             {"frames", "lost"},
         ),
         "",
         *_counter_table(
             driver["patch_list"],
-            ("patch", "bus", "state", "fresh sensors", "age"),
+            ("patch", "bus", "state", "fresh sensors", "age", *timed),
             lambda patch: (
                 patch["name"],
                 patch["bus"],
                 _state(driver, patch),
                 f"{count_text(patch['fresh'])} of {count_text(patch['sensors'])}",
                 age_text(None if patch["age_ms"] is None else patch["age_ms"] * 1e6),
+                *(_bound(patch[key]) for key in timed.values()),
             ),
             {"orphans"},
         ),
@@ -151,6 +159,13 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     return part["state"] if driver["state"] == "live" else f"was {part['state']}"
 
 
+def _told_text(value: str | float | None) -> str:
+    """A reason, or for how long it has been so."""
+    if value is None:
+        return NO_VALUE
+    return value.replace("_", "-") if isinstance(value, str) else age_text(value * 1e9)
+
+
 def _life_line(what: str, entry: dict[str, Any]) -> str:
     life, age = entry["state"], age_text(None if entry["age_ms"] is None else entry["age_ms"] * 1e6)
     parts = [click.style(life, fg=_LIFE_COLOURS.get(life), bold=True)]
@@ -168,7 +183,8 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
-_OWN_KEYS = {"name", "state", "bus", "age_ms", "modules", "sensors", "fresh"}
+_OWN_KEYS = {"name", "state", "reason", "state_age_s", "bus", "age_ms", "modules", "sensors", "fresh"}
+_OWN_KEYS |= set(_OF_A_PATCH.values())
 
 
 def _counter_table(

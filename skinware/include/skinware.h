@@ -107,6 +107,30 @@ typedef enum skinware_result {
 #define SKINWARE_STATUS_MASKED 32u        /* switched off by configuration */
 #define SKINWARE_STATUS_SUSPECT 64u       /* something happened that makes the value doubtful */
 
+/* What a bus is doing (column "bus_state" of a driver). Take a state that you do not know for "not live". */
+#define SKINWARE_BUS_CONNECTING 0u
+#define SKINWARE_BUS_LIVE 1u
+#define SKINWARE_BUS_SILENT 2u
+#define SKINWARE_BUS_DOWN 3u
+#define SKINWARE_BUS_GONE 4u
+
+/*
+ * Why (column "bus_reason", which a driver need not have; since when: "bus_since_ns", CLOCK_MONOTONIC ns). A live bus can
+ * have a reason too. Take a reason that you do not know for "something is wrong".
+ */
+#define SKINWARE_BUS_REASON_NONE 0u
+#define SKINWARE_BUS_REASON_NOTHING_HEARD 1u
+#define SKINWARE_BUS_REASON_INTERFACE_DOWN 2u
+#define SKINWARE_BUS_REASON_INTERFACE_GONE 3u
+#define SKINWARE_BUS_REASON_REFUSED 4u
+#define SKINWARE_BUS_REASON_FAILED 5u
+#define SKINWARE_BUS_REASON_BUS_OFF 6u
+#define SKINWARE_BUS_REASON_ERROR_PASSIVE 7u
+#define SKINWARE_BUS_REASON_ERROR_WARNING 8u
+#define SKINWARE_BUS_REASON_OVERFLOW 9u
+#define SKINWARE_BUS_REASON_NO_ACKNOWLEDGEMENT 10u
+#define SKINWARE_BUS_REASON_BUS_ERRORS 11u
+
 /* An attached service. */
 typedef struct skinware_reader skinware_reader;
 

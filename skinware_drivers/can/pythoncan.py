@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import threading
 from collections import deque
@@ -12,7 +13,10 @@ import can
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
+from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
+
+log = logging.getLogger("skinware.driver")
 
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
@@ -21,6 +25,9 @@ _NUMBERS = (int, float)
 
 class PythonCanBus(Bus):
     """A bus of one of python-can's interfaces (``slcan``, ``udp_multicast``, ``kvaser``, ``pcan`` ...).
+
+    What these interfaces and the libraries below them raise is not documented, and changes: whatever it is, the bus has
+    failed and is opened again.
 
     Frames are stamped when they arrive here, as most interfaces' own stamps are on no clock that we know. The options
     are those of the interface's class.
@@ -31,6 +38,7 @@ class PythonCanBus(Bus):
     """
 
     medium: ClassVar[str] = "can"
+    opens_slowly: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -49,12 +57,13 @@ class PythonCanBus(Bus):
         self._wake_fd = -1
         self._stop = threading.Event()
         self._failure: str | None = None
+        self._was_open = False
 
     def open(self) -> None:
         """Open the interface and start taking its messages.
 
         Raises:
-            ConfigurationError: the interface does not take one of the options.
+            ConfigurationError: the interface does not take one of the options (at the first time only).
             BusNotAvailable: the interface's library, adapter or channel is not there.
         """
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
@@ -62,10 +71,13 @@ class PythonCanBus(Bus):
             keywords.setdefault("fd", True)
         try:
             self._bus = can.Bus(interface=self.interface, channel=self.channel or None, **keywords)
-        except (TypeError, can.CanInterfaceNotImplementedError, ValueError) as error:
-            raise ConfigurationError(f"bus {self.interface}:{self.channel}: {error}") from None
-        except (can.CanError, OSError) as error:
-            raise BusNotAvailable(f"bus {self.interface}:{self.channel} cannot be opened: {error}") from None
+        except Exception as error:  # noqa: BLE001  (see the class)
+            is_refused = isinstance(error, TypeError | can.CanInterfaceNotImplementedError | ValueError)
+            if is_refused and not self._was_open:
+                raise ConfigurationError(f"bus {self.interface}:{self.channel}: {error}") from None
+            why = f"bus {self.interface}:{self.channel} cannot be opened: {error}"
+            raise BusNotAvailable(why, reason=BusReason.FAILED) from None
+        self._was_open = True
         self._failure = None
         self._stop.clear()
         self._queue.clear()
@@ -94,7 +106,8 @@ class PythonCanBus(Bus):
         if self._queue:
             os.eventfd_write(self._wake_fd, 1)
         elif self._failure is not None and not count:
-            raise BusNotAvailable(f"bus {self.interface}:{self.channel} failed: {self._failure}")
+            why = f"bus {self.interface}:{self.channel} failed: {self._failure}"
+            raise BusNotAvailable(why, reason=BusReason.FAILED)
         self.counters.frames += count
         return count
 
@@ -112,7 +125,7 @@ class PythonCanBus(Bus):
         )
         try:
             self._bus.send(message, timeout=0)
-        except (can.CanError, OSError) as error:
+        except Exception as error:  # noqa: BLE001  (see the class)
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error})") from None
         self.counters.sent += 1
@@ -124,7 +137,10 @@ class PythonCanBus(Bus):
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
-        self._bus.shutdown()
+        try:
+            self._bus.shutdown()
+        except Exception as error:  # noqa: BLE001  (see the class)
+            log.debug("bus %s: %s", self.channel, error)
         self._bus = None
         os.close(self._wake_fd)
         self._wake_fd = -1
@@ -134,8 +150,8 @@ class PythonCanBus(Bus):
         while bus is not None and not self._stop.is_set():
             try:
                 message = bus.recv(_POLL_S)
-            except (can.CanError, OSError, ValueError) as error:
-                self._failure = str(error)
+            except Exception as error:  # noqa: BLE001  (see the class)
+                self._failure = str(error) or type(error).__name__
                 os.eventfd_write(self._wake_fd, 1)
                 return
             if message is None:

@@ -296,7 +296,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
     def _tell_what_is_odd(self, link: Link) -> None:
         """Name the triangles that stay off, and boards that are not what the options say."""
         for set_up in self._set_ups(self._boards):
-            where = f"{link.bus_name}: board {set_up.board}"
+            where = f"{link.bus_name or 'bus'}: board {set_up.board}"
             off = set(range(TRIANGLES)) - set_up.enabled
             if set_up.wiped:
                 log.warning(

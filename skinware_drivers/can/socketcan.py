@@ -12,57 +12,52 @@ import fcntl
 import os
 import socket
 import struct
-import time
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import now_ns
+from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
+from skinware_drivers.can.interface import read_controller
+from skinware_drivers.can.recvmmsg import Rows
+from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
+from skinware_drivers.options import options_from_strings
 
-# linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/net_tstamp.h, linux/sockios.h; CPython lacks the names
+# linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
 _SOL_CAN_RAW = 101
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
-_SO_TIMESTAMPNS = 35
 _SO_MEMINFO = 55
 _MEMINFO_DROPS = 8
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
+_AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
-_CONTROL_WORDS = 4  # cmsghdr (2 words), then a timespec
 WANTED_BUFFER_BYTES = 8 << 20
 """Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
 
-_MMSGHDR = np.dtype(
-    [
-        ("name", np.uint64),
-        ("name_length", np.uint64),
-        ("iov", np.uint64),
-        ("iov_count", np.uint64),
-        ("control", np.uint64),
-        ("control_length", np.uint64),
-        ("flags", np.uint64),
-        ("length", np.uint64),
-    ]
-)
-"""``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
-_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
 
-_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
-_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
-_recvmmsg.restype = ctypes.c_int
+class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What can be said behind a CAN interface's name: ``can0?buffer=100000``."""
+
+    buffer: Annotated[int, msgspec.Meta(description="receive buffer, bytes", ge=1)] = WANTED_BUFFER_BYTES
+    timestamps: Annotated[
+        Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
+    ] = "auto"
 
 
 class SocketCanBus(Bus):
     """A CAN interface of the kernel (``can0``, ``vcan0``, ``slcan0``).
 
-    Options: ``buffer``: receive buffer in bytes, default 8 MiB. The bit rate is set where the interface is set up
-    (``ip link set can0 type can bitrate 1000000``).
+    Options: :class:`SocketCanOptions`. The bit rate is set where the interface is set up (``ip link set can0 type can
+    bitrate 1000000``).
     """
 
     medium: ClassVar[str] = "can"
@@ -76,18 +71,18 @@ class SocketCanBus(Bus):
         listen_only: bool = False,
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        unknown = set(self.options) - {"buffer"}
-        if unknown:
-            raise ConfigurationError(f"bus {channel}: unknown option {sorted(unknown)[0]!r}. Known: buffer")
         try:
-            self._wanted_buffer = int(self.options.get("buffer", WANTED_BUFFER_BYTES))
-        except ValueError:
-            raise ConfigurationError(f"bus {channel}: buffer={self.options['buffer']} is no number of bytes") from None
+            self._wanted = options_from_strings(SocketCanOptions, self.options)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"bus {channel}: {error}") from None
         self._socket: socket.socket | None = None
         self._lost_before = 0
         self.granted_buffer = 0
-        self._last_poll_ns = 0
-        self._rows = _Rows(FrameBatch(1, payload_size))
+        self._stamper = Stamper()
+        self._rows = Rows(FrameBatch(1, payload_size))
+        self._health = ControllerHealth()
+        self._is_bound = False
+        self._restarts_itself = True
 
     def open(self) -> None:
         """Open and bind the socket.
@@ -104,8 +99,8 @@ class SocketCanBus(Bus):
                 ) from None
             raise BusNotAvailable(f"bus {self.channel}: cannot open a CAN socket ({error.strerror})") from None
         try:
-            if self.payload_size > 8:
-                sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
+            # also where the layout has none: that there are FD frames on the bus explains why no others are heard
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
             sock.bind((self.channel,))
             if not _is_up(sock, self.channel):
@@ -114,32 +109,62 @@ class SocketCanBus(Bus):
                 )
         except OSError as error:
             sock.close()
-            raise BusNotAvailable(_why_not_bound(self.channel, error)) from None
+            raise _why_not_bound(self.channel, error) from None
         except BusNotAvailable:
             sock.close()
             raise
         self.adopt(sock)
+        self._is_bound = True
+        self._health.reset()
+        self._ask_kernel()
 
     def adopt(self, sock: socket.socket) -> None:
         """Receive from an open socket whose datagrams are ``struct can_frame`` (or canfd_frame)."""
-        self.granted_buffer = _enlarge_buffer(sock, self._wanted_buffer)
-        # not SO_TIMESTAMPING: that costs 20 ns a frame more, and leaves frames unstamped that came before the kernel
-        # began to stamp (in the background)
-        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self.granted_buffer = _enlarge_buffer(sock, self._wanted.buffer)
+        wants_hardware = self._wanted.timestamps != "software"
+        self._stamper = Stamper(wants_hardware and has_hardware_stamps(sock, self.channel))
+        self._stamper.switch_on(sock)
         sock.setblocking(False)
         self._socket = sock
         self._lost_before = self.counters.lost
-        self._last_poll_ns = now_ns()
 
     @property
     def note(self) -> str:
-        """A receive buffer that is smaller than was asked for, and what to do about it."""
-        if not self._socket or self.granted_buffer >= self._wanted_buffer:
-            return ""
-        return (
-            f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted_buffer} wanted;"
-            f" for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted_buffer}"
-        )
+        """A receive buffer that is smaller than was asked for, a controller that stays off; and what to do about it."""
+        notes = []
+        if self._socket and self.granted_buffer < self._wanted.buffer:
+            notes.append(
+                f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted.buffer}"
+                f" wanted; for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted.buffer}"
+            )
+        if self._socket and self._wanted.timestamps == "hardware" and not self._stamper.hardware:
+            notes.append(f"bus {self.channel}: its controller gives no time stamps; the kernel's are taken instead")
+        if not self._restarts_itself:
+            notes.append(
+                f"bus {self.channel}: its controller will not come back from bus-off by itself; to let it:"
+                f" ip link set {self.channel} down; ip link set {self.channel} type can restart-ms 100;"
+                f" ip link set {self.channel} up"
+            )
+        return "\n".join(notes)
+
+    def check(self) -> None:
+        """Ask the kernel for the interface's and its controller's state; see :class:`skinware_drivers.bus.Bus`."""
+        if self._socket is None or not self._is_bound:
+            return
+        name = str(self._socket.getsockname()[0])
+        if not name:
+            raise BusNotAvailable(f"bus {self.channel} vanished")
+        try:
+            is_up = _is_up(self._socket, name)
+        except OSError as error:
+            raise BusNotAvailable(f"bus {self.channel} vanished ({error.strerror})") from None
+        if not is_up:
+            raise BusNotAvailable(f"bus {self.channel} went down", is_down=True)
+        self._ask_kernel()
+
+    def reason(self, time_ns: int) -> BusReason:
+        """What the controller tells is wrong."""
+        return self._health.reason(time_ns)
 
     def fileno(self) -> int:
         """The socket, -1 while closed."""
@@ -152,16 +177,19 @@ class SocketCanBus(Bus):
         if not batch.free:
             return 0
         if self._rows.batch is not batch:
-            self._rows = _Rows(batch)
+            self._rows = Rows(batch)
         first = batch.stop
         count = self._rows.receive(self._socket.fileno())
         if count < 0:
             return self._nothing_received(ctypes.get_errno())
-        batch.time_ns[first : first + count] = self._stamps(self._rows.control[first : first + count])
+        batch.time_ns[first : first + count] = self._stamper.read(self._rows.control[first : first + count])
+        if self._stamper.hardware:
+            self._rows.forget(slice(first, first + count))
         batch.bus[first : first + count] = ordinal
         kept = self._sort_out(batch, first, count)
         batch.stop += kept
         self.counters.frames += kept
+        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         self.counters.lost = self._lost_before + self._kernel_drops()
         return kept
 
@@ -185,77 +213,62 @@ class SocketCanBus(Bus):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+            self._is_bound = False
+
+    def _ask_kernel(self) -> None:
+        """Learn what error frames may not have told."""
+        controller = read_controller(self.channel)
+        if controller is None:
+            return
+        self._restarts_itself = controller.restart_ms > 0
+        if controller.state is not None and controller.state < len(CONTROLLER_STATES):
+            self._health.believe(CONTROLLER_STATES[controller.state])
 
     def _nothing_received(self, number: int) -> int:
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:
             raise BusNotAvailable(f"bus {self.channel} went down", is_down=True)
-        raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})")
-
-    def _stamps(self, control: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Kernel stamps on our clock: CLOCK_REALTIME with an offset sampled now, so that clock steps do no harm."""
-        poll_ns = now_ns()
-        offset_ns = poll_ns - time.time_ns()
-        stamps = control[:, 2] * NS_PER_S + control[:, 3] + offset_ns
-        np.maximum(stamps, self._last_poll_ns, out=stamps)
-        np.minimum(stamps, poll_ns, out=stamps)
-        # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
-        self._last_poll_ns = min(int(stamps[-1]), poll_ns)
-        return stamps
+        reason = BusReason.INTERFACE_GONE if number in _AWAY else BusReason.FAILED
+        raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
     def _sort_out(self, batch: FrameBatch, first: int, count: int) -> int:
-        """Take error and remote frames out of the new rows; returns how many are left."""
+        """Take what is no data frame of this layout out of the new rows; returns how many are left."""
         rows = slice(first, first + count)
-        identifier = batch.wire["identifier"][rows]
+        identifier, length = batch.wire["identifier"][rows], batch.wire["length"][rows]
         flags = np.uint32(ERROR_FLAG | REMOTE_FLAG)
-        if not np.bitwise_or.reduce(identifier) & flags:
+        if not np.bitwise_or.reduce(identifier) & flags and not self._rows.any_cut(rows):
+            self._health.heard_data()
             return count
-        special = identifier & flags
-        is_error = (special & np.uint32(ERROR_FLAG)) != 0
-        self.counters.error_frames += int(is_error.sum())
-        self.counters.refused += int(((special != 0) & ~is_error).sum())
-        good = first + np.flatnonzero(special == 0)
+        is_error = (identifier & np.uint32(ERROR_FLAG)) != 0
+        other = ((identifier & np.uint32(REMOTE_FLAG)) != 0) | (length > batch.payload_size) | self._rows.cut(rows)
+        other &= ~is_error
+        self.counters.error_frames += int(np.count_nonzero(is_error))
+        self.counters.refused += int(np.count_nonzero(other))
+        good = np.flatnonzero(~(is_error | other))
+        self._take_errors(np.flatnonzero(is_error), good, identifier, batch.wire["payload"][rows])
+        good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]
         return len(good)
+
+    def _take_errors(
+        self,
+        errors: npt.NDArray[np.int64],
+        good: npt.NDArray[np.int64],
+        identifier: npt.NDArray[np.uint32],
+        payload: npt.NDArray[np.uint8],
+    ) -> None:
+        if len(errors):
+            self._health.take(identifier[errors], payload[errors], now_ns())
+        if len(good) and (not len(errors) or good[-1] > errors[-1]):
+            self._health.heard_data()
 
     def _kernel_drops(self) -> int:
         if self._socket is None:
             return 0
         words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
         return words[_MEMINFO_DROPS]
-
-
-class _Rows:
-    """What ``recvmmsg`` needs to put frames straight into the rows of one batch, made once.
-
-    Attributes:
-        batch: the batch.
-        control: (capacity, 4) int64, ancillary data of each row.
-    """
-
-    def __init__(self, batch: FrameBatch) -> None:
-        capacity, rows = batch.capacity, np.arange(batch.capacity)
-        self.batch = batch
-        self.control = np.zeros((capacity, _CONTROL_WORDS), np.int64)
-        self._iov = np.zeros(capacity, _IOVEC)
-        self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
-        self._iov["length"] = batch.wire.strides[0]
-        self._headers = np.zeros(capacity, _MMSGHDR)
-        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * rows
-        self._headers["iov_count"] = 1
-        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
-        self._control_length = self._headers["control_length"]
-        self._address = self._headers.ctypes.data
-
-    def receive(self, fd: int) -> int:
-        """Fill the free rows of the batch; returns how many were filled, -1 on an error (errno)."""
-        first, free = self.batch.stop, self.batch.free
-        self._control_length[first:] = 8 * _CONTROL_WORDS  # the kernel wrote what it used
-        address = self._address + _MMSGHDR.itemsize * first
-        count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
-        return count
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:
@@ -273,10 +286,11 @@ def _is_up(sock: socket.socket, interface: str) -> bool:
     return bool(flags & _IFF_UP)
 
 
-def _why_not_bound(interface: str, error: OSError) -> str:
+def _why_not_bound(interface: str, error: OSError) -> BusNotAvailable:
     if error.errno == errno.ENODEV:
         others = ", ".join(name for _, name in socket.if_nameindex() if "can" in name) or "none"
-        return f"there is no CAN interface {interface!r}; CAN interfaces here: {others} (see: ip link)"
+        return BusNotAvailable(f"there is no CAN interface {interface!r}; CAN interfaces here: {others} (see: ip link)")
     if error.errno in (errno.EPERM, errno.EACCES):
-        return f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
-    return f"bus {interface}: cannot be opened ({error.strerror})"
+        why = f"bus {interface}: not permitted ({error.strerror}); ask for access to the interface"
+        return BusNotAvailable(why, reason=BusReason.REFUSED)
+    return BusNotAvailable(f"bus {interface}: cannot be opened ({error.strerror})", reason=BusReason.FAILED)

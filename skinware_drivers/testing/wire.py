@@ -97,6 +97,8 @@ class Interference:
         frames: frames that came through, since the devices have power.
         foreign_sent: frames of other devices among them.
         sent: what the driver sent to the devices.
+        remember: whether to write that down.
+        identifiers: of what came through, with how often.
     """
 
     hardware: EmulatedHardware
@@ -109,6 +111,7 @@ class Interference:
     frames: int = 0
     foreign_sent: int = 0
     sent: list[tuple[int, bytes]] = field(default_factory=list)
+    remember: bool = True
     identifiers: dict[int, int] = field(default_factory=dict)
     _random: random.Random = field(default_factory=lambda: random.Random(1))
     _next_ns: int = 0
@@ -116,7 +119,8 @@ class Interference:
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """What the driver sends."""
-        self.sent.append((identifier, payload))
+        if self.remember:
+            self.sent.append((identifier, payload))
         if not self.silent:
             self.hardware.receive(identifier, payload, now_ns)
 

@@ -68,6 +68,10 @@ class FakeSkin:
         self.status = np.zeros(self.structure.n_sensors, np.uint8)
         self.patch_state = np.full(self.structure.n_patches, int(PatchState.LIVE), np.uint8)
         self.bus_state = np.full(len(self.structure.buses), int(BusState.LIVE), np.uint8)
+        self.bus_reason = np.zeros(len(self.structure.buses), np.uint8)
+        self.bus_since_ns = np.zeros(len(self.structure.buses), np.int64)
+        self.interval_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
+        self.age_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
         self.bus_counters = np.zeros((len(self.structure.buses), len(BUS_COUNTERS)), np.uint64)
         self.patch_counters = np.zeros((self.structure.n_patches, len(PATCH_COUNTERS)), np.uint64)
         self.writer = DriverWriter(
@@ -88,6 +92,10 @@ class FakeSkin:
             columns["module_time_ns"][:] = time.monotonic_ns()
             columns["patch_state"][:] = self.patch_state
             columns["bus_state"][:] = self.bus_state
+            columns["bus_reason"][:] = self.bus_reason
+            columns["bus_since_ns"][:] = self.bus_since_ns
+            columns["patch_interval_counts"][:] = self.interval_counts.ravel()
+            columns["patch_age_counts"][:] = self.age_counts.ravel()
             columns["bus_counters"][:] = self.bus_counters.ravel()
             columns["patch_counters"][:] = self.patch_counters.ravel()
             self.writer.commit(time.monotonic_ns())

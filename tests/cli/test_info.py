@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import Column, DriverReader, Namespace, ServiceWriter
+from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter
 from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
@@ -20,6 +20,9 @@ from skinware.realtime import now_ns
 from skinware.service import Columns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
+
+UNTOLD = {"reason": None, "state_age_s": None}
+"""What a driver need not tell of a bus."""
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
@@ -56,8 +59,8 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert driver["age_ms"] >= 0
     assert driver["rate_hz"] > 0
     assert driver["buses"] == [
-        {"name": "can0", "state": "live", "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
-        {"name": "can1", "state": "live", "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
+        {"name": "can0", "state": "live", **UNTOLD, "frames": 5156, "lost": 2, "errors": 0, "unknown": 7},
+        {"name": "can1", "state": "live", **UNTOLD, "frames": 0, "lost": 0, "errors": 0, "unknown": 0},
     ]
     (record,) = driver["readers"]
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
@@ -70,6 +73,8 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert (driver["state"], driver["driver_type"], driver["dtype"]) == ("live", "fake", "uint8")
     assert (driver["paused"], driver["missed_periods"]) == (False, 0)
     first, second = driver["patch_list"]
+    for times in (first.pop("interval"), first.pop("age")):
+        assert times == {"p50_ns": None, "p99_ns": None, "counts": [0] * 32}  # this driver does not tell
     assert first.pop("age_ms") >= 0
     assert first == {
         "name": "board 7",
@@ -82,6 +87,35 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
         "updates": 640,
     }
     assert (second["bus"], second["state"], second["fresh"]) == ("can1", "stale", 0)
+
+
+def test_why_a_bus_is_as_it_is_and_for_how_long(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin:
+        skin.bus_state[:] = BusState.DOWN, BusState.LIVE
+        skin.bus_reason[:] = BusReason.BUS_OFF, 99  # 99: of a later version
+        skin.bus_since_ns[:] = now_ns() - 12 * 10**9, 0
+        skin.publish()
+        first, second = told(capsys)["drivers"][0]["buses"]
+        out = text(capsys)
+    assert (first["state"], first["reason"], second["reason"], second["state_age_s"]) == ("down", "bus_off", "99", None)
+    assert 12 <= first["state_age_s"] < 60
+    assert re.search(r"^  bus   state  reason +for  frames", out, re.MULTILINE)
+    assert re.search(r"^  can0  down   bus-off  1\d\.\d s ", out, re.MULTILINE)
+    assert re.search(r"^  can1  live   99 +-  ", out, re.MULTILINE)
+
+
+def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4)) as skin:
+        skin.interval_counts[0, 25] = skin.age_counts[:, 21] = 100  # 16.8 to 33.6 ms; 1.05 to 2.1 ms
+        skin.publish()
+        first, second = told(capsys)["drivers"][0]["patch_list"]
+        out = text(capsys)
+    assert (first["interval"]["p99_ns"], first["age"]["p50_ns"]) == (2**25 - 1, 2**21 - 1)
+    assert second["interval"]["p99_ns"] is None
+    assert first["interval"]["counts"][25] == 100
+    assert re.search(r"age  99 % apart  99 % aged", out)
+    assert re.search(r"board 7 .*ms +34 ms +2.1 ms", out)
+    assert re.search(r"board 8 .*ms +- +2.1 ms", out)
 
 
 def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
+import os
+import pty
 import socket
 import struct
+import termios
+import tty
+from collections.abc import Iterator
 
 import can
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.errors import BusNotAvailable, BusSendError
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.pythoncan import PythonCanBus
@@ -164,3 +171,80 @@ def test_an_interface_of_python_can_that_fails_is_told(monkeypatch: pytest.Monke
     with pytest.raises(BusNotAvailable, match="bus virtual:test-failing failed: unplugged"):
         wait_until(lambda: bus.receive(FrameBatch(10), 0) > 0)
     bus.close()
+
+
+class Sick(can.BusABC):
+    """An interface whose adapter was pulled out: everything raises whatever its library likes."""
+
+    failing = False
+
+    def __init__(self, channel: str, **_options: object) -> None:
+        if self.failing:
+            raise ValueError("no such adapter")
+        super().__init__(channel)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self.failing:
+            raise AttributeError("'NoneType' object has no attribute 'read'")
+        return None, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Refuse."""
+        raise KeyError(msg.arbitration_id, timeout)
+
+    def shutdown(self) -> None:
+        """Refuse."""
+        super().shutdown()
+        raise termios.error(5, "Input/output error")
+
+
+def test_whatever_an_interface_of_python_can_raises_the_bus_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", lambda **options: Sick(options["channel"]))
+    bus = PythonCanBus("sick", "1")
+    bus.open()
+    with pytest.raises(BusSendError, match="519"):
+        bus.send(0x207, b"")
+    monkeypatch.setattr(Sick, "failing", True)
+    with pytest.raises(BusNotAvailable, match="NoneType") as caught:
+        wait_until(lambda: bus.receive(FrameBatch(10), 0) > 0)
+    assert caught.value.reason == BusReason.FAILED
+    bus.close()
+    with pytest.raises(BusNotAvailable, match="no such adapter"):  # at first it would have been a wrong option
+        bus.open()
+    with pytest.raises(ConfigurationError, match="no such adapter"):
+        PythonCanBus("sick", "2").open()
+
+
+@pytest.fixture
+def adapter_port() -> Iterator[tuple[int, str]]:
+    """An slcan adapter's end of a pty, and the path of the other."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    yield ours, os.ttyname(theirs)
+    for descriptor in (ours, theirs):
+        with contextlib.suppress(OSError):
+            os.close(descriptor)
+
+
+def failure(bus: PythonCanBus) -> BusNotAvailable:
+    with pytest.raises(BusNotAvailable, match="failed: ") as caught:
+        wait_until(lambda: bus.receive(FrameBatch(10), 0) > 0)
+    bus.close()
+    return caught.value
+
+
+def test_an_slcan_adapter_that_sends_garbage_and_is_unplugged(adapter_port: tuple[int, str]) -> None:
+    ours, path = adapter_port
+    bus = PythonCanBus("slcan", path, {"sleep_after_open": "0"})
+    bus.open()
+    os.write(ours, b"\xff\x00garbage\r")
+    assert failure(bus).reason == BusReason.FAILED  # python-can cannot go on after it
+    bus.open()
+    batch = FrameBatch(10)
+    os.write(ours, b"t47384000102030405060\r")
+    wait_until(lambda: bus.receive(batch, 0) >= 0 and len(batch) > 0)
+    assert batch.wire["identifier"][0] == 0x473
+    os.close(ours)
+    assert failure(bus).reason == BusReason.FAILED
+    with pytest.raises(BusNotAvailable):
+        bus.open()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
+import time
 
 import msgspec
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
 from skinware.errors import NameInUse
+from skinware_drivers import runner
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles
@@ -18,6 +21,50 @@ from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
 from tests.conftest import wait_until
 from tests.sdk.driving import LateBoards, Together, commands, driving, emulated, hardware_of, read_until
+
+
+class Flood(VirtualCanBus):
+    """A bus on which more foreign frames wait, always, than a batch holds."""
+
+    flooding = False
+    _always_readable = -1
+
+    def open(self) -> None:
+        super().open()
+        self._always_readable = os.eventfd(1)
+
+    def fileno(self) -> int:
+        return self._always_readable
+
+    def close(self) -> None:
+        super().close()
+        if self._always_readable >= 0:
+            os.close(self._always_readable)
+            self._always_readable = -1
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        count = super().receive(batch, ordinal)
+        while self.flooding and batch.free:
+            batch.append(ordinal, time.monotonic_ns(), 0x7F1, b"")
+            count += 1
+            self.counters.frames += 1
+        return count
+
+
+@pytest.mark.usefixtures("hurry")
+def test_a_flood_on_one_bus_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "_BATCH_FRAMES", 128)
+    hardware = EmulatedRoboskin(EmulatorOptions(boards=(7,)))
+    flood = Flood.with_hardware(hardware)
+    others = [emulated(boards=(board,), pattern="idle") for board in (8, 9)]
+    with driving(flood, *others) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        running.do(lambda: setattr(flood, "flooding", True))
+        flooded = flood.counters.frames
+        first = read_until(reader, lambda f: reader.bus_counters(f)[0]["frames"] > flooded + 10_000)
+        last = read_until(reader, lambda f: bool((f.module_time_ns > first.module_time_ns + 10**9).all()))
+        assert last.patch_state.tolist() == [PatchState.LIVE] * 3
+        running.do(lambda: setattr(flood, "flooding", False))
 
 
 def test_boards_are_set_up_in_the_real_order_with_the_real_waits() -> None:

@@ -15,12 +15,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from skinware.errors import BusNotAvailable, BusSendError
+from skinware import BusReason
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can import socketcan
+from skinware_drivers.can import recvmmsg, socketcan
 from skinware_drivers.can.socketcan import SocketCanBus
+from tests.conftest import wait_until
 
 SO_RCVBUFFORCE = 33
+SO_TIMESTAMPNS = 35
 RMEM_MAX = "/proc/sys/net/core/rmem_max"
 
 
@@ -52,6 +55,25 @@ class Cable:
     def close(self) -> None:
         self.end.close()
         self.out.close()
+
+
+@pytest.fixture(autouse=True)
+def stamping() -> Iterator[None]:
+    """The kernel begins to stamp a while after the first socket has asked for it, and goes on as long as one does."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", 0))
+        end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+
+        def is_stamped_at_once() -> bool:
+            end.sendto(b"", end.getsockname())
+            sent_ns = time.time_ns()
+            pass_ms(5)
+            _, ((_, _, stamp),), _, _ = end.recvmsg(10, 100)
+            seconds, nanoseconds = struct.unpack("=qq", stamp)
+            return bool(seconds * 10**9 + nanoseconds < sent_ns + 2_000_000)
+
+        wait_until(is_stamped_at_once)
+        yield
 
 
 @pytest.fixture
@@ -193,25 +215,71 @@ def test_stamps_tell_when_a_frame_arrived_not_when_it_was_fetched(cable: Cable) 
     assert np.all(np.diff(stamps) >= 0)
 
 
-@pytest.mark.parametrize("step_s", [3600, -3600])
-def test_a_step_of_the_wall_clock_bends_no_stamp_for_long(
-    cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: int
-) -> None:
+@pytest.mark.parametrize("step_s", [3600, -3600, 0.5, -0.5])
+def test_a_step_of_the_wall_clock_bends_no_stamp(cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: float) -> None:
     bus = SocketCanBus("can0")
-    opened_ns = time.monotonic_ns()
     bus.adopt(cable.end)
-    real = time.time_ns
-    monkeypatch.setattr(time, "time_ns", lambda: real() + step_s * 10**9)
+    batch = FrameBatch(10)
+    real, bounds = time.time_ns, []
+    for number in range(4):  # the clock is set to and fro, each time when a frame has been stamped and not yet fetched
+        pass_ms(5)
+        before_ns = time.monotonic_ns()
+        cable.put(0x123)
+        bounds.append((before_ns, time.monotonic_ns()))
+        pass_ms(20)
+        step_ns = round(step_s * 1e9) * (number % 2 == 0)
+        monkeypatch.setattr(time, "time_ns", lambda step_ns=step_ns: real() + step_ns)
+        # what is fetched now was stamped by a clock that was set since then
+        drain(bus, batch)
+    slack_ns = 2_000_000  # two clocks are read one after the other
+    for (before_ns, after_ns), stamp in zip(bounds, batch.time_ns[:4].tolist(), strict=True):
+        assert before_ns - slack_ns <= stamp <= after_ns + slack_ns
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ({"buffer": "big"}, "bus can0: option buffer=big: "),
+        ({"buffer": "0"}, "bus can0: option buffer=0: "),
+        ({"timestamps": "best"}, "bus can0: option timestamps=best: "),
+        ({"bufer": "1"}, "bus can0: unknown option 'bufer'; did you mean 'buffer'?"),
+    ],
+)
+def test_options_that_are_wrong_are_refused(query: dict[str, str], words: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        SocketCanBus("can0", query)
+    assert str(caught.value).startswith(words)
+
+
+def test_an_interface_without_stamps_of_its_own_says_so_where_they_were_asked_for(cable: Cable) -> None:
+    bus = SocketCanBus("lo", {"timestamps": "hardware", "buffer": "20000"})
+    bus.adopt(cable.end)
+    assert bus.note == "bus lo: its controller gives no time stamps; the kernel's are taken instead"
     cable.put(0x123)
     batch = FrameBatch(10)
     drain(bus, batch)
-    assert opened_ns <= batch.time_ns[0] <= time.monotonic_ns()
-    monkeypatch.setattr(time, "time_ns", real)
-    cable.put(0x123)
-    sent_ns = time.monotonic_ns()
-    pass_ms(20)
-    drain(bus, batch)
-    assert batch.time_ns[1] <= sent_ns + 5_000_000  # not clipped to the moment of the poll
+    assert batch.time_ns[0] > 0
+
+
+def test_stamping_with_hardware_takes_the_kernels_where_there_are_no_others(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socketcan, "has_hardware_stamps", lambda *_: True)
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch = FrameBatch(100)
+    for _ in range(3):
+        pass_ms(10)
+        before_ns = time.monotonic_ns()
+        for _ in range(10):
+            cable.put(0x123)
+        after_ns = time.monotonic_ns()
+        pass_ms(10)
+        first = batch.stop
+        drain(bus, batch)
+        stamps = batch.time_ns[first : batch.stop]
+        assert before_ns - 5_000_000 <= stamps.min()
+        assert stamps.max() <= after_ns + 5_000_000
 
 
 # What is no data
@@ -231,6 +299,72 @@ def test_error_and_remote_frames_are_counted_and_kept_out(cable: Cable) -> None:
     assert (bus.counters.frames, bus.counters.error_frames, bus.counters.refused) == (3, 2, 1)
 
 
+def test_fd_frames_on_a_classic_layout_are_counted_whatever_their_length(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    for identifier, length in ((0x111, 64), (0x222, 3), (0x333, 12)):
+        cable.out.send(struct.pack("=IBB2x64s", identifier, length, 4, bytes(range(64))))
+    cable.put(0x444)
+    batch = FrameBatch(10)
+    drain(bus, batch)
+    assert batch.wire["identifier"][: len(batch)].tolist() == [0x444]
+    assert (bus.counters.frames, bus.counters.refused, bus.counters.error_frames) == (1, 3, 0)
+
+
+def test_fd_frames_are_data_of_a_layout_that_has_some(cable: Cable) -> None:
+    bus = SocketCanBus("can0", payload_size=64)
+    bus.adopt(cable.end)
+    cable.out.send(struct.pack("=IBB2x64s", 0x111, 64, 4, bytes(range(64))))
+    cable.put(0x222)
+    batch = FrameBatch(10, 64)
+    drain(bus, batch)
+    assert batch.wire["identifier"][: len(batch)].tolist() == [0x111, 0x222]
+    assert batch.wire["payload"][0].tolist() == list(range(64))
+    assert bus.counters.refused == 0
+
+
+PASSIVE, OFF = "0010000000000000", "00" * 8
+
+
+def test_what_the_controller_says_is_known_and_counted(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch = FrameBatch(10)
+    cable.put(0x111)
+    cable.put(ERROR_FLAG | 0x4, bytes.fromhex(PASSIVE))
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.ERROR_PASSIVE
+    cable.put(0x111)
+    cable.put(ERROR_FLAG | 0x40, bytes.fromhex(OFF))
+    drain(bus, batch)  # data before the error frame says nothing
+    assert bus.reason(time.monotonic_ns()) == BusReason.BUS_OFF
+    cable.put(0x111)
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.NONE
+    cable.put(ERROR_FLAG | 0x40, bytes.fromhex(OFF))
+    cable.put(0x111)
+    drain(bus, batch)
+    assert bus.reason(time.monotonic_ns()) == BusReason.NONE
+    assert (bus.counters.bus_offs, bus.counters.error_frames, bus.counters.frames) == (2, 3, 4)
+
+
+def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    batch, seen = FrameBatch(64), []
+    for number in range(20):
+        for _ in range(100):
+            cable.put(ERROR_FLAG | 0x8C, bytes.fromhex("0001040A00000000"))
+        cable.put(number)
+        while True:
+            batch.clear()
+            if not bus.receive(batch, 0) and not bus.counters.error_frames % 100:
+                break
+            seen += batch.wire["identifier"][: len(batch)].tolist()
+    assert seen == list(range(20))
+    assert (bus.counters.error_frames, bus.counters.overflows, bus.counters.lost) == (2000, 2000, 0)
+
+
 @pytest.mark.parametrize(
     ("number", "words", "is_down"),
     [(errno.ENETDOWN, "bus can0 went down", True), (errno.ENODEV, "bus can0 vanished", False)],
@@ -240,7 +374,7 @@ def test_an_interface_that_fails_says_how(
 ) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     with pytest.raises(BusNotAvailable, match=words) as caught:
         bus.receive(FrameBatch(10), 0)
     assert caught.value.is_down is is_down
@@ -250,7 +384,7 @@ def test_an_interface_that_fails_says_how(
 def test_nothing_to_receive_is_no_failure(cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(socketcan, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(recvmmsg, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
     assert bus.receive(FrameBatch(10), 0) == 0
 
 

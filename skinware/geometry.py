@@ -1,0 +1,233 @@
+"""Where sensors are: a file of its own beside a driver, keyed by (type, uid), in metres.
+
+The file is TOML. Sensors stand in groups that share a type and a frame::
+
+    format = "skinware-geometry"
+    version = 1
+
+    [[group]]
+    name = "torso, board 7, triangle 5"     # for people
+    type = "pressure"
+    frame = "chest"                         # whose axes the numbers are in
+    radius_m = 0.002                        # of each sensor; left out where nobody knows
+    uid = [0x70500, 0x70501]
+    position_m = [[0.01, 0.02, 0.03], [0.01, 0.03, 0.03]]
+    normal = [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]     # outwards, of length 1; may be left out
+
+``uid`` are those of the driver's structure. A sensor that the file does not have has no known place.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.structure import Structure
+
+FORMAT, VERSION = "skinware-geometry", 1
+
+_LENGTH_TOLERANCE = 0.02
+"""Of a normal: files give them with few digits."""
+
+Triple = tuple[float, float, float]
+
+
+class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Sensors of one type in one frame.
+
+    Attributes:
+        type: name of their sensor type.
+        frame: whose axes the numbers are in.
+        uid: of each sensor.
+        position_m: of each sensor, m.
+        normal: of each sensor, of length 1, outwards; None where it is not known.
+        radius_m: of each of them, m; None where it is not known.
+        name: for people.
+    """
+
+    type: str
+    frame: str
+    uid: tuple[Annotated[int, msgspec.Meta(ge=0)], ...]
+    position_m: tuple[Triple, ...]
+    normal: tuple[Triple, ...] | None = None
+    radius_m: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for what, rows in (("position_m", self.position_m), ("normal", self.normal)):
+            if rows is None:
+                continue
+            if len(rows) != len(self.uid):
+                raise ValueError(f"{len(self.uid)} uid, but {len(rows)} {what}")
+            if not np.isfinite(np.array(rows)).all():
+                raise ValueError(f"{what}: a number is not finite")
+        if self.normal:
+            length = np.linalg.norm(np.array(self.normal), axis=1)
+            wrong = np.flatnonzero(abs(length - 1) > _LENGTH_TOLERANCE)
+            if len(wrong):
+                row = int(wrong[0])
+                raise ValueError(f"normal {row} has the length {length[row]:.3g}, not 1")
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    format: str
+    version: int
+    group: tuple[GeometryGroup, ...] = ()
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Places of n sensors.
+
+    Attributes:
+        type_name: (n,) str, name of each sensor's type.
+        uid: (n,) uint64.
+        frame: (n,) str, whose axes the numbers are in; empty where the place is not known.
+        position_m: (n, 3) float64, m; NaN where it is not known.
+        normal: (n, 3) float64 of length 1; NaN where it is not known.
+        radius_m: (n,) float64, m; NaN where it is not known.
+    """
+
+    type_name: npt.NDArray[np.str_]
+    uid: npt.NDArray[np.uint64]
+    frame: npt.NDArray[np.str_]
+    position_m: npt.NDArray[np.float64]
+    normal: npt.NDArray[np.float64]
+    radius_m: npt.NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.uid)
+
+    @property
+    def known(self) -> npt.NDArray[np.bool_]:
+        """(n,) bool: the place is known."""
+        known: npt.NDArray[np.bool_] = np.isfinite(self.position_m[:, 0])
+        return known
+
+    def of(self, structure: Structure, type_name: str) -> Geometry:
+        """The places of a skin's sensors of one type, in the order of ``structure.index(type_name)``.
+
+        Raises:
+            StructureError: the skin has no such type.
+        """
+        uid = structure.sensor_uid[structure.index(type_name)]
+        rows = {int(u): row for row, u in enumerate(self.uid) if self.type_name[row] == type_name}
+        found = np.array([rows.get(int(u), -1) for u in uid], np.int64)
+        return self._take(found, type_name, uid)
+
+    def _take(self, rows: npt.NDArray[np.int64], type_name: str, uid: npt.NDArray[np.uint64]) -> Geometry:
+        """The places of ``rows``; -1: not known."""
+        n = len(rows)
+        taken = _empty(n)
+        known = rows >= 0
+        taken.type_name[:] = type_name
+        taken.uid[:] = uid
+        for column in ("position_m", "normal", "radius_m", "frame"):
+            getattr(taken, column)[known] = getattr(self, column)[rows[known]]
+        return taken
+
+
+def read_geometry(path: str | Path) -> Geometry:
+    """Read a geometry file.
+
+    Raises:
+        ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigurationError(f"{path}: not TOML: {error}") from None
+    return _from_data(data, str(path))
+
+
+def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
+    """The text of a geometry file.
+
+    Args:
+        groups: what is in it.
+        comment: lines for its head.
+    """
+    lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
+    for group in groups:
+        lines += ["", "[[group]]"]
+        lines += [f"{key} = {_string(getattr(group, key))}" for key in ("name", "type", "frame") if getattr(group, key)]
+        if group.radius_m is not None:
+            lines.append(f"radius_m = {group.radius_m!r}")
+        lines.append(f"uid = [{', '.join(f'{uid:#x}' for uid in group.uid)}]")
+        for key in ("position_m", "normal"):
+            rows = getattr(group, key)
+            if rows is not None:
+                lines.append(f"{key} = [")
+                lines += [f"  [{', '.join(repr(float(number)) for number in row)}]," for row in rows]
+                lines.append("]")
+    return "\n".join(lines) + "\n"
+
+
+def _from_data(data: dict[str, Any], where: str) -> Geometry:
+    if data.get("format") != FORMAT:
+        raise ConfigurationError(f'{where}: no geometry file: it does not say format = "{FORMAT}"')
+    if data.get("version") != VERSION:
+        raise ConfigurationError(f"{where}: version {data.get('version')}, this Skinware reads version {VERSION}")
+    try:
+        groups = msgspec.convert(data, _File).group
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"{where}: {str(error).replace('`', '')}") from None
+    return _joined(groups, where)
+
+
+def _joined(groups: Sequence[GeometryGroup], where: str) -> Geometry:
+    geometry = _empty(sum(len(group.uid) for group in groups))
+    known: dict[tuple[str, int], str] = {}
+    row = 0
+    for number, group in enumerate(groups):
+        name = group.name or f"group {number + 1}"
+        for uid in group.uid:
+            if uid >= 1 << 64:
+                raise ConfigurationError(f"{where}: {name}: uid {uid:#x} has more than 64 bits")
+            if (group.type, uid) in known:
+                raise ConfigurationError(
+                    f"{where}: {name}: {group.type} sensor {uid:#x} is also in {known[group.type, uid]}"
+                )
+            known[group.type, uid] = name
+        rows = slice(row, row + len(group.uid))
+        geometry.type_name[rows], geometry.frame[rows] = group.type, group.frame
+        geometry.uid[rows] = np.array(group.uid, np.uint64)
+        geometry.position_m[rows] = np.array(group.position_m).reshape(-1, 3)
+        if group.normal:
+            normal = np.array(group.normal)
+            geometry.normal[rows] = normal / np.linalg.norm(normal, axis=1)[:, None]
+        if group.radius_m is not None:
+            geometry.radius_m[rows] = group.radius_m
+        row = rows.stop
+    return geometry
+
+
+def _empty(n: int) -> Geometry:
+    nowhere = np.full((n, 3), np.nan)
+    return Geometry(
+        type_name=np.full(n, "", object),
+        uid=np.zeros(n, np.uint64),
+        frame=np.full(n, "", object),
+        position_m=nowhere.copy(),
+        normal=nowhere,
+        radius_m=np.full(n, np.nan),
+    )
+
+
+def _string(text: str) -> str:
+    """A TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
+    return msgspec.json.encode(text).decode().replace("\x7f", "\\u007f")
+
+
+__all__ = ["Geometry", "GeometryGroup", "geometry_to_toml", "read_geometry"]

@@ -1,0 +1,78 @@
+"""``recvmmsg``: all datagrams that have arrived, straight into the rows of a batch, with one system call."""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.bus import FrameBatch
+
+CONTROL_WORDS = 8
+"""8-byte words of ancillary data kept of each datagram: a header (2 words), then one ``timespec`` or three."""
+_MMSGHDR = np.dtype(
+    [
+        ("name", np.uint64),
+        ("name_length", np.uint64),
+        ("iov", np.uint64),
+        ("iov_count", np.uint64),
+        ("control", np.uint64),
+        ("control_length", np.uint64),
+        ("flags", np.uint64),
+        ("length", np.uint64),
+    ]
+)
+"""``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
+_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
+
+_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
+_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
+_recvmmsg.restype = ctypes.c_int
+
+
+class Rows:
+    """What ``recvmmsg`` needs to put frames straight into the rows of one batch, made once.
+
+    Attributes:
+        batch: the batch.
+        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, 0 or what was
+            left from before (see ``forget``).
+    """
+
+    def __init__(self, batch: FrameBatch) -> None:
+        capacity, rows = batch.capacity, np.arange(batch.capacity)
+        self.batch = batch
+        self.control = np.zeros((capacity, CONTROL_WORDS), np.int64)
+        self._iov = np.zeros(capacity, _IOVEC)
+        self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
+        self._iov["length"] = batch.wire.strides[0]
+        self._headers = np.zeros(capacity, _MMSGHDR)
+        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * rows
+        self._headers["iov_count"] = 1
+        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
+        self._control_length = self._headers["control_length"]
+        self._flags = self._headers["flags"]
+        self._address = self._headers.ctypes.data
+
+    def receive(self, fd: int) -> int:
+        """Fill the free rows of the batch; returns how many were filled, -1 on an error (errno)."""
+        first, free = self.batch.stop, self.batch.free
+        self._control_length[first:] = 8 * CONTROL_WORDS  # the kernel wrote what it used
+        address = self._address + _MMSGHDR.itemsize * first
+        count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
+        return count
+
+    def forget(self, rows: slice) -> None:
+        """Let no later frame be taken for having this ancillary data, where a frame can come without any."""
+        self.control[rows] = 0
+
+    def any_cut(self, rows: slice) -> bool:
+        """Whether one of these frames was longer than a row: an FD frame where the layout knows none."""
+        return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
+
+    def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which of them were."""
+        found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
+        return found

@@ -1,0 +1,161 @@
+"""``skin-import``: other systems' files into ours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run
+from skinware.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from skinware_drivers.icub.importer import Import, ImportedPart
+    from skinware_drivers.icub.notes import Note
+
+_HEADINGS = {
+    "todo": "To be filled in or decided",
+    "odd": "Understood, but look at it",
+    "unknown": "Not understood, left out",
+    "missing": "Not there",
+    "unused": "Understood, of no meaning for the driver",
+}
+
+
+@click.group("skin-import", context_settings=CONTEXT_SETTINGS)
+def command() -> None:
+    """Make configurations for skin-driver from the files of other systems."""
+
+
+@command.command(
+    "icub",
+    epilog=examples(
+        "skin-import icub iCubGenova02 -o skin             a whole robot: a configuration for each skin device",
+        "skin-import icub iCubGenova02 positions -o skin   with skinGui's positions: kinds of modules, and a geometry",
+        "skin-import icub torso.xml --bus 1=can0           one device, on stdout",
+    ),
+)
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path, exists=True))
+@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write files here.")
+@click.option("-f", "--force", is_flag=True, help="Write over files that are there.")
+@click.option("--part", "only", multiple=True, metavar="NAME", help="Only the skin device of this name; several.")
+@click.option("--bus", "buses", multiple=True, metavar="PATCH=NAME", help="Bus that a patch is wired to, as 1=can0.")
+@click.option("--positions", multiple=True, metavar="PART=FILE", help="Position file of a body part, where unclear.")
+@json_option
+@click.option("-v", "--verbose", is_flag=True, help="Also name what was understood, but has no meaning here.")
+def icub(
+    paths: tuple[Path, ...],
+    output: Path | None,
+    force: bool,
+    only: tuple[str, ...],
+    buses: tuple[str, ...],
+    positions: tuple[str, ...],
+    as_json: bool,
+    verbose: bool,
+) -> None:
+    """Read the skin of an iCub: XML of robots-configuration, positions and drawings of skinGui, or folders of them.
+
+    Configurations go to stdout, or to DIR with a geometry file each. Whatever is not understood is named on stderr.
+    """
+    from skinware_drivers.icub.importer import import_files
+    from skinware_drivers.icub.notes import Notes
+
+    notes = Notes()
+    try:
+        done = import_files(
+            paths,
+            notes,
+            only=only,
+            positions={name: Path(file) for name, file in _pairs(positions, "--positions PART=FILE")},
+            bus_names={_patch(patch): name for patch, name in _pairs(buses, "--bus PATCH=NAME")},
+        )
+        if not done.parts:
+            raise ConfigurationError("no part could be translated")
+    except ConfigurationError:
+        _report(notes.all(), verbose)
+        raise
+    if output is None and len(done.parts) > 1 and not as_json:
+        names = ", ".join(part.part.name for part in done.parts)
+        raise ConfigurationError(f"{len(done.parts)} parts ({names}): choose one with --part, or give -o DIR")
+    written = [] if output is None else _write(done.parts, output, force)
+    if as_json:
+        print_json(_as_data(done, notes.all(), written))
+        return
+    _report(notes.all(), verbose)
+    if output is None:
+        click.echo(done.parts[0].configuration(), nl=False)
+        if done.parts[0].groups:
+            click.echo("skin-import: with -o DIR, there is a geometry file too", err=True)
+        return
+    for part in done.parts:
+        figures = part.figures()
+        click.echo(
+            f"{output / part.name}.toml: {sum(len(bus.options.boards) for bus in part.buses)} boards,"
+            f" {figures['triangles']} triangles, {figures['sensors']} sensors,"
+            f" {figures['sensors_with_a_place']} with a place"
+        )
+
+
+def _pairs(texts: Sequence[str], form: str) -> list[tuple[str, str]]:
+    pairs = []
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key or not value:
+            raise ConfigurationError(f"{text!r}: write {form}")
+        pairs.append((key, value))
+    return pairs
+
+
+def _patch(text: str) -> int:
+    if text not in ("1", "2"):
+        raise ConfigurationError(f"--bus {text}=...: a patch is 1 or 2")
+    return int(text)
+
+
+def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dict[str, str]]:
+    """Write all files or, where one is in the way, none."""
+    texts: dict[Path, str] = {}
+    written = []
+    for part in parts:
+        files = {"config": folder / f"{part.name}.toml"}
+        texts[files["config"]] = part.configuration()
+        if part.groups:
+            files["geometry"] = folder / f"{part.name}.geometry.toml"
+            texts[files["geometry"]] = part.geometry()
+        written.append({kind: str(path) for kind, path in files.items()})
+    in_the_way = [str(path) for path in texts if path.exists()]
+    if in_the_way and not force:
+        raise ConfigurationError(f"{', '.join(in_the_way)}: there already; give another folder, or --force")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        path.write_text(text, encoding="utf-8")
+    return written
+
+
+def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, str]]) -> dict[str, object]:
+    parts = []
+    for number, part in enumerate(done.parts):
+        files = written[number] if written else {"configuration_text": part.configuration()}
+        parts.append({**part.figures(), **files})
+    return {"parts": parts, "notes": notes, "files": [str(path) for path in done.files]}
+
+
+def _report(notes: Sequence[Note], verbose: bool) -> None:
+    for level, heading in _HEADINGS.items():
+        of_level = [note for note in notes if note.level == level]
+        if not of_level:
+            continue
+        if level == "unused" and not verbose:
+            click.echo(f"{heading}: {len(of_level)} (-v names them)", err=True)
+            continue
+        click.echo(f"{heading}:", err=True)
+        for note in of_level:
+            click.echo(f"  {note}", err=True)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

@@ -1,0 +1,185 @@
+"""Body parts on boards: what a part's ports, position files and drawings say of its triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from skinware.geometry import GeometryGroup
+from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
+from skinware_drivers.icub.drawing import Drawing, Shape
+from skinware_drivers.icub.notes import Notes
+from skinware_drivers.icub.part import Part
+from skinware_drivers.icub.positions import Positions
+from skinware_drivers.icub.wrapper import Port
+
+_OF_A_BOARD = TRIANGLES * CHANNELS
+
+Place = tuple[int, int, int]
+"""Patch, board, triangle."""
+
+
+@dataclass
+class Body:
+    """What is known of a part's triangles beside how they are set up.
+
+    Attributes:
+        shapes: what triangles are; those of which it is not known are left out.
+        bare: triangles that are known to have no taxel.
+        drawn: triangles that a drawing of their body part shows, by name of the body part.
+        groups: places of sensors.
+    """
+
+    shapes: dict[Place, Shape] = field(default_factory=dict)
+    bare: set[Place] = field(default_factory=set)
+    drawn: dict[str, set[Place]] = field(default_factory=dict)
+    groups: list[GeometryGroup] = field(default_factory=list)
+
+
+def read_body(
+    part: Part,
+    ports: Sequence[Port],
+    positions: Mapping[str, Positions],
+    drawings: Mapping[str, Drawing],
+    notes: Notes,
+) -> Body:
+    """Put position files and drawings, by name of the body part, on the boards of a part."""
+    body = Body()
+    for port in ports:
+        channels = _channels(part, port, notes)
+        if port.name in positions:
+            _place(body, part, port, positions[port.name], channels, notes)
+        if port.name in drawings:
+            _draw(body, port, drawings[port.name], channels, notes)
+    return body
+
+
+def _channels(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
+    """Place of every triangle of a port, by its number in the body part."""
+    order = part.host_order
+    triangles: dict[int, Place] = {}
+    for index in range(port.first, port.last + 1):
+        board, rest = divmod(index, _OF_A_BOARD)
+        local = port.local_first + index - port.first
+        if board >= len(order):
+            text = f"goes to {port.last}, but the {len(order)} boards have {len(order) * _OF_A_BOARD} values"
+            notes.add("odd", port.element.file, text, line=port.element.line, element=port.element.label)
+            break
+        if rest % CHANNELS == 0 and local % CHANNELS == 0:
+            triangles[local // CHANNELS] = (*order[board], rest // CHANNELS)
+    return triangles
+
+
+def _place(
+    body: Body, part: Part, port: Port, positions: Positions, triangles: Mapping[int, Place], notes: Notes
+) -> None:
+    bus_of = {patch: bus for bus, patch in enumerate(sorted(part.boards))}
+    count = len(positions.tactile) // CHANNELS
+    beyond = [number for number in triangles if number >= count]
+    if beyond or count > len(triangles):
+        text = f"it has {count} triangles, the port {port.name} {len(triangles)}; what has no counterpart is left out"
+        notes.add("odd", positions.path, text)
+    for number, place in triangles.items():
+        if number >= count:
+            continue
+        shape = _shape(positions.non_tactile(number * CHANNELS))
+        if shape is None:
+            body.bare.add(place)
+            continue
+        body.shapes[place] = shape
+        poses = positions.poses[number * CHANNELS : (number + 1) * CHANNELS]
+        thermal = set(shape[1])
+        for type_name, of_type in (("pressure", set(range(CHANNELS)) - thermal), ("temperature", thermal)):
+            known = [k for k in sorted(of_type) if poses[k] is not None]
+            if known:
+                body.groups.append(_group(port, place, bus_of[place[0]], type_name, positions.frame, known, poses))
+    bare = [place for place in triangles.values() if place in body.shapes and not _has_group(body, place, bus_of)]
+    if bare:
+        text = f"taxels without a place: {places_text(bare)}"
+        notes.add("missing", positions.path, text)
+
+
+def _has_group(body: Body, place: Place, bus_of: Mapping[int, int]) -> bool:
+    first = _uid(bus_of[place[0]], place, 0)
+    return any(group.uid[0] >> 8 == first >> 8 for group in body.groups)
+
+
+def _group(
+    port: Port, place: Place, bus: int, type_name: str, frame: str, channels: Sequence[int], poses: Sequence[object]
+) -> GeometryGroup:
+    found = [pose for k in channels if isinstance(pose := poses[k], tuple)]
+    return GeometryGroup(
+        type=type_name,
+        frame=frame,
+        uid=tuple(_uid(bus, place, k) for k in channels),
+        position_m=tuple(pose[:3] for pose in found),
+        normal=tuple(pose[3:] for pose in found),
+        name=f"{port.name}, board {place[1]}, triangle {place[2]}",
+    )
+
+
+def _uid(bus: int, place: Place, channel: int) -> int:
+    """The driver's uid of a channel."""
+    return bus << 32 | place[1] << 16 | place[2] << 8 | channel
+
+
+def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
+    """What a triangle is by its channels that are no taxels; None: it has no taxel at all."""
+    if len(non_tactile) == CHANNELS:
+        return None
+    for kind, usual in NON_TACTILE.items():
+        if non_tactile == usual:
+            return kind, usual
+    return ("palm" if len(non_tactile) == 1 else "triangle"), non_tactile
+
+
+def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Place], notes: Notes) -> None:
+    outside = [number for number in drawing.shapes if number not in triangles]
+    if outside:
+        text = f"draws triangles {runs_text(outside)}, which the port {port.name} does not have; left out"
+        notes.add("odd", drawing.path, text)
+    drawn = body.drawn.setdefault(port.name, set())
+    for number, shape in drawing.shapes.items():
+        if number not in triangles:
+            continue
+        place = triangles[number]
+        drawn.add(place)
+        known = body.shapes.get(place)
+        if known is None and shape is not None and place not in body.bare:
+            body.shapes[place] = shape
+            if shape[0] == "palm":
+                text = f"channel 11 of {places_text([place])} is taken to be thermal, as in most palm triangles"
+                notes.add("odd", drawing.path, text)
+
+
+def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:
+    """Name what is drawn but off, and what is on but not drawn.
+
+    Args:
+        body: of the part.
+        triangles: all places of each body part.
+        enabled: places that are switched on.
+        notes: takes it.
+    """
+    for name, drawn in body.drawn.items():
+        on = triangles.get(name, set()) & enabled
+        for which, what in ((drawn - on, "drawn, but off"), (on - drawn, "on, but not drawn")):
+            if which:
+                notes.add("odd", name, f"{what}: {places_text(which)}", element="skinGui's drawing")
+
+
+def places_of(part: Part, ports: Sequence[Port]) -> dict[str, set[Place]]:
+    """All places of each body part."""
+    quiet = Notes()
+    return {port.name: set(_channels(part, port, quiet).values()) for port in ports}
+
+
+def places_text(places: Sequence[Place] | set[Place]) -> str:
+    """Places as people read them."""
+    boards: dict[tuple[int, int], list[int]] = {}
+    for patch, board, triangle in sorted(places):
+        boards.setdefault((patch, board), []).append(triangle)
+    return "; ".join(f"patch {p} board {b}: {runs_text(triangles)}" for (p, b), triangles in boards.items())
+
+
+__all__ = ["Body", "Place", "check_drawings", "places_of", "places_text", "read_body"]

@@ -1,0 +1,187 @@
+"""Devices in a robot's XML: their parameters and groups, with everything that they include put in its place.
+
+Format: YARP's yarprobotinterface. A device holds ``param``, ``group``, ``paramlist`` and ``action``; ``xi:include`` and
+(older) ``params file=`` bring in other files, relative to the file or to the robot's folder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.icub.notes import Level, Notes
+from skinware_drivers.icub.xml_tree import Element, read_xml
+
+_MOST_INCLUDES = 200
+_LONGEST_CHAIN = 8
+_HIGHEST_FOLDER = 6
+_CONTAINERS = ("devices", "params", "robot")
+
+
+@dataclass
+class Group:
+    """Named parameters, groups and lists.
+
+    Attributes:
+        element: where it stands.
+        params: by name.
+        groups: by name.
+        lists: by name, the elements ``elem`` of each.
+        actions: elements ``action``.
+        others: elements that have no place in a device.
+    """
+
+    element: Element
+    params: dict[str, Element] = field(default_factory=dict)
+    groups: dict[str, Group] = field(default_factory=dict)
+    lists: dict[str, list[Element]] = field(default_factory=dict)
+    actions: list[Element] = field(default_factory=list)
+    others: list[Element] = field(default_factory=list)
+
+
+class DeviceReader:
+    """Finds the devices of files, each file and device once.
+
+    Args:
+        notes: takes what is odd.
+    """
+
+    def __init__(self, notes: Notes) -> None:
+        self._notes = notes
+        self._files: dict[Path, Element | ConfigurationError] = {}
+        self._seen: set[int] = set()
+
+    def devices(self, path: Path) -> Iterator[Element]:
+        """The elements ``device`` of a file and of those that it includes, without those found before.
+
+        Raises:
+            ConfigurationError: the file itself is no XML.
+        """
+        root = self._read(path)
+        if root.tag != "params":  # parameters are of whoever includes them
+            yield from self._devices(root, [path.resolve()])
+
+    def group_of(self, device: Element) -> Group:
+        """What is in a device."""
+        group = Group(device)
+        device.understood = True
+        self._fill(group, device, [device.file.resolve()], [0])
+        return group
+
+    def _devices(self, element: Element, trail: list[Path]) -> Iterator[Element]:
+        if element.tag == "device":
+            if id(element) not in self._seen:
+                self._seen.add(id(element))
+                yield element
+            return
+        target = _target(element)
+        if target is not None:
+            found = self._include(element, target, trail)
+            if found is not None:
+                yield from self._devices(found, [*trail, found.file.resolve()])
+            return
+        for child in element.children:
+            yield from self._devices(child, trail)
+
+    def _fill(self, group: Group, element: Element, trail: list[Path], count: list[int]) -> None:
+        for child in element.children:
+            target = _target(child)
+            if target is not None:
+                child.understood = True
+                count[0] += 1
+                if count[0] > _MOST_INCLUDES:
+                    raise ConfigurationError(f"{child.file}:{child.line}: more than {_MOST_INCLUDES} files included")
+                found = self._include(child, target, trail)
+                if found is not None and found.tag != "device":
+                    found.understood = True
+                    whole = found if found.tag in _CONTAINERS else Element("params", {}, found.file, 0, [found])
+                    self._fill(group, whole, [*trail, found.file.resolve()], count)
+            elif child.tag in _CONTAINERS:
+                child.understood = True
+                self._fill(group, child, trail, count)
+            elif child.tag == "param":
+                self._put(group.params, child)
+            elif child.tag == "group":
+                child.understood = True
+                inner = group.groups.setdefault(child.name, Group(child))
+                self._fill(inner, child, trail, count)
+            elif child.tag == "paramlist":
+                child.understood = True
+                group.lists.setdefault(child.name, []).extend(child.children)
+            elif child.tag == "action":
+                group.actions.append(child)
+                inner = Group(child)
+                self._fill(inner, child, trail, count)
+                group.lists.update(inner.lists)
+            else:
+                group.others.append(child)
+
+    def _put(self, params: dict[str, Element], param: Element) -> None:
+        first = params.setdefault(param.name, param)
+        if first is not param:
+            param.understood = True
+            text = f"given again as {param.text!r}; the first counts ({first.text!r})"
+            self._notes.add("odd", param.file, text, line=param.line, element=param.label)
+
+    def _include(self, element: Element, target: str, trail: list[Path]) -> Element | None:
+        """The root of an included file; None where there is none (which is noted)."""
+        path = _find(target, element.file)
+        if path is None:
+            self._note(element, "missing", f"{target!r} is not there")
+            return None
+        if path.resolve() in trail:
+            self._note(element, "odd", f"{target!r} includes itself; left out")
+            return None
+        if len(trail) >= _LONGEST_CHAIN:
+            self._note(element, "odd", f"{target!r}: files include each other {_LONGEST_CHAIN} deep; left out")
+            return None
+        try:
+            return self._read(path)
+        except ConfigurationError as error:
+            self._note(element, "missing", f"{target!r} cannot be read: {error}")
+            return None
+
+    def _note(self, element: Element, level: Level, text: str) -> None:
+        self._notes.add(level, element.file, text, line=element.line, element=element.tag)
+
+    def _read(self, path: Path) -> Element:
+        key = path.resolve()
+        if key not in self._files:
+            try:
+                self._files[key] = read_xml(path, self._notes)
+            except ConfigurationError as error:
+                self._files[key] = error
+        found = self._files[key]
+        if isinstance(found, ConfigurationError):
+            raise ConfigurationError(str(found))
+        return found
+
+
+def _target(element: Element) -> str | None:
+    """What an element includes; None if it does not include."""
+    if element.tag.rpartition(":")[2] == "include":
+        return element.attributes.get("href", "")
+    if element.tag == "params":
+        return element.attributes.get("file")
+    return None
+
+
+def _find(target: str, near: Path) -> Path | None:
+    """A file by its name: from the folder of another file, or (older robots) from a folder above it."""
+    if "://" in target or not target.strip():
+        return None
+    folders = [near.parent, *near.resolve().parent.parents][:_HIGHEST_FOLDER]
+    for folder in folders:
+        path = Path(os.path.normpath(folder / target.strip()))
+        try:
+            if path.is_file():
+                return path
+        except (OSError, ValueError):  # a name that no file can have
+            return None
+    return None
+
+
+__all__ = ["DeviceReader", "Group"]

@@ -1,0 +1,309 @@
+"""From files and folders to configurations: finds skin devices, what belongs to them, and translates them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from skinware.errors import ConfigurationError
+from skinware.geometry import GeometryGroup, geometry_to_toml
+from skinware_drivers.can.roboskin_options import CHANNELS
+from skinware_drivers.icub.body import check_drawings, places_of, read_body
+from skinware_drivers.icub.device import DeviceReader
+from skinware_drivers.icub.drawing import Drawing, is_drawing, read_drawing
+from skinware_drivers.icub.notes import Level, Notes
+from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
+from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
+from skinware_drivers.icub.toml_text import configuration_text
+from skinware_drivers.icub.translate import TranslatedBus, enabled_places, service_name, translate
+from skinware_drivers.icub.wrapper import WRAPPER, Port, Wrapper, read_wrapper
+from skinware_drivers.icub.xml_tree import Element
+
+_SUFFIXES = (".xml", ".txt", ".ini")
+_MOST_FILES = 20_000
+_RELATED_DEVICES = ("skin", "inertial", "mtb")
+
+
+@dataclass
+class ImportedPart:
+    """One skin device, translated.
+
+    Attributes:
+        name: of the skin; a name that a service can have.
+        part: what the files say.
+        ports: body parts in its index.
+        buses: in the order of the configuration.
+        groups: places of its sensors.
+        triangles: number of triangles that are switched on.
+    """
+
+    name: str
+    part: Part
+    ports: Sequence[Port]
+    buses: list[TranslatedBus]
+    groups: list[GeometryGroup]
+    triangles: int
+
+    def configuration(self) -> str:
+        """The text of its configuration file."""
+        lines = [f"{self.part.name} ({self.part.device_type}), made by skin-import from {self.part.element.file.name}."]
+        if self.ports:
+            lines.append(f"Body parts: {', '.join(port.name for port in self.ports)}.")
+        if self.part.device_type == ETHERNET:
+            lines.append(
+                "The robot reads these boards through an Ethernet board. This driver needs the CAN bus itself."
+            )
+            lines.append("It must be the only one that sets the boards up.")
+        return configuration_text(self.name, self.buses, "\n".join(lines))
+
+    def geometry(self) -> str:
+        """The text of its geometry file."""
+        lines = f"Places of the sensors of {self.name}, made by skin-import: read it with skinware.geometry."
+        return geometry_to_toml(self.groups, lines)
+
+    def figures(self) -> dict[str, object]:
+        """For programs."""
+        return {
+            "name": self.name,
+            "device": self.part.name,
+            "type": self.part.device_type,
+            "file": str(self.part.element.file),
+            "buses": [{"patch": b.patch, "name": b.name, "boards": list(b.options.boards)} for b in self.buses],
+            "body_parts": [port.name for port in self.ports],
+            "triangles": self.triangles,
+            "sensors": self.triangles * CHANNELS,
+            "sensors_with_a_place": sum(len(group.uid) for group in self.groups),
+        }
+
+
+@dataclass
+class Import:
+    """What came of an import.
+
+    Attributes:
+        parts: skin devices that could be translated.
+        files: files that were read.
+    """
+
+    parts: list[ImportedPart]
+    files: list[Path]
+
+
+@dataclass
+class _Sources:
+    devices: list[Element] = field(default_factory=list)
+    positions: list[Path] = field(default_factory=list)
+    drawings: list[Path] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+
+def import_files(
+    paths: Iterable[Path],
+    notes: Notes,
+    *,
+    only: Sequence[str] = (),
+    positions: Mapping[str, Path] | None = None,
+    bus_names: Mapping[int, str] | None = None,
+) -> Import:
+    """Translate the skin devices in files and folders.
+
+    Args:
+        paths: XML of robots-configuration, position files and drawings of skinGui, and folders of them.
+        notes: takes what there is to say of them, also if this raises.
+        only: devices to translate, by name; all if empty.
+        positions: position file of a body part, where the names of the files leave it open.
+        bus_names: bus of each patch; only for one device.
+
+    Raises:
+        ConfigurationError: a file cannot be read, there is no skin device, or one that was named is not there.
+    """
+    reader = DeviceReader(notes)
+    sources = _Sources()
+    for path in paths:
+        _gather(path, reader, sources, notes)
+    devices = _pick(sources.devices, only)
+    if bus_names and len(devices) > 1:
+        raise ConfigurationError(f"--bus names buses of one part, but there are {len(devices)}; choose one with --part")
+    wrappers = _Wrappers(reader, sources.devices)
+    files = _BodyFiles(sources, dict(positions or {}), notes)
+    parts: list[ImportedPart] = []
+    for device in devices:
+        part = read_part(device.name or "skin", device.attributes["type"], reader.group_of(device), notes)
+        ports = wrappers.ports_of(part, notes)
+        body = read_body(part, ports, *files.of_ports(ports), notes)
+        buses = translate(part, body, bus_names or {}, notes)
+        if not buses:
+            continue
+        enabled = enabled_places(buses)
+        check_drawings(body, places_of(part, ports), enabled, notes)
+        name = service_name(part.name, {each.name for each in parts})
+        parts.append(ImportedPart(name, part, ports, buses, body.groups, len(enabled)))
+    if not only:
+        wrappers.name_unused(notes)
+    files.name_unused({port.name for part in parts for port in part.ports})
+    return Import(parts, sources.files)
+
+
+def _gather(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes) -> None:
+    """Find out what a file is, or what is in a folder."""
+    if not path.is_dir():
+        _take(path, reader, sources, notes)
+        return
+    for file in _files_in(path):
+        try:
+            _take(file, reader, sources, notes, is_asked_for=False)
+        except ConfigurationError as error:
+            notes.add("missing", file, f"cannot be used: {error}")
+
+
+def _files_in(folder: Path) -> list[Path]:
+    found: list[Path] = []
+    for where, folders, names in os.walk(folder):
+        folders.sort()
+        found += [Path(where, name) for name in sorted(names) if name.lower().endswith(_SUFFIXES)]
+        if len(found) > _MOST_FILES:
+            raise ConfigurationError(f"{folder}: more than {_MOST_FILES} files: give the folder of one robot")
+    return found
+
+
+def _take(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes, *, is_asked_for: bool = True) -> None:
+    sources.files.append(path)
+    if path.suffix.lower() not in (".txt", ".ini"):
+        sources.devices += reader.devices(path)
+        return
+    text = read_text(path)
+    if is_positions(text):
+        sources.positions.append(path)
+    elif is_drawing(text):
+        sources.drawings.append(path)
+    elif is_asked_for:
+        raise ConfigurationError(f"{path}: neither positions nor a drawing of skinGui")
+    else:
+        notes.add("unused", path, "neither positions nor a drawing of skinGui")
+
+
+def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
+    """The skin devices, or those of them that were named."""
+    found = [device for device in devices if device.attributes.get("type") in DEVICE_TYPES]
+    if not found:
+        raise ConfigurationError(f"no device of type {' or '.join(DEVICE_TYPES)} in what was read")
+    for name in names:
+        if not any(device.name == name for device in found):
+            there_are = ", ".join(sorted(device.name for device in found))
+            raise ConfigurationError(f"--part {name}: there is none; there are: {there_are}")
+    return [device for device in found if not names or device.name in names]
+
+
+class _Wrappers:
+    """The skinWrappers, and the ports that they give to skin devices."""
+
+    def __init__(self, reader: DeviceReader, devices: Sequence[Element]) -> None:
+        self._wrappers: list[tuple[Element, Wrapper, Notes]] = []
+        self._others: list[Element] = []
+        for device in devices:
+            device_type = device.attributes.get("type", "")
+            if device_type == WRAPPER:
+                own = Notes()
+                self._wrappers.append((device, read_wrapper(reader.group_of(device), own), own))
+            elif device_type not in DEVICE_TYPES and any(word in device_type.lower() for word in _RELATED_DEVICES):
+                self._others.append(device)
+        self._used: set[int] = set()
+
+    def ports_of(self, part: Part, notes: Notes) -> Sequence[Port]:
+        """The ports of a device; of several robots, those of the wrapper in the nearest folder."""
+        where = part.element.file.resolve().parts
+        of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
+        if not of_part:
+            text = "no skinWrapper with its ports: the body parts, and so the places of the taxels, are not known"
+            notes.add("missing", part.element.file, text, line=part.element.line, element=part.element.label)
+            return ()
+        element, wrapper, own = max(of_part, key=lambda entry: _shared(where, entry[0].file.resolve().parts))
+        self._used.add(id(element))
+        notes.take(own)
+        return wrapper.ports
+
+    def name_unused(self, notes: Notes) -> None:
+        """Name the wrappers without a device, and other devices that have to do with skin."""
+        for element, wrapper, _ in self._wrappers:
+            if id(element) not in self._used:
+                text = f"there is no skin device {wrapper.device!r}; its ports are not used"
+                notes.add("missing", element.file, text, line=element.line, element=element.label)
+        for element in self._others:
+            text = f"a device of type {element.attributes['type']!r} is not imported"
+            if "inertial" in text.lower():
+                text += "; see the option inertial of the driver"
+            notes.add("unknown", element.file, text, line=element.line, element=element.label)
+
+
+def _shared(one: Sequence[str], other: Sequence[str]) -> int:
+    """Number of folders that two paths share."""
+    return next((n for n, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
+
+
+class _BodyFiles:
+    """Position files and drawings, by the body part that they are of."""
+
+    def __init__(self, sources: _Sources, chosen: Mapping[str, Path], notes: Notes) -> None:
+        self._chosen, self._notes = chosen, notes
+        self._positions = sources.positions
+        self._drawings: list[tuple[Drawing, Notes]] = []
+        for path in sources.drawings:
+            own = Notes()
+            self._drawings.append((read_drawing(path, own), own))
+        self._used: set[Path] = set()
+
+    def of_ports(self, ports: Sequence[Port]) -> tuple[dict[str, Positions], dict[str, Drawing]]:
+        """What there is of a device's body parts."""
+        positions, drawings = {}, {}
+        for port in ports:
+            path = self._chosen.get(port.name) or self._positions_of(port)
+            if path is not None:
+                self._used.add(path)
+                positions[port.name] = read_positions(path, self._notes)
+            drawing = self._drawing_of(port)
+            if drawing is not None:
+                drawings[port.name] = drawing
+        return positions, drawings
+
+    def name_unused(self, ports: set[str]) -> None:
+        """Name the files of no part that was imported.
+
+        Raises:
+            ConfigurationError: the user chose a file for a body part that there is not.
+        """
+        for name in self._chosen:
+            if name not in ports:
+                raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")
+        for path in [*self._positions, *(drawing.path for drawing, _ in self._drawings)]:
+            if path not in self._used:
+                self._notes.add("unused", path, "no body part of this name is imported")
+
+    def _positions_of(self, port: Port) -> Path | None:
+        """By the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
+        exact = [path for path in self._positions if path.stem == port.name]
+        similar = [path for path in self._positions if path.stem.startswith(f"{port.name}_")]
+        candidates = exact if len(exact) == 1 else [*exact, *similar]
+        if len(candidates) > 1:
+            names = ", ".join(path.name for path in candidates)
+            self._note(port, "todo", f"whose positions? {names}; none is used: say --positions {port.name}=FILE")
+            return None
+        return candidates[0] if candidates else None
+
+    def _drawing_of(self, port: Port) -> Drawing | None:
+        """By what the drawing itself says."""
+        found = [(drawing, own) for drawing, own in self._drawings if drawing.part == port.name]
+        self._used.update(drawing.path for drawing, _ in found)
+        if len(found) > 1:
+            self._note(port, "odd", f"several drawings, none used: {', '.join(d.path.name for d, _ in found)}")
+            return None
+        for _, own in found:
+            self._notes.take(own)
+        return found[0][0] if found else None
+
+    def _note(self, port: Port, level: Level, text: str) -> None:
+        self._notes.add(level, port.element.file, text, line=port.element.line, element=port.element.label)
+
+
+__all__ = ["Import", "ImportedPart", "import_files"]

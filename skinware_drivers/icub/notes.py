@@ -1,0 +1,56 @@
+"""What an import has to say of the files it read: nothing is dropped without a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+Level = Literal["todo", "odd", "unknown", "missing", "unused"]
+"""``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not
+understood; ``missing``: named, but not there; ``unused``: understood, and of no meaning for a driver."""
+
+
+class Note(msgspec.Struct, frozen=True, order=True):
+    """One remark.
+
+    Attributes:
+        level: what kind.
+        file: where it is about.
+        line: counted from 1; 0: the file as a whole.
+        element: what is meant there.
+        text: the remark.
+    """
+
+    level: Level
+    file: str
+    line: int
+    element: str
+    text: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {self.element}: {self.text}" if self.element else f"{place}: {self.text}"
+
+
+class Notes:
+    """Remarks in the order in which they came, each once."""
+
+    def __init__(self) -> None:
+        self._notes: dict[Note, None] = {}
+
+    def add(self, level: Level, file: Path | str, text: str, *, line: int = 0, element: str = "") -> None:
+        """Note something."""
+        self._notes[Note(level, str(file), line, element, text)] = None
+
+    def take(self, other: Notes) -> None:
+        """Add all of another's."""
+        self._notes.update(other._notes)
+
+    def all(self) -> list[Note]:
+        """All of them."""
+        return list(self._notes)
+
+
+__all__ = ["Level", "Note", "Notes"]

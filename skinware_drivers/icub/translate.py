@@ -1,0 +1,239 @@
+"""A part as a configuration of our driver: options for each bus, checked by the driver itself."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin_options import (
+    NON_TACTILE,
+    TRIANGLE_SKIN_TYPES,
+    TRIANGLES,
+    Kind,
+    RoboskinOptions,
+    SpecialBoards,
+    runs_text,
+)
+from skinware_drivers.can.roboskin_setup import BoardSetUp
+from skinware_drivers.icub.body import Body, Place, places_text
+from skinware_drivers.icub.notes import Notes
+from skinware_drivers.icub.part import ETHERNET, Part
+
+_TICK_MS = 0.0032
+_OWN_TIMER, _COMPENSATED, _NOT_COMPENSATED_TYPE, _AREA_SHIFTS = 3, 0x08, 2, 0x22
+_USUAL_OLD_PERIOD_MS = 50
+_BUS_COMMENT = {
+    ETHERNET: "fill in the interface that taps CAN{patch} of the Ethernet board, as can0",
+    "": "fill in the interface of this bus, as can0",
+}
+
+
+@dataclass(frozen=True)
+class TranslatedBus:
+    """One bus of a part.
+
+    Attributes:
+        patch: what the files call it.
+        name: as ``skin-driver`` takes it; empty: to be filled in.
+        comment: what to fill in.
+        options: for this bus.
+    """
+
+    patch: int
+    name: str
+    comment: str
+    options: RoboskinOptions
+
+
+def translate(part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes) -> list[TranslatedBus]:
+    """The buses of a part, in order of their patches; those on which nothing is switched on are left out.
+
+    Args:
+        part: the part.
+        body: what is known of its triangles.
+        bus_names: names of buses that the user gave, by patch.
+        notes: takes what is odd.
+    """
+    buses = []
+    for patch in sorted(part.boards):
+        try:
+            options = _old_options(part, patch, notes) if part.old else _options(part, patch)
+            options = _with_kinds(options, patch, body)
+            RoboskinDriver(options)  # refuses what it could not do
+        except ConfigurationError as error:
+            _note(notes, "odd", part, f"patch {patch} is left out: {error}")
+            continue
+        name = bus_names.get(patch, part.bus_name)
+        comment = "" if name else _BUS_COMMENT.get(part.device_type, _BUS_COMMENT[""]).format(patch=patch)
+        buses.append(TranslatedBus(patch, name, comment, options))
+        _check_set_up(part, patch, options, body, notes)
+    for patch in bus_names:
+        if patch not in part.boards:
+            raise ConfigurationError(f"--bus {patch}={bus_names[patch]}: {part.name} has no patch {patch}")
+    to_fill_in = [str(bus.patch) for bus in buses if not bus.name]
+    if to_fill_in and part.device_type == ETHERNET:
+        text = (
+            "the boards hang behind an Ethernet board: wire a CAN interface to the bus itself and fill in its name;"
+            f" patch {', '.join(to_fill_in)}"
+        )
+        _note(notes, "todo", part, text)
+    elif to_fill_in:
+        _note(notes, "todo", part, "the files do not name a CAN interface of this machine: fill in the bus")
+    return buses
+
+
+def enabled_places(buses: list[TranslatedBus]) -> set[Place]:
+    """The triangles that are switched on."""
+    return {
+        (bus.patch, board, triangle)
+        for bus in buses
+        for board in bus.options.boards
+        for triangle in BoardSetUp(bus.options, board).enabled
+    }
+
+
+def service_name(name: str, taken: set[str]) -> str:
+    """A name that a service can have, made of a device's."""
+    safe = re.sub(r"[^A-Za-z0-9_-]", "_", name).lstrip("_-")[:40] or "skin"
+    found, number = safe, 2
+    while found in taken:
+        found, number = f"{safe}-{number}", number + 1
+    return found
+
+
+def _options(part: Part, patch: int) -> RoboskinOptions:
+    special = [
+        SpecialBoards(s.boards, period_ms=s.period_ms, skin_type=s.skin_type, no_load=s.no_load)
+        for s in part.board_sets
+        if s.patch == patch
+    ]
+    modules = [
+        Kind(s.board, s.triangles, enabled=s.enabled, shift=s.shift, cdc_offset=s.cdc_offset)
+        for s in part.triangle_sets
+        if s.patch == patch
+    ]
+    return RoboskinOptions(
+        boards=part.boards[patch],
+        period_ms=part.period_ms,
+        skin_type=part.skin_type,
+        no_load=part.no_load,
+        shift=part.shift,
+        cdc_offset=part.cdc_offset,
+        enabled=part.enabled,
+        special_boards=tuple(special),
+        modules=tuple(modules),
+    )
+
+
+def _old_options(part: Part, patch: int, notes: Notes) -> RoboskinOptions:
+    """The old set-up: one shift and offset for a bus; the rest can differ from board to board."""
+    boards = part.boards[patch]
+    each = {board: _OldSettings(part, board, notes) for board in boards}
+    first = each[boards[0]]
+    for board, settings in each.items():
+        if (settings.shift, settings.cdc_offset) != (first.shift, first.cdc_offset):
+            text = f"board {board} has another 4E_Shift or 4C_CDCOffset; those of board {boards[0]} are taken for all"
+            _note(notes, "odd", part, text)
+    special = tuple(
+        SpecialBoards((board,), period_ms=s.period_ms, skin_type=s.skin_type, no_load=s.no_load)
+        for board, s in each.items()
+        if (s.period_ms, s.skin_type, s.no_load) != (first.period_ms, first.skin_type, first.no_load)
+    )
+    modules = tuple(Kind(board, s.off, enabled=False) for board, s in each.items() if s.off)
+    return RoboskinOptions(
+        boards=boards,
+        period_ms=first.period_ms,
+        skin_type=first.skin_type,
+        no_load=first.no_load,
+        shift=first.shift,
+        cdc_offset=first.cdc_offset,
+        old_style=True,
+        special_boards=special,
+        modules=modules,
+    )
+
+
+class _OldSettings:
+    def __init__(self, part: Part, board: int, notes: Notes) -> None:
+        values = part.old[board].values
+        period_ms = float(_USUAL_OLD_PERIOD_MS)
+        if values["4C_Timer"] & 0xF == _OWN_TIMER:
+            period_ms = (values["4C_TimeL"] | values["4C_TimeH"] << 8) * _TICK_MS
+        self.period_ms = min(max(round(period_ms), 1), 209)
+        if self.period_ms != period_ms:
+            _note(notes, "odd", part, f"board {board}: a period of {period_ms:g} ms becomes {self.period_ms} ms")
+        parameter = values["4E_Param"]
+        self.skin_type = parameter & 3 if parameter & _COMPENSATED else _NOT_COMPENSATED_TYPE
+        if parameter & ~(_COMPENSATED | 3):
+            _note(
+                notes, "unknown", part, f"board {board}: 4E_Param {parameter:#x}: only bits 0, 1 and 3 are understood"
+            )
+        if values["4E_Shift3_1"] != _AREA_SHIFTS:
+            text = f"board {board}: 4E_Shift3_1 {values['4E_Shift3_1']:#x}: areas are not used, so 0x22 is sent"
+            _note(notes, "unused", part, text)
+        if values["4E_Shift"] & 0xF0:
+            _note(notes, "odd", part, f"board {board}: 4E_Shift {values['4E_Shift']:#x}: its low four bits count")
+        self.shift, self.no_load = values["4E_Shift"] & 0x0F, values["4E_NoLoad"]
+        self.cdc_offset = values["4C_CDCOffsetL"] | values["4C_CDCOffsetH"] << 8
+        mask = values["4E_EnaL"] | values["4E_EnaH"] << 8
+        self.off = tuple(triangle for triangle in range(TRIANGLES) if not mask >> triangle & 1)
+
+
+def _with_kinds(options: RoboskinOptions, patch: int, body: Body) -> RoboskinOptions:
+    """Options that also say what the triangles are, where the type of skin alone would say another thing."""
+    kinds: dict[tuple[int, str, tuple[int, ...]], list[int]] = {}
+    for board in options.boards:
+        set_up = BoardSetUp(options, board)
+        usual = "triangle" if set_up.skin_type in TRIANGLE_SKIN_TYPES else "fingertip"
+        for triangle in sorted(set_up.enabled):
+            shape = body.shapes.get((patch, board, triangle))
+            if shape is not None and shape != (usual, NON_TACTILE[usual]):
+                kinds.setdefault((board, *shape), []).append(triangle)
+    more = tuple(
+        Kind(board, tuple(triangles), kind=kind, thermal=None if thermal == NON_TACTILE[kind] else thermal)
+        for (board, kind, thermal), triangles in kinds.items()
+    )
+    return msgspec.structs.replace(options, modules=(*options.modules, *more))
+
+
+def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, notes: Notes) -> None:
+    """Name what the files switch on in vain, and what is on without anything there."""
+    for board in options.boards:
+        set_up = BoardSetUp(options, board)
+        if set_up.wiped:
+            sets = [s for s in part.board_sets if s.patch == patch and board in s.boards]
+            element = sets[-1].element
+            text = (
+                f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, off again"
+                " by this set, and on again by nothing: they stay off, as on the robot"
+            )
+            notes.add("odd", element.file, text, line=element.line, element=element.label)
+        elif not set_up.enabled:
+            _note(notes, "odd", part, f"patch {patch} board {board}: no triangle is switched on")
+    on = {(patch, board, t) for board in options.boards for t in BoardSetUp(options, board).enabled}
+    if on & body.bare:
+        _note(notes, "odd", part, f"on, though their position file has no taxel there: {places_text(on & body.bare)}")
+    unknown = {place for place in on if place not in body.shapes and place not in body.bare}
+    if unknown and part.old:
+        text = (
+            'the files do not tell what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
+            f" without it, skin type {options.skin_type} decides"
+        )
+        _note(notes, "todo", part, text)
+    elif {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}:
+        special = {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}
+        text = f"fingertips or palms? taken to be fingertips, as no position file tells: {places_text(special)}"
+        _note(notes, "todo", part, text)
+
+
+def _note(notes: Notes, level: Any, part: Part, text: str) -> None:
+    notes.add(level, part.element.file, text, line=part.element.line, element=part.element.label)
+
+
+__all__ = ["TranslatedBus", "enabled_places", "service_name", "translate"]

@@ -1,0 +1,266 @@
+"""State, reason and age of a bus as people and programs are told, whatever its hardware does."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import ClassVar
+
+import pytest
+
+from skinware import BusReason, BusState, DriverReader, Status
+from skinware.errors import BusNotAvailable
+from skinware.realtime import now_ns
+from skinware_drivers import bus_line, bus_news
+from skinware_drivers.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
+from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from tests.conftest import wait_until
+from tests.sdk.driving import TroubledBus, driving, emulated, hardware_of, read_until
+
+pytestmark = pytest.mark.usefixtures("hurry")
+
+
+class ReportingBus(TroubledBus):
+    """A bus whose controller reports what the test says, and whose interface can be lost without a word.
+
+    Attributes:
+        wrong: what the controller reports.
+        lost_in_silence: ``check`` finds the interface gone; nothing else does.
+        opening: as long as it is clear, ``open`` does not come back.
+    """
+
+    opens_slowly: ClassVar[bool] = False
+
+    def __init__(self, *arguments: object, **more: object) -> None:
+        super().__init__(*arguments, **more)
+        self.wrong = BusReason.NONE
+        self.lost_in_silence = False
+        self.opening = threading.Event()
+        self.opening.set()
+        self.opened_in: set[str] = set()
+
+    def open(self) -> None:
+        self.opened_in.add(threading.current_thread().name)
+        assert self.opening.wait(30)
+        if self.lost_in_silence:
+            raise BusNotAvailable("the bus is not there")
+        super().open()
+
+    def reason(self, time_ns: int) -> BusReason:
+        return self.wrong
+
+    def check(self) -> None:
+        if self.lost_in_silence:
+            raise BusNotAvailable("the bus has vanished")
+
+
+class SlowBus(ReportingBus):
+    """One whose ``open`` may take long."""
+
+    opens_slowly = True
+
+
+def reporting(kind: type[ReportingBus] = ReportingBus, **options: object) -> ReportingBus:
+    return kind.with_hardware(EmulatedRoboskin(RoboskinOptions(boards=(7,), **options)))  # type: ignore[arg-type]
+
+
+def told(caplog: pytest.LogCaptureFixture, bus: str) -> list[str]:
+    return [r.getMessage() for r in caplog.records if r.getMessage().startswith(bus)]
+
+
+def test_a_bus_off_is_told_with_its_time_and_ends_as_the_controller_says(caplog: pytest.LogCaptureFixture) -> None:
+    bus, other = reporting(), emulated(boards=(7,))
+    with caplog.at_level(logging.WARNING), driving(bus, other) as running, DriverReader("roboskin") as reader:
+        live = read_until(reader, lambda f: f.bus_state.tolist() == [BusState.LIVE] * 2 and not f.status.any())
+        assert live.bus_reason.tolist() == [BusReason.NONE] * 2
+        before_ns = now_ns()
+        assert 0 < live.bus_since_ns.max() < before_ns
+
+        def go_off() -> None:
+            bus.wrong = BusReason.BUS_OFF
+
+        running.do(go_off)
+        off = read_until(reader, lambda f: f.bus_reason[0] == BusReason.BUS_OFF)
+        assert off.bus_state.tolist() == [BusState.DOWN, BusState.LIVE]
+        assert before_ns < off.bus_since_ns[0] <= off.published_ns
+        assert off.bus_since_ns[1] == live.bus_since_ns[1]
+        later = read_until(reader, lambda f: f.sequence >= off.sequence + 3)
+        assert later.bus_since_ns[0] == off.bus_since_ns[0]  # since then, not since now
+        shown = running.status()["buses"][0]
+        assert (shown["state"], shown["reason"]) == ("down", "bus_off")
+        assert shown["state_age_s"] > 0
+        bus.wrong = BusReason.NONE
+        back = read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE)
+        assert (back.bus_reason[0], back.generation) == (BusReason.NONE, live.generation)
+        assert back.bus_since_ns[0] > off.bus_since_ns[0]
+    first, second = told(caplog, "bus bus0")
+    assert first.startswith("bus bus0: bus-off: ")
+    assert second == "bus bus0: in order again (was bus-off)"
+    assert not told(caplog, "bus bus1")
+
+
+def test_a_live_bus_tells_what_is_wrong_with_it(caplog: pytest.LogCaptureFixture) -> None:
+    bus = reporting()
+    with caplog.at_level(logging.WARNING), driving(bus), DriverReader("roboskin") as reader:
+        for wrong in (BusReason.ERROR_WARNING, BusReason.ERROR_PASSIVE, BusReason.OVERFLOW):
+            bus.wrong = wrong
+            frame = read_until(reader, lambda f, wrong=wrong: f.bus_reason[0] == wrong)  # type: ignore[misc]
+            assert frame.bus_state[0] == BusState.LIVE
+            assert not (frame.status & Status.STALE).any()
+    lines = told(caplog, "bus bus0")
+    assert [line.split(":")[1].split()[0] for line in lines] == ["error-warning", "error-passive", "the"]
+
+
+def test_silence_is_told_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    bus = emulated(boards=(7,), pattern="idle", boot_s=0.05)
+    with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        running.do(lambda: hardware_of(bus).kill(7, bus._clock()))
+        silent = read_until(reader, lambda f: f.bus_state[0] == BusState.SILENT)
+        assert silent.bus_reason[0] == BusReason.NOTHING_HEARD
+        read_until(reader, lambda f: f.sequence >= silent.sequence + 3)
+        running.do(lambda: hardware_of(bus).restart(7, bus._clock()))
+        read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE and not f.bus_reason.any())
+    assert told(caplog, "bus bus0") == ["bus bus0: nothing is heard any more", "bus bus0: frames come again"]
+
+
+def test_a_loss_that_a_send_swallowed_is_found_and_the_bus_opened_again() -> None:
+    """The kernel reports a vanished interface once: to the next send, if that comes before the next receive."""
+    bus, other = reporting(pattern="idle"), emulated(boards=(7,))
+    with driving(bus, other) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status[:192].any())
+
+        def vanish() -> None:
+            bus.lost_in_silence = True
+            bus.hardware = EmulatedRoboskin(RoboskinOptions(boards=(9,)))  # nothing that is heard
+
+        running.do(vanish)
+        gone = read_until(reader, lambda f: f.bus_state[0] == BusState.GONE)
+        assert gone.bus_reason[0] == BusReason.INTERFACE_GONE
+        assert gone.bus_state[1] == BusState.LIVE
+        bus.lost_in_silence = False
+        read_until(reader, lambda f: f.bus_state[0] == BusState.SILENT)
+
+
+def test_an_interface_that_opens_slowly_holds_up_no_other_bus() -> None:
+    slow, other = reporting(SlowBus), emulated(boards=(7,))
+    with driving(slow, other) as running, DriverReader("roboskin") as reader:
+        first = read_until(reader, lambda f: not f.status.any())
+        slow.opened_in.clear()
+        slow.opening.clear()
+        running.do(slow.go_down)
+        wait_until(lambda: bool(slow.opened_in))
+        held = read_until(reader, lambda f: f.bus_state[0] == BusState.DOWN)
+        later = read_until(reader, lambda f: f.sequence >= held.sequence + 10)
+        assert not later.status[192:].any()
+        assert (later.status[:192] & Status.STALE).all()
+        slow.down = False
+        slow.opening.set()
+        back = read_until(reader, lambda f: not f.status.any())
+        assert back.generation == first.generation
+    assert threading.current_thread().name not in slow.opened_in
+
+
+def test_a_driver_stops_while_an_interface_is_being_opened() -> None:
+    slow = reporting(SlowBus)
+    with driving(slow) as running:
+        slow.opened_in.clear()
+        slow.opening.clear()
+        running.do(slow.go_down)
+        wait_until(lambda: bool(slow.opened_in))
+        assert running.runner is not None
+        running.do(running.runner.stop)
+        slow.down = False
+        slow.opening.set()
+    assert slow.fileno() == -1  # opened after all, and closed
+
+
+def test_a_bus_that_cannot_be_opened_again_for_an_odd_reason_is_tried_for_ever(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    bus = reporting()
+    with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
+        real, tries = bus.open, []
+
+        def fail() -> None:
+            tries.append(1)
+            raise OSError("the library is confused")
+
+        monkeypatch.setattr(bus, "open", fail)
+        running.do(bus.go_down)
+        frame = read_until(reader, lambda f: f.bus_reason[0] == BusReason.FAILED)
+        assert frame.bus_state[0] == BusState.GONE
+        wait_until(lambda: len(tries) > 3)
+        bus.down = False
+        monkeypatch.setattr(bus, "open", real)
+        read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE)
+    assert caplog.text.count("the library is confused") == 1
+
+
+# -- news ---------------------------------------------------------------------------------------------------------
+
+
+class Clock:
+    """A clock that the test moves."""
+
+    def __init__(self) -> None:
+        self.time_ns = 10**12
+
+    def __call__(self) -> int:
+        return self.time_ns
+
+    def pass_s(self, duration_s: float) -> None:
+        self.time_ns += round(duration_s * 1e9)
+
+
+def test_a_bus_that_comes_and_goes_for_an_hour_fills_no_log(caplog: pytest.LogCaptureFixture) -> None:
+    clock = Clock()
+    news = BusNews(clock)
+    with caplog.at_level(logging.WARNING):
+        for number in range(36_000):
+            news.tell(f"bus can0: change {number}")
+            clock.pass_s(0.1)
+        clock.pass_s(LINE_EVERY_S)
+        news.catch_up()
+        news.catch_up()
+    lines = told(caplog, "bus can0")
+    assert lines[:LINES_AT_ONCE] == [f"bus can0: change {number}" for number in range(LINES_AT_ONCE)]
+    assert len(lines) <= LINES_AT_ONCE + 3600 / LINE_EVERY_S + 1
+    assert lines[-1].startswith("bus can0: change 35999 (")  # the last word is never lost
+    kept_back = sum(int(line.partition("(")[2].split()[0]) for line in lines if "(" in line)
+    assert kept_back + len(lines) == 36_000
+
+
+def test_a_quiet_bus_may_speak_at_length_again(caplog: pytest.LogCaptureFixture) -> None:
+    clock = Clock()
+    news = BusNews(clock)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            for number in range(LINES_AT_ONCE):
+                news.tell(f"bus can0: {number}")
+            clock.pass_s(LINES_AT_ONCE * LINE_EVERY_S)
+    assert len(told(caplog, "bus can0")) == 3 * LINES_AT_ONCE
+    assert "were not told" not in caplog.text
+
+
+def test_a_flapping_bus_of_a_running_driver_is_told_of_a_few_times(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus_line, "_FIRST_PAUSE_S", 0.001)
+    monkeypatch.setattr(bus_line, "_LONGEST_PAUSE_S", 0.001)
+    monkeypatch.setattr(bus_news, "LINES_AT_ONCE", 3)
+    bus = reporting()
+    with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
+        flaps = 0
+
+        def flap() -> None:
+            nonlocal flaps
+            if bus.fileno() >= 0:
+                bus.fail_next_receive(BusNotAvailable("the bus went down", is_down=True))
+                flaps += 1
+
+        while flaps < 30:
+            running.do(flap)
+        read_until(reader, lambda f: f.bus_state[0] == BusState.LIVE)
+    assert len(told(caplog, "the bus went down")) + len(told(caplog, "bus bus0")) <= 3

@@ -262,7 +262,7 @@ EmulatedBus = VirtualCanBus | EmulatedSerialBus
 
 def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
     """An emulated bus of the medium that a driver speaks."""
-    if adapter.medium == "can":
+    if adapter.medium in ("can", "virtual"):
         return VirtualCanBus.with_hardware(
             hardware,
             payload_size=adapter.payload_size,

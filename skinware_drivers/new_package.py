@@ -94,8 +94,9 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
             made.append(path)
         unfinished.rename(folder)
     except OSError as error:
-        shutil.rmtree(unfinished, ignore_errors=True)
         raise SkinwareError(f"cannot make {folder}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)  # there is none if all went well
     return made
 
 

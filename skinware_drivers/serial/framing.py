@@ -133,7 +133,9 @@ class Framed:
         """Frames that were found one by one."""
         length = np.array([len(body) for body in bodies], np.int64)
         data = np.frombuffer(b"".join((*bodies, bytes(int(length.max())))), np.uint8)
-        return cls(data, np.add.accumulate(length) - length, length, np.array(identifier, np.int64), np.array(end, np.int64))
+        return cls(
+            data, np.add.accumulate(length) - length, length, np.array(identifier, np.int64), np.array(end, np.int64)
+        )
 
 
 _NONE = np.zeros(0, np.int64)

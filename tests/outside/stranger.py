@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import site
 import subprocess
 import sys
 import sysconfig
 import venv
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tests.commands import BIN
@@ -28,7 +31,6 @@ class Stranger:
 
     Attributes:
         home: an empty folder to work in.
-        environ: environment of its processes.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -45,7 +47,7 @@ class Stranger:
             for key, value in os.environ.items()
             if not key.startswith(("PYTHON", "PYTEST", "COV", "VIRTUAL_ENV"))
         }
-        self.environ = {
+        self._environ = {
             **keep,
             "PATH": f"{self._bin}:{os.environ['PATH']}",
             "HOME": str(self.home),
@@ -58,10 +60,15 @@ class Stranger:
         self._add_commands()
         self.do("pip", "install", "--quiet", "--no-deps", str(built_wheel(folder / "wheel")), cwd=folder)
 
+    @property
+    def environ(self) -> dict[str, str]:
+        """Environment of its processes: they meet in the namespace of the test that runs."""
+        return {**self._environ, "SKINWARE_NAMESPACE": os.environ.get("SKINWARE_NAMESPACE", "default")}
+
     def do(self, *command: str, cwd: Path | None = None) -> str:
         """Run a command to its end; its output. It must succeed."""
         done = subprocess.run(
-            [str(self._bin / command[0]) if (self._bin / command[0]).exists() else command[0], *command[1:]],
+            [self._bin / command[0], *command[1:]],
             cwd=cwd or self.home,
             env=self.environ,
             stdin=subprocess.DEVNULL,
@@ -80,6 +87,25 @@ class Stranger:
             path = self._bin / name
             path.write_text(f'#!/bin/sh\nexec {self._bin / "python"} -m {name} "$@"\n')
             path.chmod(0o755)
+
+    @contextmanager
+    def running(self, *command: str, cwd: Path | None = None) -> Iterator[None]:
+        """A command that is interrupted at the end; it must then end well."""
+        process = subprocess.Popen(
+            [self._bin / command[0], *command[1:]],
+            cwd=cwd or self.home,
+            env=self.environ,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        try:
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, f"{' '.join(command)}\n{output}"
 
 
 def built_wheel(folder: Path) -> Path:

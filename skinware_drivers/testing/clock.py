@@ -16,7 +16,6 @@ import time
 import traceback
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
@@ -251,7 +250,8 @@ def _watch(thread: threading.Thread, clock: HandClock) -> None:
 def _is_asleep(thread: threading.Thread) -> bool:
     """Whether the kernel says that it waits for something, rather than for a processor."""
     try:
-        status = Path(f"/proc/self/task/{thread.native_id}/stat").read_text()
+        with open(f"/proc/self/task/{thread.native_id}/stat") as file:
+            status = file.read()
     except OSError:
         return False
     return status.rpartition(")")[2].split()[0] == "S"

@@ -2,94 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import msgspec
 
-from skinware import DriverFrame, DriverReader
 from skinware.errors import BusNotAvailable, BusSendError
-from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import Bus
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
-from skinware_drivers.runner import PublishMode, Runner
+from skinware_drivers.runner import PublishMode
+from skinware_drivers.testing.driving import Driving, driving_lines
+from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import CommandReceived
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
-
-
-class Driving:
-    """A running driver; ``do`` runs something in its event loop, where the emulated hardware may be touched."""
-
-    def __init__(
-        self,
-        lines: Sequence[tuple[AnyAdapter, Bus]],
-        name: str,
-        listen_only: bool,
-        publish: PublishMode | None = None,
-    ) -> None:
-        self.ready = threading.Event()
-        self.failure: BaseException | None = None
-        self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]
-        self._name = name
-        self._listen_only = listen_only
-        self._publish = publish
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self.runner: Runner | None = None
-        self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
-
-    def _run(self) -> None:
-        async def run() -> None:
-            self._loop = asyncio.get_running_loop()
-            self.runner = Runner(
-                self._name,
-                self._lines,
-                name=self._name,
-                listen_only=self._listen_only,
-                publish=self._publish,
-                slots=64,
-                on_ready=self.ready.set,
-            )
-            await self.runner.run()
-
-        try:
-            asyncio.run(run())
-        except BaseException as error:  # noqa: BLE001  (shown to the test, which fails on it)
-            self.failure = error
-            self.ready.set()
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def stop(self) -> None:
-        if self.runner is not None and self._loop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self.runner.stop)
-        self._thread.join(30)
-        assert not self._thread.is_alive(), "the driver did not stop"
-        if self.failure is not None:
-            raise self.failure
-
-    def do(self, action: Callable[[], object]) -> None:
-        """Run in the driver's loop and wait for it."""
-        done = threading.Event()
-
-        def act() -> None:
-            action()
-            done.set()
-
-        assert self._loop is not None
-        self._loop.call_soon_threadsafe(act)
-        assert done.wait(30)
-
-    def status(self) -> dict[str, Any]:
-        assert self.runner is not None
-        return self.runner.status()
 
 
 def emulated(log: list[msgspec.Struct] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
@@ -232,32 +161,17 @@ def driving(
         yield running
 
 
-@contextmanager
-def driving_lines(
-    lines: Sequence[tuple[AnyAdapter, Bus]],
-    name: str,
-    *,
-    listen_only: bool = False,
-    wait: bool = True,
-    publish: PublishMode | None = None,
-) -> Iterator[Driving]:
-    """Any driver on any buses."""
-    running = Driving(lines, name, listen_only, publish)
-    running.start()
-    try:
-        if wait:
-            assert running.ready.wait(30)
-            if running.failure is not None:
-                raise running.failure
-        yield running
-    finally:
-        running.stop()
-
-
-def read_until(reader: DriverReader, condition: Callable[[DriverFrame], bool], frames: int = 1200) -> DriverFrame:
-    """The first frame that fulfils a condition."""
-    for count, frame in enumerate(reader.in_order(timeout_s=30)):
-        if condition(frame):
-            return frame
-        assert count < frames, "the frames never came to it"
-    raise AssertionError
+__all__ = [
+    "Chatter",
+    "Driving",
+    "LateBoards",
+    "Together",
+    "TroubledBus",
+    "commands",
+    "driving",
+    "driving_lines",
+    "emulated",
+    "hardware_of",
+    "read_until",
+    "troubled",
+]

@@ -1,0 +1,166 @@
+"""The CAN lab: a guest kernel that has CAN, over this machine's own files, for a machine whose kernel has none.
+
+    python -m skinware_drivers.testing.lab check                  what is missing here; exit status 1 if anything is
+    python -m skinware_drivers.testing.lab run [-T S] -- COMMAND  boot, run COMMAND in this folder, exit as it did
+    python -m skinware_drivers.testing.lab --kernel rt ...        the same with a PREEMPT_RT kernel
+
+The guest sees this machine's files read-only; what it writes is gone with it. It has vcan, and two emulated CAN
+controllers on one wire: can0 and can1. SKINWARE_CAN_LAB=1 tells a program that it runs inside, and
+SKINWARE_CAN_LAB_KERNEL on which kernel. The processor is emulated: what runs there works, but says nothing of timing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+MODULES = "can-raw vcan vxcan slcan can-gw kvaser_pci"
+CONTROLLERS = "-object can-bus,id=canbus0" + " -device kvaser_pci,canbus=canbus0" * 2
+PACKAGES = "qemu-system-x86 {image} iproute2 kmod"
+IMAGES = {"plain": "linux-image-amd64", "rt": "linux-image-rt-amd64"}
+"""Kernels that can be chosen, and Debian's packages of them."""
+
+
+def find_kernel(flavour: str) -> Path | None:
+    """The newest installed kernel of a flavour that has CAN modules."""
+    kernels = [
+        Path("/boot") / f"vmlinuz-{folder.name}"
+        for folder in Path("/lib/modules").glob("*")
+        if (folder / "kernel/drivers/net/can/vcan.ko").exists()
+        or (folder / "kernel/drivers/net/can/vcan.ko.xz").exists()
+    ]
+    present = [kernel for kernel in kernels if kernel.exists() and ("-rt-" in kernel.name) == (flavour == "rt")]
+    return max(present, key=lambda kernel: [int(part) for part in _numbers(kernel.name)], default=None)
+
+
+def _numbers(text: str) -> list[str]:
+    return "".join(c if c.isdigit() else " " for c in text).split()
+
+
+def find_vng() -> str | None:
+    """The command of virtme-ng, beside this Python or on the path."""
+    return shutil.which("vng", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
+
+
+def missing(flavour: str) -> list[str]:
+    """What this machine lacks, a line each; empty if the lab can run."""
+    lacks = []
+    if shutil.which("qemu-system-x86_64") is None:
+        lacks.append("qemu-system-x86_64")
+    if find_kernel(flavour) is None:
+        kind = "a PREEMPT_RT kernel" if flavour == "rt" else "a kernel"
+        lacks.append(f"{kind} with CAN modules in /boot and /lib/modules")
+    lacks += [f"the command {name}" for name in ("ip", "modprobe") if shutil.which(name, path=_path()) is None]
+    if find_vng() is None:
+        lacks.append("virtme-ng (pip install virtme-ng)")
+    return lacks
+
+
+def _path() -> str:
+    return os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
+
+
+def guest_script(flavour: str, command: list[str], folder: Path) -> str:
+    """What the guest runs."""
+    return f"""
+        set -e
+        export PATH={shlex.quote(_path())} SKINWARE_CAN_LAB=1 SKINWARE_CAN_LAB_KERNEL={flavour}
+        export PYTHONDONTWRITEBYTECODE=1 HOME=/tmp HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
+        modprobe -a {MODULES}
+        sysctl -q -w net.core.netdev_max_backlog=100000
+        ip link set lo up
+        mountpoint -q /dev/shm || mount -t tmpfs tmpfs /dev/shm
+        cd {shlex.quote(str(folder))}
+        exec {shlex.join(command)}
+    """
+
+
+def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int:
+    """Boot the guest and run a command in it; the guest is gone when this returns.
+
+    Args:
+        flavour: of the kernel, a key of ``IMAGES``.
+        command: what to run.
+        timeout_s: when to stop the guest at the latest.
+        folder: where the command runs.
+
+    Returns:
+        The command's exit status; 1 if the lab cannot run here, 124 after the timeout.
+    """
+    lacks = missing(flavour)
+    kernel, vng = find_kernel(flavour), find_vng()
+    if lacks or kernel is None or vng is None:
+        return report(flavour, lacks)
+    # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
+    arguments = [vng, "--run", str(kernel), "--disable-kvm", "--force-9p", "--disable-microvm", "--cpus", "2"]
+    arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS}"]
+    arguments += ["--exec", f"bash -c {shlex.quote(guest_script(flavour, command, folder))}"]
+    environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
+    # through a pipe: given a file, QEMU opens it anew and overwrites what is in it
+    process = subprocess.Popen(
+        arguments,
+        start_new_session=True,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    relay = threading.Thread(target=copy_output, args=(process,), daemon=True)
+    relay.start()
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        sys.stderr.write(f"CAN lab: the guest was still running after {timeout_s:g} s and was stopped\n")
+        return 124
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        relay.join()
+
+
+def copy_output(process: subprocess.Popen[bytes]) -> None:
+    """What the guest prints, at once."""
+    while process.stdout is not None and (data := os.read(process.stdout.fileno(), 65536)):
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+
+def report(flavour: str, lacks: list[str]) -> int:
+    """Say what is missing and how to get it."""
+    if not lacks:
+        sys.stdout.write(f"the CAN lab can run: {find_kernel(flavour)}\n")
+        return 0
+    packages = PACKAGES.format(image=IMAGES[flavour])
+    sys.stderr.write(
+        f"the CAN lab cannot run here; missing: {', '.join(lacks)}\n"
+        f"install: apt-get install --no-install-recommends {packages}\n"
+    )
+    return 1
+
+
+def main(folder: Path) -> int:
+    """Entry point; commands run in ``folder``."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kernel", choices=IMAGES, default="plain", help="which kernel to boot (default: plain)")
+    actions = parser.add_subparsers(dest="action", required=True)
+    actions.add_parser("check")
+    running = actions.add_parser("run")
+    running.add_argument("-T", "--timeout", type=float, default=1800.0, help="seconds before the guest is stopped")
+    running.add_argument("command", nargs="+")
+    arguments = parser.parse_args()
+    if arguments.action == "check":
+        return report(arguments.kernel, missing(arguments.kernel))
+    return run(arguments.kernel, arguments.command, arguments.timeout, folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path.cwd()))

@@ -1,0 +1,84 @@
+"""Emulated devices on a pseudo terminal, in a thread: what a program opens is a serial port like any other."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+
+from skinware_drivers.cli.emulation import Emulation
+from skinware_drivers.serial.bus import PtyBus
+from skinware_drivers.testing.defect import require
+from skinware_drivers.virtual.hardware import load_emulator
+
+_LONGEST_S = 30.0
+_LONGEST_WRITE = 4096
+
+
+class _Control:
+    """Tells the path once the port is there, and ends the emulation."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self.ready = threading.Event()
+        self.failure: BaseException | None = None
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def fileno(self) -> int:
+        return self._event
+
+    def event(self, name: str, **facts: Any) -> None:
+        del facts
+        if name == "ready":
+            self.ready.set()
+
+    def stop(self) -> None:
+        self.stopped = True
+        os.eventfd_write(self._event, 1)
+
+    def close(self) -> None:
+        os.close(self._event)
+
+
+@contextmanager
+def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
+    """Run emulated devices as long as the ``with`` lasts; yields the path of their serial port.
+
+    Args:
+        emulator: class or registered name of an emulator whose frames are the bytes on the line.
+        options: of the emulator.
+    """
+    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
+    hardware = factory(msgspec.convert(options, factory.Options, strict=False))
+    bus, control = PtyBus("", payload_size=_LONGEST_WRITE), _Control()
+
+    def run() -> None:
+        try:
+            Emulation(bus, hardware, control).run(
+                control, bus_name="pty", driver=str(emulator), options=msgspec.defstruct("NoOptions", [])()
+            )
+        except BaseException as error:  # noqa: BLE001  (raised in the test)
+            control.failure = error
+            control.ready.set()
+
+    thread = threading.Thread(target=run, name="emulated patch", daemon=True)
+    thread.start()
+    try:
+        require(control.ready.wait(_LONGEST_S), "the emulated patch did not start")
+        if control.failure is not None:
+            raise control.failure
+        yield bus.note.removeprefix("serial port ")
+    finally:
+        control.stop()
+        thread.join(_LONGEST_S)
+        control.close()
+    require(not thread.is_alive(), "the emulated patch did not stop")
+    if control.failure is not None:
+        raise control.failure
+
+
+__all__ = ["emulated_on_a_pty"]

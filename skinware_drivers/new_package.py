@@ -22,7 +22,7 @@ from skinware.errors import ConfigurationError, SkinwareError
 from skinware_drivers.registry import DRIVERS
 from skinware_drivers.virtual.hardware import EMULATORS
 
-LONGEST_NAME = 24
+LONGEST_NAME = 20
 """Lines of the templates stay short enough with it."""
 
 _COMMON = {

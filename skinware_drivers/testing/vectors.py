@@ -56,8 +56,7 @@ def decode_frames(adapter: AnyAdapter, frames: Sequence[tuple[int, str | bytes]]
     decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
     batch = FrameBatch(len(frames), adapter.payload_size, decoder.headroom)
     for number, (identifier, payload) in enumerate(frames):
-        data = bytes.fromhex(payload) if isinstance(payload, str) else payload
-        batch.append(0, (number + 1) * _MS, identifier, data)
+        batch.append(0, (number + 1) * _MS, identifier, _bytes(payload))
     updates, foreign = decoder.decode(batch)
     decoder.state.show(updates)
     state = decoder.state
@@ -71,8 +70,13 @@ def decode_stream(adapter: SerialAdapter[Any], stream: str | bytes) -> Shown:
         adapter: the driver. Its ``framing``, ``layout`` and ``patches`` are used, nothing is sent.
         stream: the bytes, or their hexadecimal digits.
     """
-    framed = adapter.framing.framer().feed(bytes.fromhex(stream) if isinstance(stream, str) else stream)
+    framed = adapter.framing.framer().feed(_bytes(stream))
     return decode_frames(adapter, list(zip(framed.identifier.tolist(), framed.bodies(), strict=True)))
+
+
+def _bytes(data: str | bytes) -> bytes:
+    """Spaces between hexadecimal digits may be anywhere, or nowhere."""
+    return bytes.fromhex("".join(data.split())) if isinstance(data, str) else data
 
 
 __all__ = ["Shown", "decode_frames", "decode_stream"]

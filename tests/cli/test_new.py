@@ -22,7 +22,7 @@ from skinware_drivers.new_package import check_name, make_package
         ("9lives", "beginning with a letter$"),
         ("", "beginning with a letter$"),
         ("../up", "how about 'up'"),
-        ("x" * 25, "25 letters"),
+        ("x" * 21, "21 letters"),
         ("lambda", "a word of Python"),
         ("roboskin", r"there is driver 'roboskin' already \(skinware_drivers"),
         ("json", "there is a Python package 'json' already"),

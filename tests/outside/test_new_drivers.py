@@ -63,7 +63,7 @@ def test_a_new_serial_driver_reads_a_port(stranger: Stranger, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("transport", ["can", "serial", "virtual"])
-@pytest.mark.parametrize("name", ["q", "the_longest_of_the_names"])
+@pytest.mark.parametrize("name", ["q", "the_longest_of_names"])
 def test_what_is_made_is_clean_whatever_its_name(stranger: Stranger, transport: str, name: str, tmp_path: Path) -> None:
     stranger.do("skin-new", name, "--transport", transport, cwd=tmp_path)
     stranger.do("ruff", "check", cwd=tmp_path / name)

@@ -18,6 +18,18 @@ def test_a_tutorial_leads_to_what_it_promises(stranger: Stranger, page: str, tmp
     assert Walkthrough(tmp_path, stranger.environ).follow((ROOT / page).read_text()) > 15
 
 
+ENDS_BADLY = """<!-- terminal -->
+```console
+trap 'exit 3' INT
+touch f
+while :; do sleep 0.01; done
+```
+```console
+until [ -e f ]; do sleep 0.01; done
+```
+"""
+
+
 def walk(tmp_path: Path, page: str) -> None:
     Walkthrough(tmp_path, {"PATH": "/usr/bin:/bin"}).follow(page)
 
@@ -26,7 +38,12 @@ def test_every_kind_of_step_is_followed(tmp_path: Path) -> None:
     page = """
 <!-- terminal -->
 ```console
+touch ready
 exec sleep 1000
+```
+<!-- terminal, once there is ready -->
+```console
+rm ready
 ```
 ```console
 mkdir new && cd new
@@ -61,7 +78,7 @@ grep two numbers
 a = 1
 ```
 """
-    assert [step.kind for step in steps(page)].count("console") == 4
+    assert [step.kind for step in steps(page)].count("console") == 5
     walk(tmp_path, page)
     assert (tmp_path / "new/numbers").read_text() == "one\nthree\n"
     assert (tmp_path / "new/more").read_text() == "a = 1\n"
@@ -76,7 +93,7 @@ a = 1
         ("```console\necho a > f\n```\n<!-- edit: f -->\n```diff\n-b\n+c\n```\n", "line 4: 0 times in f"),
         ("```console\necho a > f\n```\n<!-- part of: f -->\n```python\nb\n```\n", "line 4: not in f"),
         ("```python\nb\n```\n", "line 1: what is to be done"),
-        ("<!-- terminal -->\n```console\nexit 3\n```\n", "line 1: exit 3"),
+        (ENDS_BADLY, "line 1: trap"),
     ],
 )
 def test_what_does_not_hold_is_found(page: str, words: str, tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ Blocks, in the order of the page:
 
 A comment in front of a block, which readers do not see, says what the page says in words:
 
-* ``<!-- terminal -->``: the commands run in a terminal of their own, until the next ``<!-- close terminals -->``.
+* ``<!-- terminal -->``: the commands run in a terminal of their own, until the next ``<!-- close terminals -->``;
+  ``<!-- terminal, once there is FILE -->``: what the reader started before takes a moment to make it.
 * ``<!-- fails -->``: the commands must fail.
 * ``<!-- edit: FILE -->``, ``<!-- write: FILE -->``, ``<!-- part of: FILE -->``: for the kinds above.
 """
@@ -25,10 +26,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.conftest import wait_until
+
 PATIENCE_S = 120.0
 _CLOSE = "<!-- close terminals -->"
 _STEP = re.compile(
-    r"^(?:<!-- (?P<how>terminal|fails|(?:edit|write|part of): \S+) -->\n)?"
+    r"^(?:<!-- (?P<how>terminal(?:, once there is \S+)?|fails|(?:edit|write|part of): \S+) -->\n)?"
     rf"```(?P<kind>\w+)\n(?P<text>.*?)^```$|^{_CLOSE}$",
     re.MULTILINE | re.DOTALL,
 )
@@ -79,7 +82,9 @@ class Walkthrough:
     def _do(self, step: Step) -> None:
         if step.kind == "close":
             self._close_terminals()
-        elif step.kind == "console" and step.how == "terminal":
+        elif step.kind == "console" and step.how.startswith("terminal"):
+            _, _, needed = step.how.partition(", once there is ")
+            wait_until((self._folder / needed).exists)
             self._terminals.append((step, self._start(step.text)))
         elif step.kind == "console":
             self._run(step)

@@ -125,7 +125,7 @@ class DriverWriter:
         group: str | None = None,
         operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
-        self.structure = structure
+        self.structure: Structure = structure
         self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
         self._service = ServiceWriter(
             name,

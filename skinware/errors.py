@@ -104,7 +104,9 @@ class BusNotAvailable(BusError):
     def __init__(self, message: str, *, is_down: bool = False, reason: BusReason | None = None) -> None:
         super().__init__(message)
         self.is_down = is_down
-        self.reason = (BusReason.INTERFACE_DOWN if is_down else BusReason.INTERFACE_GONE) if reason is None else reason
+        self.reason: BusReason = (
+            (BusReason.INTERFACE_DOWN if is_down else BusReason.INTERFACE_GONE) if reason is None else reason
+        )
 
 
 class BusSendError(BusError):

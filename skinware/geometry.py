@@ -96,9 +96,9 @@ class Geometry:
         radius_m: (n,) float64, m; NaN where it is not known.
     """
 
-    type_name: npt.NDArray[np.str_]
+    type_name: npt.NDArray[Any]
     uid: npt.NDArray[np.uint64]
-    frame: npt.NDArray[np.str_]
+    frame: npt.NDArray[Any]
     position_m: npt.NDArray[np.float64]
     normal: npt.NDArray[np.float64]
     radius_m: npt.NDArray[np.float64]

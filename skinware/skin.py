@@ -189,7 +189,7 @@ class Skin:
         on_detach: Told | None = None,
         on_structure: Told | None = None,
     ) -> None:
-        self.namespace = Namespace.of(namespace)
+        self.namespace: Namespace = Namespace.of(namespace)
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._readers: dict[str, DriverReader] = {}
         self._layout = SkinLayout((), ())

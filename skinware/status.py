@@ -79,3 +79,5 @@ class BusReason(enum.IntEnum):
     """Nobody on the wire acknowledges what is sent."""
     BUS_ERRORS = 11
     """The controller hears broken frames: another bit rate, missing termination, bad wires."""
+    REMOVED = 12
+    """The driver was told to do without this bus."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -74,14 +74,14 @@ class Structure:
     ) -> None:
         self.types: tuple[SensorType, ...] = tuple(types)
         self.buses: tuple[str, ...] = tuple(buses)
-        self.patch_name = _column("patch_name", patch_name)
-        self.patch_bus = _column("patch_bus", patch_bus)
-        self.module_patch = _column("module_patch", module_patch)
-        self.module_kind = _column("module_kind", module_kind)
-        self.sensor_uid = _column("sensor_uid", sensor_uid)
-        self.sensor_type = _column("sensor_type", sensor_type)
-        self.sensor_module = _column("sensor_module", sensor_module)
-        self.dtype = np.dtype(dtype)
+        self.patch_name: npt.NDArray[np.bytes_] = _column("patch_name", patch_name)
+        self.patch_bus: npt.NDArray[np.uint32] = _column("patch_bus", patch_bus)
+        self.module_patch: npt.NDArray[np.uint32] = _column("module_patch", module_patch)
+        self.module_kind: npt.NDArray[np.bytes_] = _column("module_kind", module_kind)
+        self.sensor_uid: npt.NDArray[np.uint64] = _column("sensor_uid", sensor_uid)
+        self.sensor_type: npt.NDArray[np.uint32] = _column("sensor_type", sensor_type)
+        self.sensor_module: npt.NDArray[np.uint32] = _column("sensor_module", sensor_module)
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
         self._check()
 
     @property
@@ -225,7 +225,7 @@ class Structure:
         mine, theirs = self.to_columns(), other.to_columns()
         return all(np.array_equal(mine[name], theirs[name]) for name in mine)
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__: ClassVar[None]  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         names = ", ".join(t.name for t in self.types)

@@ -27,7 +27,7 @@ from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
 from skinware.service import ServiceReader, ServiceWriter
 from skinware.skin import Skin, Snapshot
 
-log = logging.getLogger("skinware.threads")
+log: logging.Logger = logging.getLogger("skinware.threads")
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Frame)

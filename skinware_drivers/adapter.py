@@ -17,7 +17,7 @@ from skinware.status import Status
 from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
-from skinware_drivers.link import Link
+from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
@@ -34,6 +34,8 @@ class Notice(enum.Enum):
 
     RESTARTED = "restarted"
     """It lost its configuration: ``revive`` is called for it, and for it alone."""
+    CHANGED = "changed"
+    """It is not what it was described as (another device was plugged in, new firmware): ``join`` is called."""
     LOST = "lost"
     """It is not there, or not in a state to send: stale, until data comes."""
     SUSPECT = "suspect"
@@ -90,6 +92,7 @@ class Adapter(ABC, Generic[OptionsT]):
         patches: what hangs on each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+        pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
     """
 
     medium: ClassVar[str]
@@ -99,6 +102,7 @@ class Adapter(ABC, Generic[OptionsT]):
     layout: Layout
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
+    pace_per_ms: float = DEFAULT_PACE_PER_MS
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options
@@ -130,6 +134,17 @@ class Adapter(ABC, Generic[OptionsT]):
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
         return self.patches
+
+    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
+        """Put the times at which devices took their samples in place of the times of receipt, where frames tell them.
+
+        Called with what arrived from this bus before it is decoded; see :mod:`skinware_drivers.device_time`. By default
+        the times of receipt stay.
+
+        Args:
+            wire: (n,) frames, rows of :func:`skinware_drivers.bus.wire_dtype`.
+            time_ns: (n,) CLOCK_MONOTONIC ns; to be changed in place.
+        """
 
     async def configure(self, link: Link) -> None:
         """Set the devices up."""
@@ -165,6 +180,21 @@ class Adapter(ABC, Generic[OptionsT]):
         """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""
         del known
         return await self.describe(link)
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
+        """Ask who is there, without knowing anything of the bus, for ``skin-find --probe``. By default nobody is asked.
+
+        Only what can do no harm to any device of this kind may be sent, whatever it is doing.
+
+        Args:
+            link: the bus.
+            idle: nothing is sending: requests that would disturb a device which sends are harmless too.
+
+        Returns:
+            Who answered, in a few words for people; None if nobody did.
+        """
+        return None
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:

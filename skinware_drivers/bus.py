@@ -8,8 +8,9 @@ A bus knows nothing of skins. It moves frames between a wire and a :class:`Frame
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,13 @@ REMOTE_FLAG = 0x4000_0000
 """Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
 ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
+
+
+class Filter(NamedTuple):
+    """Frames that are wanted: ``identifier & mask == value``, flags of the identifier included."""
+
+    value: int
+    mask: int
 
 
 _CAN_PAYLOAD = 64
@@ -130,6 +138,10 @@ class Bus(ABC):
 
     Attributes:
         opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
+        narrows: frames that nobody wants can be left out, see ``narrow``.
+        bit_rate: of the wire, bit/s; 0 where it is not known.
+        wire_bits: about how many bits the frames seen so far took on the wire; counted where the bit rate is known.
+        fullest: largest share of the receive buffer in use after a take, since somebody set it to 0.
 
     Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
     down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and
@@ -164,6 +176,10 @@ class Bus(ABC):
         self.payload_size = payload_size
         self.listen_only = listen_only
         self.counters = BusCounters()
+        self.narrows = False
+        self.bit_rate = 0
+        self.wire_bits = 0
+        self.fullest = 0.0
 
     @abstractmethod
     def open(self) -> None:
@@ -200,6 +216,12 @@ class Bus(ABC):
     def close(self) -> None:
         """Let go of the wire. Idempotent."""
 
+    def narrow(self, filters: Sequence[Filter]) -> None:  # noqa: B027  (a bus need not be able to)
+        """From now on leave out what none of these lets through; without any, nothing is left out.
+
+        Called only where ``narrows`` is true. It holds until the next call, also over ``close`` and ``open``.
+        """
+
     def check(self) -> None:  # noqa: B027  (nothing to look after is the default)
         """Look after a bus from which nothing comes, twice a second: a loss need not show in ``receive``.
 
@@ -220,6 +242,11 @@ class Bus(ABC):
         """What a person should know about this bus (say, a receive buffer smaller than asked for)."""
         return ""
 
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"bus {self.channel}"
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.channel}>"
 
@@ -230,6 +257,7 @@ __all__ = [
     "REMOTE_FLAG",
     "Bus",
     "BusCounters",
+    "Filter",
     "FrameBatch",
     "wire_dtype",
 ]

@@ -15,6 +15,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.description import Patch
+from skinware_drivers.limits import BusLimits
 from skinware_drivers.link import Link
 
 log = logging.getLogger("skinware.driver")
@@ -39,6 +40,7 @@ class BusLine:
         patches: what was found on it, None until it was asked.
         state: what the bus is doing.
         reason: why, or what is wrong with it though frames come.
+        limits: how close it is to what it can carry.
         since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
@@ -55,7 +57,7 @@ class BusLine:
         self.adapter = adapter
         self.bus = bus
         adapter.fit(bus)
-        self.link = Link(bus)
+        self.link = Link(bus, adapter.pace_per_ms)
         self.patches: Sequence[Patch] | None = None
         self.state = BusState.CONNECTING
         self.reason = BusReason.NONE
@@ -68,6 +70,7 @@ class BusLine:
         self.suspects: set[int] = set()
         self.revived_ns = 0
         self._epoll = epoll
+        self.limits = BusLimits(name, bus)
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0
@@ -138,6 +141,7 @@ class BusLine:
             return
         time_ns = now_ns()
         self._news.catch_up()
+        self.limits.look()
         before, reason = (self.state, self.reason), self.bus.reason(time_ns)
         if reason == BusReason.BUS_OFF:
             self._become(BusState.DOWN, reason)
@@ -223,6 +227,21 @@ class BusLine:
             else:
                 self.started = True
                 return
+
+    def begin_lost(self) -> None:
+        """Wait for a bus that nobody has opened yet as for one that was lost; nothing hangs on it so far."""
+        self.patches = ()
+        self.lost.set()
+
+    def remove(self) -> None:
+        """Let go of the bus for good."""
+        if self.bus.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                self._epoll.unregister(self.bus.fileno())
+        self.bus.close()
+        self.lost.set()
+        self.patches = ()
+        self._become(BusState.GONE, BusReason.REMOVED)
 
     async def stop(self) -> None:
         """Make its devices silent, if they were told to send and it can be done now."""

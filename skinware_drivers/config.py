@@ -27,7 +27,7 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
-from skinware_drivers.options import nearest_name
+from skinware_drivers.options import nearest_name, options_from_strings
 
 T = TypeVar("T", bound=msgspec.Struct)
 
@@ -83,6 +83,26 @@ def read_config(path: Path) -> DriverConfig:
     for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
         check_keys(BusConfig, bus, f"{path}: bus {number + 1}")
     return convert(DriverConfig, data, str(path))
+
+
+def options_of_bus(struct: type[T], settings: DriverConfig, bus_name: str, given: Mapping[str, str] | None = None) -> T:
+    """A driver's options for one bus: what is given as text beats the bus' own, they beat the file's common ones.
+
+    Args:
+        struct: the driver's ``Options``.
+        settings: the file.
+        bus_name: as it stands in the file.
+        given: ``key=value`` texts, say of a command line.
+
+    Raises:
+        ConfigurationError: an unknown option or a wrong value.
+    """
+    of_bus = next((bus.options for bus in settings.bus if bus.name == bus_name), {})
+    values = {**settings.options, **of_bus}
+    if given:
+        as_given = options_from_strings(struct, given)
+        values.update({key: getattr(as_given, key) for key in given})
+    return convert(struct, values, f"options of {bus_name}")
 
 
 def convert(struct: type[T], data: Mapping[str, Any], where: str) -> T:

@@ -20,6 +20,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import SkinTables
+from skinware_drivers.device_stamps import DeviceStamps
 from skinware_drivers.frame_kind import Assembly, FrameKind
 from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
 from skinware_drivers.pairing import Pairing
@@ -97,6 +98,7 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
+        self.device_stamps = DeviceStamps(self._frames, self._module_patch)
         self.unknown_identifiers = np.zeros((len(structure.buses), STANDARD_IDENTIFIERS), np.int64)
 
     @property
@@ -132,6 +134,8 @@ class Decoder:
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
                 entry[rows] = compiled.name_modules(entry[rows], payload[rows])
+        new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
+        self.device_stamps.tell(kind[new], entry[new], payload[new], batch.time_ns[first:last][new])
         is_module = entry < self._n_modules
         foreign = np.flatnonzero(~is_module)
         parts = []
@@ -151,6 +155,10 @@ class Decoder:
         elif (newest_ns[1:] < newest_ns[:-1]).any():
             updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
+
+    def forget(self, patch: int) -> None:
+        """A patch has restarted: its sequence numbers begin anew."""
+        self._last_sequence[self._module_patch == patch] = -1
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""

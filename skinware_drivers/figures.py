@@ -11,15 +11,20 @@ from skinware.realtime import now_ns
 from skinware.status import PatchState
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
+from skinware_drivers.limits import MachineLimits
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 
 def figures(
-    lines: Sequence[BusLine], writer: DriverWriter | None, decoder: Decoder | None, publisher: Publisher | None
+    lines: Sequence[BusLine],
+    machine: MachineLimits,
+    writer: DriverWriter | None,
+    decoder: Decoder | None,
+    publisher: Publisher | None,
 ) -> dict[str, Any]:
     """State and counters of every bus and patch; only the buses' states as long as nothing is published."""
     if writer is None or decoder is None or publisher is None:
-        return {"sequence": 0, "buses": [_bus(line) for line in lines]}
+        return {"sequence": 0, "buses": [_bus(line) for line in lines], "machine": _machine(machine)}
     structure, state, time_ns = decoder.tables.structure, decoder.state, now_ns()
     buses = []
     for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
@@ -40,13 +45,18 @@ def figures(
                 **counters,
             }
         )
-    return {"sequence": writer.sequence, "buses": buses, "patches": patches}
+    return {"sequence": writer.sequence, "buses": buses, "patches": patches, "machine": _machine(machine)}
+
+
+def _machine(machine: MachineLimits) -> dict[str, int]:
+    return {"softnet_dropped": machine.softnet_dropped}
 
 
 def _bus(line: BusLine) -> dict[str, Any]:
     state_age_s = round((now_ns() - line.since_ns) / 1e9, 3)
     reason = line.reason.name.lower() if line.reason else None
-    return {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
+    state = {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
+    return {**state, "load": None if line.limits.load is None else round(line.limits.load, 3)}
 
 
 def _bounds(counts: list[int]) -> dict[str, int | None]:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, Values
+from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, StatusBytes, Values
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
@@ -91,6 +91,11 @@ class FrameKind:
             if isinstance(flag, Sentinel):
                 hit = np.isnan(raw) if flag.value != flag.value else raw == flag.value
                 status[:, columns] |= np.where(hit, np.uint8(flag.status), np.uint8(0))
+                continue
+            if isinstance(flag, StatusBytes):
+                end = flag.offset + raw.shape[1]
+                rows = np.flatnonzero(length >= end)
+                status[rows, columns] |= payload[rows, flag.offset : end] & np.uint8(flag.mask)
                 continue
             place = flag.offset, np.dtype(flag.dtype).str
             if place not in words:

@@ -143,6 +143,19 @@ class Sentinel:
 
 
 @dataclass(frozen=True)
+class StatusBytes:
+    """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
+
+    Attributes:
+        offset: first byte.
+        mask: bits of each that are status bits.
+    """
+
+    offset: int
+    mask: Status
+
+
+@dataclass(frozen=True)
 class Stamp:
     """A sequence number in the payload that counts a module's frames; what it skips or repeats is counted.
 
@@ -155,6 +168,35 @@ class Stamp:
     offset: int
     dtype: str
     modulo: int | None = None
+
+
+@dataclass(frozen=True)
+class DeviceTime:
+    """The time in a payload at which the device took the values, by its own clock.
+
+    The frame's time then is that time on our clock, and not that of the receipt. All frames of a patch have one clock.
+
+    Attributes:
+        offset: first byte.
+        dtype: unsigned numpy dtype with byte order, at most 4 bytes.
+        unit_s: seconds per count.
+        modulo: it wraps to 0 here; default: the dtype's own range.
+    """
+
+    offset: int
+    dtype: str
+    unit_s: float
+    modulo: int | None = None
+
+    @property
+    def end(self) -> int:
+        """One past its last byte."""
+        return self.offset + np.dtype(self.dtype).itemsize
+
+    @property
+    def turn(self) -> int:
+        """Counts until it is 0 again."""
+        return self.modulo or 1 << 8 * np.dtype(self.dtype).itemsize
 
 
 @dataclass(frozen=True)
@@ -186,6 +228,7 @@ class Frame:
             the patch has one module.
         flags: what sets status bits.
         stamp: sequence number, if there is one.
+        time: the device's own time, if it tells it.
     """
 
     name: str
@@ -194,8 +237,9 @@ class Frame:
     values: Values | Sequence[Values] | Expand
     patch: Bits | int | None = None
     module: Bits | int | None = None
-    flags: Sequence[Flag | Sentinel] = ()
+    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
     stamp: Stamp | None = None
+    time: DeviceTime | None = None
 
     @property
     def runs(self) -> Sequence[Values]:
@@ -251,6 +295,8 @@ class Layout:
             raise ConfigurationError(f"a layout has 1 to {MOST_FRAMES} frames of different names, not {names}")
         for frame in self.frames:
             _check_frame(frame)
+        if len({(frame.time.unit_s, frame.time.turn) for frame in self.frames if frame.time is not None}) > 1:
+            raise ConfigurationError("the frames of a device tell the time of one clock: give one unit and one modulo")
         if self.cycle is not None:
             members = list(self.cycle.members)
             if len(set(members)) < len(members) or not set(members) <= set(names) or len(members) < 2:
@@ -296,3 +342,5 @@ def _check_frame(frame: Frame) -> None:
             raise refuse(f"byte {condition.offset} is not in every right payload")
     if frame.stamp is not None and frame.stamp.offset + np.dtype(frame.stamp.dtype).itemsize > min(frame.length):
         raise refuse("the sequence number is not in every right payload")
+    if frame.time is not None and frame.time.end > min(frame.length):
+        raise refuse("the device's time is not in every right payload")

@@ -12,10 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
-from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus import Bus, Filter, FrameBatch
+from skinware_drivers.filters import fewest, filters_of
+from skinware_drivers.layout import Layout
 
-_SEND_RETRY_S = 0.002
+_FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05
 _SEND_TIMEOUT_S = 0.5
+DEFAULT_PACE_PER_MS = 4.0
+"""Half of what a CAN bus of 1 Mbit/s can carry: the devices' own frames need the other half."""
+AT_ONCE = 8
+"""Frames that may be sent without a pause, if none was sent for a while; reception waits for no more than these."""
 
 
 class Reply(NamedTuple):
@@ -49,18 +55,26 @@ class Heard(NamedTuple):
 class Link:
     """One bus as a driver's handshakes see it. Everything runs in the runner's one event loop, without a thread.
 
-    Frames that the layout does not claim are offered to whoever waits; nobody waiting costs nothing.
+    Frames that the layout does not claim are offered to whoever waits; nobody waiting costs nothing. However much a
+    driver sends, it sends at a pace, and everything else has its turn between.
+
+    Args:
+        bus: the bus.
+        pace_per_ms: frames that may be sent within a millisecond on average.
     """
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, pace_per_ms: float = DEFAULT_PACE_PER_MS) -> None:
         self._bus = bus
+        self._gap_s = 1e-3 / pace_per_ms
+        self._free_at_s = 0.0
+        self._wanted: Sequence[Filter] | None = None
         self._waiters: list[tuple[tuple[Match, ...], asyncio.Queue[Reply]]] = []
         self._heard: Counter[Heard] | None = None
 
     @property
     def bus_name(self) -> str:
         """Name of the bus, for messages."""
-        return self._bus.channel
+        return self._bus.name
 
     @property
     def listen_only(self) -> bool:
@@ -73,15 +87,54 @@ class Link:
         Raises:
             BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
         """
-        deadline = asyncio.get_running_loop().time() + timeout_s
+        loop = asyncio.get_running_loop()
+        deadline_s, retry_s = loop.time() + timeout_s, _FIRST_RETRY_S
         while True:
+            await self._keep_pace()
             try:
                 self._bus.send(identifier, payload)
                 return
             except BusSendError:
-                if self._bus.listen_only or asyncio.get_running_loop().time() >= deadline:
+                left_s = deadline_s - loop.time()
+                if self._bus.listen_only or left_s <= 0:
                     raise
-            await asyncio.sleep(_SEND_RETRY_S)
+            await asyncio.sleep(min(retry_s, left_s))
+            retry_s = min(2 * retry_s, _LONGEST_RETRY_S)
+
+    async def _keep_pace(self) -> None:
+        """Wait until one more frame may be sent."""
+        loop = asyncio.get_running_loop()
+        self._free_at_s = max(self._free_at_s, loop.time() - AT_ONCE * self._gap_s) + self._gap_s
+        wait_s = self._free_at_s - loop.time()
+        if wait_s > 0:
+            await asyncio.sleep(wait_s)
+
+    def narrow(self, layout: Layout) -> None:
+        """From now on only frames of this layout, and what somebody waits for, need be received."""
+        if self._bus.narrows:
+            self._wanted = filters_of(layout)
+            self._tell_bus()
+
+    def _tell_bus(self) -> None:
+        if self._wanted is None:
+            return
+        if self._heard is not None:
+            self._bus.narrow(())
+            return
+        awaited = [Filter(m.value, m.mask) for matches, _ in self._waiters for m in matches]
+        self._bus.narrow(fewest([*self._wanted, *awaited]))
+
+    @contextmanager
+    def _waiting(self, matches: tuple[Match, ...]) -> Iterator[asyncio.Queue[Reply]]:
+        queue: asyncio.Queue[Reply] = asyncio.Queue()
+        entry = (matches, queue)
+        self._waiters.append(entry)
+        self._tell_bus()
+        try:
+            yield queue
+        finally:
+            self._waiters.remove(entry)
+            self._tell_bus()
 
     async def request(self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float) -> Reply:
         """Send one frame and wait for the first answer to it; older frames do not count.
@@ -90,19 +143,14 @@ class Link:
             HandshakeTimeout: no answer in time.
             BusSendError: as ``send``.
         """
-        queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entry = ((reply,), queue)
-        self._waiters.append(entry)
-        try:
+        with self._waiting((reply,)) as queue:
             await self.send(identifier, payload)
-            async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
-                return await queue.get()
-        except TimeoutError:
-            raise HandshakeTimeout(
-                f"{self.bus_name}: no answer to {identifier:03X} [{payload.hex(' ').upper()}] within {timeout_s:g} s"
-            ) from None
-        finally:
-            self._waiters.remove(entry)
+            try:
+                async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
+                    return await queue.get()
+            except TimeoutError:
+                sent = f"{identifier:03X} [{payload.hex(' ').upper()}]"
+                raise HandshakeTimeout(f"{self.bus_name}: no answer to {sent} within {timeout_s:g} s") from None
 
     async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
         """Send one frame and gather all answers that come within ``duration_s``.
@@ -110,36 +158,28 @@ class Link:
         Raises:
             BusSendError: as ``send``.
         """
-        queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entry = ((reply,), queue)
-        self._waiters.append(entry)
-        try:
+        with self._waiting((reply,)) as queue:
             await self.send(identifier, payload)
             await asyncio.sleep(duration_s)
-        finally:
-            self._waiters.remove(entry)
         return [queue.get_nowait() for _ in range(queue.qsize())]
 
     async def listen(self, duration_s: float) -> Counter[Heard]:
         """Send nothing and count what is on the bus for a time (frames of declared modules excepted)."""
         heard: Counter[Heard] = Counter()
         self._heard = heard
+        self._tell_bus()
         try:
             await asyncio.sleep(duration_s)
         finally:
             self._heard = None
+            self._tell_bus()
         return heard
 
     @contextmanager
     def follow(self, *matches: Match) -> Iterator[asyncio.Queue[Reply]]:
         """Hear every frame that matches, in order of arrival, in a queue."""
-        queue: asyncio.Queue[Reply] = asyncio.Queue()
-        entry = (matches, queue)
-        self._waiters.append(entry)
-        try:
+        with self._waiting(matches) as queue:
             yield queue
-        finally:
-            self._waiters.remove(entry)
 
     async def sleep(self, duration_s: float) -> None:
         """Let time pass; the bus keeps being read."""

@@ -20,13 +20,17 @@ class Operation:
     Attributes:
         method: coroutine function (adapter, link, patches, ...).
         sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
+        looks: it changes nothing.
+        alone: it is for ``skin-config`` on a bus without a running driver, which would not know what happened.
     """
 
     method: Callable[..., Any]
-    sets_up: bool
+    sets_up: bool = False
+    looks: bool = False
+    alone: bool = False
 
 
-def operation(*, sets_up: bool = False) -> Callable[[OperationT], OperationT]:
+def operation(*, sets_up: bool = False, looks: bool = False, alone: bool = False) -> Callable[[OperationT], OperationT]:
     """Mark an adapter's coroutine method as an operation, under its own name.
 
     ::
@@ -41,19 +45,27 @@ def operation(*, sets_up: bool = False) -> Callable[[OperationT], OperationT]:
 
     Args:
         sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
+        looks: it changes nothing, so nobody need be asked first, and patches need not be known.
+        alone: a running driver does not offer it; ``skin-config`` does, on a bus without one.
     """
 
     def mark(method: OperationT) -> OperationT:
-        setattr(method, _MARK, Operation(method, sets_up))
+        setattr(method, _MARK, Operation(method, sets_up, looks, alone))
         return method
 
     return mark
 
 
-def operations_of(adapter: type[Any]) -> dict[str, Operation]:
-    """The operations of an adapter class by name, sorted."""
+def operations_of(adapter: type[Any], *, alone: bool = False) -> dict[str, Operation]:
+    """The operations of an adapter class by name, sorted.
+
+    Args:
+        adapter: the class.
+        alone: also those that a running driver does not offer.
+    """
     members = inspect.getmembers(adapter, inspect.iscoroutinefunction)
-    return {name: getattr(member, _MARK) for name, member in members if hasattr(member, _MARK)}
+    found: dict[str, Operation] = {name: getattr(member, _MARK) for name, member in members if hasattr(member, _MARK)}
+    return {name: declared for name, declared in found.items() if alone or not declared.alone}
 
 
 def check_arguments(method: Callable[..., Any], arguments: dict[str, Any]) -> None:

@@ -12,11 +12,11 @@ from typing import Any, Literal
 import numpy as np
 
 from skinware.driver_service import DriverWriter
-from skinware.errors import BusError, BusNotAvailable, StructureError
+from skinware.errors import BusError, BusNotAvailable, ConfigurationError, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.service import DEFAULT_SLOTS
-from skinware.status import PatchState
+from skinware.status import BusReason, PatchState
 from skinware_drivers.adapter import AnyAdapter, Notice, Watch
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.bus_line import BusLine
@@ -25,6 +25,7 @@ from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.desk import RequestDesk
 from skinware_drivers.figures import figures
 from skinware_drivers.layout import Layout
+from skinware_drivers.limits import MachineLimits
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
 from skinware_drivers.polling import Poller
@@ -86,6 +87,8 @@ class Runner:
         self._group = group
         self._on_ready = on_ready
         self._watch: Watch | None = None
+        self._machine = MachineLimits()
+        self._serving: dict[BusLine, asyncio.Task[None]] = {}
         self._batch = self._make_batch(headroom=0)
         self._stopping = asyncio.Event()
         self._failure: BaseException | None = None
@@ -121,19 +124,16 @@ class Runner:
         """
         loop = asyncio.get_running_loop()
         self._namespace.create(self._group)
-        tasks: list[asyncio.Task[None]] = []
         try:
             for line in self.lines:
                 line.open()
             loop.add_reader(self._epoll.fileno(), self._on_readable)
-            stopping = asyncio.create_task(self._wait_for_stop())
-            tasks = [stopping, *(asyncio.create_task(self._serve(line)) for line in self.lines)]
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            self._serving = {line: self._beside(self._serve(line)) for line in self.lines}
+            await self._stopping.wait()
             if self._failure is not None:
                 raise self._failure
         finally:
+            tasks = list(self._serving.values())
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -147,8 +147,52 @@ class Runner:
         """Take in what has appeared on the buses since the start, as a new generation."""
         self._join_requested.set()
 
-    async def _wait_for_stop(self) -> None:
-        await self._stopping.wait()
+    @property
+    def bus_names(self) -> list[str]:
+        """Names of its buses, without those that were removed."""
+        return [line.name for line in self.lines if line.reason != BusReason.REMOVED]
+
+    async def add_bus(self, name: str, adapter: AnyAdapter, bus: Bus) -> None:
+        """Take in one more bus while the others go on; users see a new generation. It need not be there yet.
+
+        A bus that was removed gets its old place back. The others keep theirs, and with them the uids of their sensors.
+
+        Raises:
+            ConfigurationError: there is a bus of this name, or its sensor types contradict those of the others.
+        """
+        async with self._built:
+            known = next((line for line in self.lines if line.name == name), None)
+            if known is not None and known.reason != BusReason.REMOVED:
+                raise ConfigurationError(f"bus {name} is in use already")
+            line = BusLine(name, len(self.lines) if known is None else known.ordinal, adapter, bus, self._epoll)
+            line.begin_lost()
+            self.lines[line.ordinal : line.ordinal + 1] = [line]
+            self._rebuild(anew=True)  # nothing of it may arrive before there is a place for it
+            if self.decoder is not None and len(self.decoder.tables.structure.buses) < len(self.lines):
+                del self.lines[line.ordinal]
+                raise ConfigurationError(f"bus {name} does not fit the others (what was logged says why)")
+        self._serving[line] = self._beside(self._serve(line))
+
+    async def remove_bus(self, name: str) -> None:
+        """Stop the devices on a bus and go on without it; users see a new generation.
+
+        Its place stays, empty, so that the sensors of the other buses keep their uids.
+
+        Raises:
+            ConfigurationError: there is no such bus, or it is the last one with sensors.
+        """
+        line = next((line for line in self.lines if line.name == name and line.reason != BusReason.REMOVED), None)
+        if line is None:
+            raise ConfigurationError(f"there is no bus {name}")
+        if not any(other.patches for other in self.lines if other is not line):
+            raise ConfigurationError(f"bus {name} is the last one with sensors; stop the driver instead")
+        task = self._serving.pop(line)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await line.stop()
+        async with self._built:
+            line.remove()
+            self._rebuild()
 
     async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
         if self._desk is not None and self.writer is not None:
@@ -226,7 +270,7 @@ class Runner:
             except BusError as error:
                 log.warning("%s: nothing joined: %s", line.name, str(error))
                 continue
-            if patches and patches != line.patches:
+            if patches:  # also the same ones: what is known of their types and frames may have changed
                 line.patches = patches
                 await self._build()
 
@@ -235,23 +279,28 @@ class Runner:
     async def _build(self) -> None:
         """(Re)build tables, decoder and writer once every bus has been asked what hangs on it."""
         async with self._built:
-            if any(line.patches is None for line in self.lines) or not any(line.patches for line in self.lines):
-                return
-            adapters = [line.adapter for line in self.lines]
-            try:
-                tables = assemble(
-                    [(line.name, line.patches or ()) for line in self.lines],
-                    join_types([adapter.types for adapter in adapters]),
-                    np.result_type(*(adapter.dtype for adapter in adapters)),
-                )
-            except StructureError as error:
-                log.error("what was found makes no skin: %s", error)
-                return
-            known = self.decoder
-            if known is not None and tables.structure == known.tables.structure and self._layouts == known.layouts:
-                return
-            self._go_over_to(tables)
-            self._built.notify_all()
+            self._rebuild()
+
+    def _rebuild(self, *, anew: bool = False) -> None:
+        """With ``_built`` held. ``anew``: also if nothing has changed but the bus behind a name."""
+        if any(line.patches is None for line in self.lines) or not any(line.patches for line in self.lines):
+            return
+        adapters = [line.adapter for line in self.lines]
+        try:
+            tables = assemble(
+                [(line.name, line.patches or ()) for line in self.lines],
+                join_types([adapter.types for adapter in adapters]),
+                np.result_type(*(adapter.dtype for adapter in adapters)),
+            )
+        except StructureError as error:
+            log.error("what was found makes no skin: %s", error)
+            return
+        known = self.decoder
+        is_known = known is not None and tables.structure == known.tables.structure and self._layouts == known.layouts
+        if is_known and not anew:
+            return
+        self._go_over_to(tables)
+        self._built.notify_all()
 
     def _go_over_to(self, tables: SkinTables) -> None:
         adapter = self.lines[0].adapter
@@ -275,6 +324,9 @@ class Runner:
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
         self.decoder = Decoder(self._layouts, tables)
+        for line in self.lines:
+            if line.patches:
+                line.link.narrow(line.adapter.layout)
         self._watch = adapter.watch(tables)
         for line in self.lines:
             for key in line.suspects:
@@ -335,7 +387,9 @@ class Runner:
             for number, line in enumerate(ready):
                 batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
                 try:
+                    first = batch.stop
                     if line.bus.receive(batch, line.ordinal):
+                        line.adapter.stamp(batch.wire[first : batch.stop], batch.time_ns[first : batch.stop])
                         line.heard_ns = time_ns
                         is_behind |= not batch.free
                 except BusNotAvailable as error:
@@ -383,6 +437,7 @@ class Runner:
     # -- buses and patches ----------------------------------------------------------------------------------------
 
     def _update_bus_states(self) -> None:
+        self._machine.look()
         for line in self.lines:
             line.look(self._silence_ns)
             if self.publisher is not None:
@@ -416,9 +471,10 @@ class Runner:
         """Set one patch up anew."""
         async with line.busy:
             number = self._number_of(line, patch)
-            if self.publisher is None or self._watch is None or number is None:
+            if self.publisher is None or self._watch is None or self.decoder is None or number is None:
                 return
             self.publisher.lose(number, PatchState.RESTARTED)
+            self.decoder.forget(number)
             try:
                 await line.adapter.revive(line.link, patch)
             except BusError as error:
@@ -445,6 +501,9 @@ class Runner:
                 self._watch.forget(number)
             elif notice is Notice.LOST or self._listen_only:
                 self.publisher.lose(number, PatchState.STALE)
+            elif notice is Notice.CHANGED:
+                self.publisher.lose(number, PatchState.STALE)
+                self.join()
             elif patch.key not in reviving or reviving[patch.key].done():
                 log.warning("%s: %s has restarted", line.name, patch.name)
                 self.publisher.lose(number, PatchState.RESTARTED)
@@ -496,7 +555,7 @@ class Runner:
 
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
-        return figures(self.lines, self.writer, self.decoder, self.publisher)
+        return figures(self.lines, self._machine, self.writer, self.decoder, self.publisher)
 
 
 def _first_patch(decoder: Decoder, line: BusLine) -> int:

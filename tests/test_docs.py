@@ -17,7 +17,7 @@ from tests.commands import PATIENCE_S, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-ELSEWHERE = ("c-and-cpp",)
+ELSEWHERE = ("c-and-cpp", "icub")
 """Pages whose snippets other tests run."""
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 

@@ -130,6 +130,7 @@ typedef enum skinware_result {
 #define SKINWARE_BUS_REASON_OVERFLOW 9u
 #define SKINWARE_BUS_REASON_NO_ACKNOWLEDGEMENT 10u
 #define SKINWARE_BUS_REASON_BUS_ERRORS 11u
+#define SKINWARE_BUS_REASON_REMOVED 12u
 
 /* An attached service. */
 typedef struct skinware_reader skinware_reader;

@@ -65,7 +65,7 @@ class Word:
 
     def __init__(self, memory: npt.NDArray[np.uint8], offset: int) -> None:
         self._memory = memory
-        self.address = memory.ctypes.data + offset
+        self.address: int = memory.ctypes.data + offset
         self._address = ctypes.c_void_p(self.address)
         self._expected = ctypes.c_uint32()
         self._timeout = _Timespec()

@@ -46,9 +46,9 @@ class Namespace:
     """
 
     def __init__(self, name: str | None = None, *, owner: str | int | None = None) -> None:
-        self.name = check_name(name or os.environ.get("SKINWARE_NAMESPACE") or "default", "namespace")
-        self.path = ROOT / f"skinware.{self.name}"
-        self.readers_path = self.path / "readers"
+        self.name: str = check_name(name or os.environ.get("SKINWARE_NAMESPACE") or "default", "namespace")
+        self.path: Path = ROOT / f"skinware.{self.name}"
+        self.readers_path: Path = self.path / "readers"
         self._extra_owner = _user_id(owner if owner is not None else os.environ.get("SKINWARE_OWNER"))
 
     @classmethod

@@ -70,13 +70,13 @@ class Frame:
         self._data = data
         self._words = words if type(data) is memoryview else None
         self._columns = ring.columns
-        self.context = ring.context
-        self.generation = ring.generation
-        self.sequence = sequence
+        self.context: object = ring.context
+        self.generation: int = ring.generation
+        self.sequence: int = sequence
         self.acquired_ns: int = words[_ACQUIRED]
         self.published_ns: int = words[_PUBLISHED]
         self.flags: int = words[_FLAGS]
-        self.stale = False
+        self.stale: bool = False
 
     @property
     def position(self) -> tuple[int, int]:
@@ -126,12 +126,12 @@ class RingReader(Generic[F]):
         layout = segment.layout
         self._frame_class = frame_class
         self.context = context
-        self.columns = segment.slot_formats()
+        self.columns: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]] = segment.slot_formats()
         self.segment = segment
-        self.generation = segment.generation
+        self.generation: int = segment.generation
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
-        self.wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
+        self.wake_word: _futex.Word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slots = _slots(segment)
         self._slot_words = _slot_headers(segment)
@@ -251,7 +251,7 @@ class RingWriter:
         self._contents = [slot[_layout.SLOT.itemsize :] for slot in _slots(segment)]
         self._statistics = self._words[_STATISTICS]
         self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
-        self.sequence = 0
+        self.sequence: int = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
             segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
 

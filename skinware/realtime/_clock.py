@@ -38,9 +38,9 @@ class Periodic:
     """
 
     def __init__(self, rate_hz: float, start_ns: int | None = None) -> None:
-        self.period_ns = period_ns(rate_hz)
-        self.deadline_ns = (now_ns() if start_ns is None else start_ns) + self.period_ns
-        self.missed = 0
+        self.period_ns: int = period_ns(rate_hz)
+        self.deadline_ns: int = (now_ns() if start_ns is None else start_ns) + self.period_ns
+        self.missed: int = 0
 
     def advance(self, time_ns: int) -> None:
         """Move to the first deadline after ``time_ns``; those that are jumped over count as missed."""

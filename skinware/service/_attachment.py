@@ -38,8 +38,8 @@ class Attachment(Generic[F]):
     frame_class: type[Any] = Frame
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None) -> None:
-        self.name = check_name(name, "service")
-        self.namespace = Namespace.of(namespace)
+        self.name: str = check_name(name, "service")
+        self.namespace: Namespace = Namespace.of(namespace)
         self._client = RequestClient(self.namespace, name)
         self._closed = False
         self._moved = False

@@ -44,8 +44,8 @@ class Request:
     """
 
     def __init__(self, server: RequestServer, peer: socket.socket, ask: Ask) -> None:
-        self.operation = ask.operation
-        self.arguments = ask.arguments
+        self.operation: str = ask.operation
+        self.arguments: dict[str, Any] = ask.arguments
         self.cancelled = False
         self._server = server
         self._peer = peer
@@ -88,7 +88,7 @@ class RequestServer(ForkGuard):
 
     def __init__(self, namespace: Namespace, name: str, operations: Mapping[str, str]) -> None:
         super().__init__()
-        self.operations = dict(operations)
+        self.operations: dict[str, str] = dict(operations)
         self.paused = False
         self._path = namespace.socket_path(name)
         self._inode = 0

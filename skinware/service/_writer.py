@@ -63,9 +63,9 @@ class ServiceWriter:
         description: str = "",
         operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
-        self.name = check_name(name, "service")
-        self.namespace = Namespace.of(namespace)
-        self.missed_periods = 0
+        self.name: str = check_name(name, "service")
+        self.namespace: Namespace = Namespace.of(namespace)
+        self.missed_periods: int = 0
         self._paused = self._stopping = False
         self._kind = kind
         self._slots = slots

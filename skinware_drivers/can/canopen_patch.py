@@ -39,6 +39,7 @@ _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
 _BOOT_UP, _OPERATIONAL = 0, 5
 _EXACT = EXTENDED_FLAG | 0x7FF
 _LAST_SYNCHRONOUS = 240
+_MOST_ERRORS_TOLD = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
 
 
@@ -74,6 +75,9 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
     A node is a patch, each of its TPDOs a module, each mapped number a sensor: uid = node << 24 | index << 8 |
     subindex, type by its name in the EDS (one that contains ``temperature`` is of that type, and so on). Factor and
     Unit of the EDS, if it has them, are scale and unit.
+
+    Attributes:
+        expects_heartbeat_of: nodes that took the heartbeat period of the options; others are not missed.
     """
 
     Options: ClassVar[type[msgspec.Struct]] = CanopenOptions
@@ -84,6 +88,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         self._dictionary = _read_eds(options.eds, 0)
         self._clients: dict[int, SdoClient] = {}
         self._tpdos: dict[int, list[Tpdo]] = {}
+        self.expects_heartbeat_of: set[int] = set()
 
     @property
     def period_s(self) -> float:
@@ -167,9 +172,9 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
                     async with asyncio.timeout(loss_s / 2):
                         frame = await frames.get()
                     nodes[frame.identifier & 0x7F].hear(frame)
-                if self.options.heartbeat_ms and frames.empty():  # what was heard comes before what was not
-                    for node in nodes.values():
-                        node.look(asyncio.get_running_loop().time(), loss_s)
+                if frames.empty():  # what was heard comes before what was not
+                    for node in self.expects_heartbeat_of & nodes.keys():
+                        nodes[node].look(asyncio.get_running_loop().time(), loss_s)
 
     def _default(self, node: int) -> list[Tpdo]:
         return default_tpdos(_read_eds(self.options.eds, node))
@@ -195,17 +200,21 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
 
     async def _configure(self, link: Link, node: int) -> None:
         await link.send(0x000, bytes((_ENTER_PRE_OPERATIONAL, node)))
-        await self._write(node, 0x1017, 0, self.options.heartbeat_ms)
+        self.expects_heartbeat_of.discard(node)
+        if await self._write(node, 0x1017, 0, self.options.heartbeat_ms) and self.options.heartbeat_ms:
+            self.expects_heartbeat_of.add(node)
         for tpdo in self._tpdos[node]:
             if tpdo.transmission > _LAST_SYNCHRONOUS:
                 await self._write(node, 0x1800 + tpdo.number - 1, 5, self.options.period_ms)
 
-    async def _write(self, node: int, index: int, subindex: int, value: int) -> None:
-        """Set an UNSIGNED16; a device that does not let itself be told keeps its own."""
+    async def _write(self, node: int, index: int, subindex: int, value: int) -> bool:
+        """Set an UNSIGNED16; False if the device keeps its own."""
         try:
             await self._clients[node].write(index, subindex, value.to_bytes(2, "little"))
         except SdoAborted as error:
             log.warning("%s", str(error))
+            return False
+        return True
 
 
 class _NodeState:
@@ -216,6 +225,7 @@ class _NodeState:
         self._tell = tell
         self._heard_s: float | None = None
         self._is_operational = False
+        self._errors: set[int] = set()
 
     def hear(self, frame: Reply) -> None:
         """A heartbeat, a boot-up message, or an EMCY."""
@@ -234,6 +244,7 @@ class _NodeState:
     def _hear_state(self, state: int) -> None:
         if state == _BOOT_UP:
             self._heard_s = None
+            self._errors.clear()
             self._tell(self._patch, Notice.RESTARTED)
         else:
             self._heard_s = asyncio.get_running_loop().time()
@@ -246,10 +257,13 @@ class _NodeState:
             return
         code = int.from_bytes(payload[:2], "little")
         if code >> 8 == 0:  # error reset, or no error
+            self._errors.clear()
             self._tell(self._patch, Notice.SOUND)
             return
-        text = EmcyError(code, payload[2], payload[3:], 0).get_desc() or "unknown error"
-        log.warning("%s reports an error: %s (code %04X)", self._patch.name, text, code)
+        if code not in self._errors and len(self._errors) < _MOST_ERRORS_TOLD:  # each once, until they are over
+            self._errors.add(code)
+            text = EmcyError(code, payload[2], payload[3:], 0).get_desc() or "unknown error"
+            log.warning("%s reports an error: %s (code %04X)", self._patch.name, text, code)
         self._tell(self._patch, Notice.SUSPECT)
 
 

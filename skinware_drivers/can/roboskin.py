@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 import msgspec
@@ -22,6 +22,7 @@ from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can.roboskin_boards import BoardOperations
 from skinware_drivers.can.roboskin_layout import (
     HEAD_BYTE,
     INERTIAL,
@@ -67,7 +68,8 @@ _RECALIBRATION_CYCLES = 5
 """A board re-calibrates all its triangles after this many cycles with a channel that does not acknowledge though it
 is connected (embot_app_application_theSkin.cpp)."""
 _MTB3_TYPE = 5
-"""Board type in the answers of an MTB3; others with skin are 11 (mtb4), 16 (mtb4w) and 20 (mtb4c)."""
+_SKIN_BOARD_TYPES = (_MTB3_TYPE, 11, 16, 20)
+"""Board types in answers: mtb (MTB3), mtb4, mtb4w, mtb4c (icub-firmware embot_prot_can.h)."""
 
 
 class BaselineWatch(Watch):
@@ -99,7 +101,7 @@ class BaselineWatch(Watch):
         self._not_acknowledged[patch] = 0
 
 
-class RoboskinDriver(CanAdapter[RoboskinOptions]):
+class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     """MTB3 and MTB4 boards. See this package's ``roboskin_layout`` for the wire, and ``RoboskinOptions``.
 
     Sensor uid = board << 16 | triangle << 8 | channel. Non-tactile channels (thermal pads) are of type temperature.
@@ -115,6 +117,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         self._boards: tuple[int, ...] = options.boards
         self._board_type: dict[int, int] = {}
         self._disabled: set[int] = set()  # patch keys
+        self._told = False
         self.types = make_types(options)
         if options.all_inertial:
             self.dtype = np.int16
@@ -142,10 +145,10 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         else:
             answers = await link.collect(0x70F, b"\xff", Match(0x700, 0x70F, b"\xff"), duration_s=_DISCOVERY_S)
             # five bytes: the application answers; four: the boot loader, which has no skin
-            found = {a.identifier >> 4 & 0xF: a.payload[1] for a in answers if len(a.payload) >= 5}
-            self._boards = tuple(board for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in found)
-            self._board_type = {board: found[board] for board in self._boards}
-        self._tell_what_is_odd(link)
+            self._take_found(link, {a.identifier >> 4 & 0xF: a.payload[1] for a in answers if len(a.payload) >= 5})
+        if not self._told:
+            self._tell_what_is_odd(link)
+        self._told = bool(self._boards)
         self.layout = self._layout()
         return self.patches_set_up(self._boards)
 
@@ -288,6 +291,21 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
         if len(missing) == len(self._boards):
             raise HandshakeTimeout(f"none of the boards {', '.join(map(str, self._boards))} answers")
 
+    def _take_found(self, link: Link, board_types: Mapping[int, int]) -> None:
+        """Take the boards that answered and have skin; others are left alone, as START makes a strain board send."""
+        known = self._board_type
+        self._board_type = {
+            board: board_types[board] for board in range(FIRST_BOARD, LAST_BOARD + 1) if board in board_types
+        }
+        self._boards = tuple(board for board, its_type in self._board_type.items() if its_type in _SKIN_BOARD_TYPES)
+        for board in sorted(self._board_type.keys() - set(self._boards) - known.keys()):
+            log.warning(
+                "%s: board %d is of type %d, which is not known to have skin: left alone; if it has, name it in boards",
+                link.bus_name or "bus",
+                board,
+                self._board_type[board],
+            )
+
     async def _version(self, link: Link, board: int) -> bytes:
         """GET_FW_VERSION by unicast (an MTB3 ignores the broadcast); eight bytes: 1C type major minor build ..."""
         reply = Match(0x200 | board << 4, 0x7FF, b"\x1c")
@@ -296,7 +314,7 @@ class RoboskinDriver(CanAdapter[RoboskinOptions]):
     def _tell_what_is_odd(self, link: Link) -> None:
         """Name the triangles that stay off, and boards that are not what the options say."""
         for set_up in self._set_ups(self._boards):
-            where = f"{link.bus_name or 'bus'}: board {set_up.board}"
+            where = f"{link.bus_name}: board {set_up.board}"
             off = set(range(TRIANGLES)) - set_up.enabled
             if set_up.wiped:
                 log.warning(

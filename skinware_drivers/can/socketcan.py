@@ -6,13 +6,15 @@ Every frame comes with the kernel's own time stamp; what the kernel had to drop 
 from __future__ import annotations
 
 import array
+import contextlib
 import ctypes
 import errno
 import fcntl
 import os
 import socket
 import struct
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -21,7 +23,7 @@ import numpy.typing as npt
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.recvmmsg import Rows
@@ -30,14 +32,18 @@ from skinware_drivers.options import options_from_strings
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
 _SOL_CAN_RAW = 101
+_CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
-_MEMINFO_DROPS = 8
+_MEMINFO_USED, _MEMINFO_SIZE, _MEMINFO_DROPS = 0, 1, 8
+_FRAME_BITS, _MORE_OF_EXTENDED = 47, 20  # of a frame without payload and stuff bits, with the pause after it
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
+MOST_FILTERS = 512
+"""``CAN_RAW_FILTER_MAX`` of linux/can/raw.h."""
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 WANTED_BUFFER_BYTES = 8 << 20
@@ -51,6 +57,10 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     timestamps: Annotated[
         Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
     ] = "auto"
+    filter: Annotated[
+        Literal["on", "off"],
+        msgspec.Meta(description="let the kernel leave out frames that the driver does not know; nobody counts them"),
+    ] = "off"
 
 
 class SocketCanBus(Bus):
@@ -75,6 +85,8 @@ class SocketCanBus(Bus):
             self._wanted = options_from_strings(SocketCanOptions, self.options)
         except ConfigurationError as error:
             raise ConfigurationError(f"bus {channel}: {error}") from None
+        self.narrows = self._wanted.filter == "on"
+        self._filters: Sequence[Filter] = ()
         self._socket: socket.socket | None = None
         self._lost_before = 0
         self.granted_buffer = 0
@@ -102,6 +114,8 @@ class SocketCanBus(Bus):
             # also where the layout has none: that there are FD frames on the bus explains why no others are heard
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
+            if self._filters:
+                _set_filters(sock, self._filters)
             sock.bind((self.channel,))
             if not _is_up(sock, self.channel):
                 raise BusNotAvailable(
@@ -147,6 +161,14 @@ class SocketCanBus(Bus):
             )
         return "\n".join(notes)
 
+    def narrow(self, filters: Sequence[Filter]) -> None:
+        """Set the kernel's filters; see :class:`skinware_drivers.bus.Bus`. More than it takes are as none."""
+        filters = filters if len(filters) <= MOST_FILTERS else ()
+        if filters != self._filters and self._socket is not None:
+            with contextlib.suppress(OSError):  # the interface is gone, which receiving will tell
+                _set_filters(self._socket, filters)
+        self._filters = filters
+
     def check(self) -> None:
         """Ask the kernel for the interface's and its controller's state; see :class:`skinware_drivers.bus.Bus`."""
         if self._socket is None or not self._is_bound:
@@ -190,7 +212,9 @@ class SocketCanBus(Bus):
         batch.stop += kept
         self.counters.frames += kept
         self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
-        self.counters.lost = self._lost_before + self._kernel_drops()
+        if self.bit_rate:
+            self.wire_bits += _wire_bits(batch.wire[first : first + kept])
+        self._read_memory()
         return kept
 
     def send(self, identifier: int, payload: bytes) -> None:
@@ -221,6 +245,8 @@ class SocketCanBus(Bus):
         if controller is None:
             return
         self._restarts_itself = controller.restart_ms > 0
+        # of FD frames a part is faster, and of filtered ones nothing is known: then there is no telling the load
+        self.bit_rate = 0 if self.payload_size > 8 or self.narrows else controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
 
@@ -264,11 +290,26 @@ class SocketCanBus(Bus):
         if len(good) and (not len(errors) or good[-1] > errors[-1]):
             self._health.heard_data()
 
-    def _kernel_drops(self) -> int:
-        if self._socket is None:
-            return 0
-        words = array.array("I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1)))
-        return words[_MEMINFO_DROPS]
+    def _read_memory(self) -> None:
+        """What the kernel says of the receive buffer: how full it still is, and what did not fit."""
+        if self._socket is not None:
+            data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
+            words = array.array("I", data)
+            self.counters.lost = self._lost_before + words[_MEMINFO_DROPS]
+            self.fullest = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
+
+
+def _wire_bits(wire: npt.NDArray[np.void]) -> int:
+    """About how many bits classic frames take on the wire, one stuff bit in ten bits included."""
+    extended = np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG))
+    bits = _FRAME_BITS * len(wire) + _MORE_OF_EXTENDED * extended + 8 * int(wire["length"].sum(dtype=np.int64))
+    return int(bits * 11) // 10
+
+
+def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:
+    everything = (Filter(0, 0),)  # none at all would let nothing through
+    packed = b"".join(struct.pack("=II", *one) for one in filters or everything)
+    sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
 
 
 def _enlarge_buffer(sock: socket.socket, wanted: int) -> int:

@@ -17,12 +17,16 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Coroutine, Sequence
 
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
+    from skinware_drivers.bus import Bus
     from skinware_drivers.config import DriverConfig
     from skinware_drivers.runner import PublishMode, Runner
+
+
+log = logging.getLogger("skinware.driver")
 
 
 class DriverCommand(click.Command):
@@ -94,10 +98,11 @@ def command(
 ) -> None:
     """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
-    SIGHUP makes a listener take in what it has heard since it started.
+    SIGHUP makes a listener take in what it has heard since it started, and reads the buses of the --config file
+    again: those that were added or taken out come or go, the others go on.
     """
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.config import DriverConfig
+    from skinware_drivers.config import DriverConfig, options_of_bus
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
     from skinware_drivers.runner import Runner
 
@@ -113,14 +118,20 @@ def command(
     if not bus_names:
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
     given = {key: text for key, text in driver_options.items() if text is not None}
-    lines = []
-    for bus_name in bus_names:
-        adapter = driver(_options(driver, settings, bus_name, given))
+
+    def line_of(bus_name: str, settings: DriverConfig) -> tuple[str, AnyAdapter, Bus]:
+        adapter = driver(options_of_bus(driver.Options, settings, bus_name, given))
         bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
-        lines.append((bus_name, adapter, bus))
+        return bus_name, adapter, bus
+
+    async def read_buses_again() -> None:
+        if config is not None and not buses:  # what the command line names is not the file's to change
+            new = _read(str(config))
+            await _go_over_to(runner, [bus.name for bus in new.bus], lambda name: line_of(name, new))
+
     runner = Runner(
         driver_type,
-        lines,
+        [line_of(bus_name, settings) for bus_name in bus_names],
         name=name or settings.name or driver_type,
         listen_only=listen_only,
         publish=publish or settings.publish or None,
@@ -131,18 +142,48 @@ def command(
     )
     if profile is not None:
         profile.apply()
-    asyncio.run(_run(runner, as_json))
+    asyncio.run(_run(runner, as_json, read_buses_again))
 
 
-async def _run(runner: Runner, as_json: bool) -> None:
+async def _go_over_to(
+    runner: Runner, names: Sequence[str], line_of: Callable[[str], tuple[str, AnyAdapter, Bus]]
+) -> None:
+    """Add and remove buses until the driver has these."""
+    present = runner.bus_names
+    for name in names:
+        if name not in present:
+            await runner.add_bus(*line_of(name))
+    for name in present:
+        if name not in names:
+            await runner.remove_bus(name)
+
+
+async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Coroutine[Any, Any, None]]) -> None:
     loop = asyncio.get_running_loop()
+    reading: set[asyncio.Task[None]] = set()
+
+    async def read_again() -> None:
+        try:
+            await read_buses_again()
+        except ConfigurationError as error:
+            log.error("buses stay as they are: %s", error)
+
+    def on_hangup() -> None:
+        runner.join()
+        task = loop.create_task(read_again())
+        reading.add(task)
+        task.add_done_callback(reading.discard)
+
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, runner.stop)
-    loop.add_signal_handler(signal.SIGHUP, runner.join)
+    loop.add_signal_handler(signal.SIGHUP, on_hangup)
     reporting = asyncio.create_task(_report(runner)) if as_json else None
     try:
         await runner.run()
     finally:
+        for task in reading:
+            task.cancel()
+        await asyncio.gather(*reading, return_exceptions=True)
         if reporting is not None:
             reporting.cancel()
             await asyncio.gather(reporting, return_exceptions=True)
@@ -187,18 +228,6 @@ def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[i
     if realtime is None and not chosen:
         return None
     return Profile.from_text("normal" if realtime is None else realtime, cpus=chosen)
-
-
-def _options(driver: type[AnyAdapter], settings: DriverConfig, bus_name: str, given: dict[str, str]) -> Any:
-    """The driver's options for one bus: the command line beats the bus' own, they beat the file's common ones."""
-    from skinware_drivers.config import convert
-    from skinware_drivers.options import options_from_strings
-
-    of_bus = next((bus.options for bus in settings.bus if bus.name == bus_name), {})
-    values = {**settings.options, **of_bus}
-    text_values = options_from_strings(driver.Options, given)
-    values.update({key: getattr(text_values, key) for key in given})
-    return convert(driver.Options, values, f"options of {bus_name}")
 
 
 def _read(path: str) -> DriverConfig:

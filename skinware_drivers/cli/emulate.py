@@ -88,13 +88,19 @@ def _emulate(
     from skinware_drivers.virtual.hardware import load_emulator, medium_of
 
     emulator = load_emulator(driver)
-    medium = medium_of(emulator)
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
-    bus = make_bus(bus_name, payload_size=_LONGEST_COMMAND[medium])
+    framing = getattr(emulator, "framing", None)
+    medium = "serial" if framing is not None else medium_of(emulator)
+    bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if bus.medium not in (None, medium):
-        such = "vcan0" if medium == "can" else f"pty:/tmp/{driver}"
-        raise ConfigurationError(f"{bus_name} is a {bus.medium} bus, {driver} lives on {medium}: --bus {such}")
+        where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty or a port"
+        raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
+    if framing is not None:
+        from skinware_drivers.serial.bus import SerialBus
+
+        if isinstance(bus, SerialBus):
+            bus.use(framing)
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)

@@ -210,8 +210,7 @@ class Emulation:
 
     def _receive(self, now_ns: int) -> None:
         while self._bus.receive(self._batch, 0):
-            rows = self._batch.wire[self._batch.start : self._batch.stop]
-            for row in rows:
+            for row in self._batch.wire[self._batch.start : self._batch.stop]:
                 payload = row["payload"][: row["length"]].tobytes()
                 self._hardware.receive(int(row["identifier"]), payload, now_ns)
             self._batch.clear()

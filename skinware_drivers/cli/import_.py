@@ -136,11 +136,13 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dic
 
 
 def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, str]]) -> dict[str, object]:
+    from skinware_drivers.icub.notes import shown
+
     parts = []
     for number, part in enumerate(done.parts):
         files = written[number] if written else {"configuration_text": part.configuration()}
         parts.append({**part.figures(), **files})
-    return {"parts": parts, "notes": notes, "files": [str(path) for path in done.files]}
+    return {"parts": parts, "notes": notes, "files": [shown(path) for path in done.files]}
 
 
 def _report(notes: Sequence[Note], verbose: bool) -> None:

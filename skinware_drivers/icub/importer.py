@@ -13,7 +13,7 @@ from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import check_drawings, places_of, read_body
 from skinware_drivers.icub.device import DeviceReader
 from skinware_drivers.icub.drawing import Drawing, is_drawing, read_drawing
-from skinware_drivers.icub.notes import Level, Notes
+from skinware_drivers.icub.notes import Level, Notes, shown
 from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.toml_text import configuration_text
@@ -48,9 +48,10 @@ class ImportedPart:
 
     def configuration(self) -> str:
         """The text of its configuration file."""
-        lines = [f"{self.part.name} ({self.part.device_type}), made by skin-import from {self.part.element.file.name}."]
+        where = shown(self.part.element.file.name)
+        lines = [f"{shown(self.part.name)} ({self.part.device_type}), made by skin-import from {where}."]
         if self.ports:
-            lines.append(f"Body parts: {', '.join(port.name for port in self.ports)}.")
+            lines.append(f"Body parts: {shown(', '.join(port.name for port in self.ports))}.")
         if self.part.device_type == ETHERNET:
             lines.append(
                 "The robot reads these boards through an Ethernet board. This driver needs the CAN bus itself."
@@ -69,7 +70,7 @@ class ImportedPart:
             "name": self.name,
             "device": self.part.name,
             "type": self.part.device_type,
-            "file": str(self.part.element.file),
+            "file": shown(self.part.element.file),
             "buses": [{"patch": b.patch, "name": b.name, "boards": list(b.options.boards)} for b in self.buses],
             "body_parts": [port.name for port in self.ports],
             "triangles": self.triangles,

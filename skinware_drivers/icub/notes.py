@@ -34,6 +34,15 @@ class Note(msgspec.Struct, frozen=True, order=True):
         return f"{place}: {self.element}: {self.text}" if self.element else f"{place}: {self.text}"
 
 
+_LONGEST = 400
+
+
+def shown(text: object) -> str:
+    """A text from a foreign file as a terminal or a comment can show it: without control characters, not too long."""
+    visible = "".join(c if c.isprintable() else "?" for c in str(text))
+    return visible if len(visible) <= _LONGEST else f"{visible[:_LONGEST]} ..."
+
+
 class Notes:
     """Remarks in the order in which they came, each once."""
 
@@ -42,7 +51,7 @@ class Notes:
 
     def add(self, level: Level, file: Path | str, text: str, *, line: int = 0, element: str = "") -> None:
         """Note something."""
-        self._notes[Note(level, str(file), line, element, text)] = None
+        self._notes[Note(level, shown(file), line, shown(element), shown(text))] = None
 
     def take(self, other: Notes) -> None:
         """Add all of another's."""
@@ -53,4 +62,4 @@ class Notes:
         return list(self._notes)
 
 
-__all__ = ["Level", "Note", "Notes"]
+__all__ = ["Level", "Note", "Notes", "shown"]

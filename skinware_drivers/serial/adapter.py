@@ -27,6 +27,7 @@ class SerialAdapter(Adapter[OptionsT]):
     framing: Framing
     commands: Encoding | None = None
     baudrate: int = DEFAULT_BAUDRATE
+    _line: SerialBus | None = None
 
     @property
     def payload_size(self) -> int:
@@ -40,5 +41,14 @@ class SerialAdapter(Adapter[OptionsT]):
             ConfigurationError: it is another kind of bus.
         """
         super().fit(bus)
-        if isinstance(bus, SerialBus):
-            bus.use(self.framing, self.commands, self.baudrate)
+        self._line = bus if isinstance(bus, SerialBus) else None
+        self.change_framing(self.framing)
+
+    def change_framing(self, framing: Framing) -> None:
+        """Go over to another framing, for devices that tell in ``describe`` how long their frames are.
+
+        What was received and not yet fetched is dropped. ``payload_size`` must have allowed for it from the beginning.
+        """
+        self.framing = framing
+        if self._line is not None:
+            self._line.use(framing, self.commands, self.baudrate)

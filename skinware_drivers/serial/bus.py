@@ -5,14 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import BusReason
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.framing import Encoding, Framed, Framer, FramerCounters, Framing, Unframed
@@ -22,6 +23,8 @@ from skinware_drivers.serial.ports import Port, PtyPort
 _CHUNK = 1 << 16
 _MORE_WAITS = 2048  # a read that gave so much is followed by another
 _MOST_UNSENT = 1 << 16
+_SPAN_NS = NS_PER_S
+"""What was skipped is held against what was good so often."""
 
 
 class SerialBus(Bus):
@@ -44,6 +47,7 @@ class SerialBus(Bus):
     """
 
     medium: ClassVar[str] = "serial"
+    opens_slowly: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -54,7 +58,9 @@ class SerialBus(Bus):
         listen_only: bool = False,
     ) -> None:
         own, of_url = _split_options(channel, options or {})
-        super().__init__(channel + of_url, own, payload_size=payload_size, listen_only=listen_only)
+        self._path = channel + of_url
+        name = self._path or "&".join(f"{key}={own[key]}" for key in ("serial_number", "vid_pid") if key in own)
+        super().__init__(name, own, payload_size=payload_size, listen_only=listen_only)
         self._serial_options = options_from_strings(SerialOptions, own)
         self._framing: Framing = Unframed(payload_size)
         self._commands: Encoding = self._framing
@@ -68,6 +74,7 @@ class SerialBus(Bus):
         self._framer: Framer = self._framing.framer()
         self._reads: list[tuple[int, int]] = []
         self._before = FramerCounters()
+        self._told, self._told_ns, self._is_garbled = FramerCounters(), 0, False
 
     def use(self, framing: Framing, commands: Encoding | None = None, baudrate: int | None = None) -> None:
         """Say what is on the line. What was received but not fetched is dropped.
@@ -106,7 +113,7 @@ class SerialBus(Bus):
         self._epoll.register(self._event, select.EPOLLIN)
 
     def _open_port(self) -> Port:
-        path = find_port(self.channel, self._serial_options)
+        path = find_port(self._path, self._serial_options)
         return open_port(path, self._serial_options, self._serial_options.baudrate or self._baudrate)
 
     def fileno(self) -> int:
@@ -165,6 +172,10 @@ class SerialBus(Bus):
             self._port.close()
             self._port = None
 
+    def reason(self, time_ns: int) -> BusReason:
+        """``BUS_ERRORS`` while most of what is received belongs to no frame: another baud rate, or another device."""
+        return BusReason.BUS_ERRORS if self._is_garbled and time_ns < self._told_ns + 2 * _SPAN_NS else BusReason.NONE
+
     @property
     def note(self) -> str:
         """What a person should know about the port."""
@@ -174,6 +185,7 @@ class SerialBus(Bus):
         self._before = _sum(self._before, self._framer.counters)
         self._before.skipped_bytes += self._framer.pending
         self._framer = self._framing.framer()
+        self._told, self._told_ns, self._is_garbled = FramerCounters(), 0, False
         self._reads.clear()
         self._backlog.clear()
 
@@ -202,6 +214,14 @@ class SerialBus(Bus):
         if len(framed):
             self._backlog.append((framed, self._times(framed, known, time_ns)))
         self._forget_reads()
+        if time_ns > self._told_ns + _SPAN_NS:
+            self._tell_garbled(time_ns)
+
+    def _tell_garbled(self, time_ns: int) -> None:
+        """Whether more was skipped than was good since it was last told."""
+        now, before = self._framer.counters, self._told
+        self._is_garbled = now.skipped_bytes - before.skipped_bytes > now.frame_bytes - before.frame_bytes
+        self._told, self._told_ns = replace(now), time_ns
 
     def _times(self, framed: Framed, known: int, time_ns: int) -> npt.NDArray[np.int64]:
         """(n,) int64 ns: when the last byte of each frame was read."""
@@ -268,7 +288,7 @@ class PtyBus(SerialBus):
     """
 
     def _open_port(self) -> Port:
-        return PtyPort(self.channel)
+        return PtyPort(self._path)
 
 
 def _split_options(channel: str, options: dict[str, str]) -> tuple[dict[str, str], str]:

@@ -176,10 +176,7 @@ class Crc(Checksum):
         if len(data) > _LONG:
             row = np.frombuffer(data, np.uint8)[None]
             return int(self.of_rows(row, np.array([len(data)]))[0])
-        state = self._first_state
-        for byte in data:
-            state = self._step(state, byte)
-        return self._finish(state)
+        return self._finish(self._after(data, self._first_state))
 
     def of_rows(self, rows: Bytes, length: Indices) -> Words:
         """Of the last ``length`` bytes of each row; those before them are zero."""
@@ -225,10 +222,20 @@ class Crc(Checksum):
     def _table(self) -> list[int]:
         return _reflected_table(self) if self.reflected_in else _normal_table(self)
 
-    def _step(self, state: int, byte: int) -> int:
+    def _after(self, data: bytes, state: int) -> int:
+        """The register after some bytes."""
+        table = self._table
         if self.reflected_in:
-            return self._table[(state ^ byte) & 0xFF] ^ state >> 8
-        return (state << 8 & (1 << self.width) - 1) ^ self._table[(state >> self.width - 8 ^ byte) & 0xFF]
+            for byte in data:
+                state = table[(state ^ byte) & 0xFF] ^ state >> 8
+            return state
+        shift, mask = self.width - 8, (1 << self.width) - 1
+        for byte in data:
+            state = (state << 8 & mask) ^ table[(state >> shift ^ byte) & 0xFF]
+        return state
+
+    def _step(self, state: int, byte: int) -> int:
+        return self._after(bytes([byte]), state)
 
     def _finish(self, state: int) -> int:
         if self.reflected_in != self.reflected_out:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -90,42 +91,55 @@ class DelimitedFramer(Framer):
         self._padding = bytes(self._longest_segment + 8)
         self._delimiter = bytes([framing.stuffing.delimiter])
         trusts_first = framing.checksum is not None if framing.trusts_first is None else framing.trusts_first
+        self._decode = framing.stuffing.decode
+        self._checksum_size = framing.checksum.size if framing.checksum is not None else 0
         self._discarding = not trusts_first  # everything up to the next delimiter
 
     def _find_few(self, stream: bytes) -> tuple[Framed, int]:
-        counters, framing = self.counters, self._framing
         *segments, rest = stream.split(self._delimiter)
-        bodies: list[bytes] = []
-        identifiers: list[int] = []
-        ends: list[int] = []
-        end = self._before
-        for segment in segments:
-            end += len(segment) + 1
-            if self._discarding:
-                self._discarding = False
-                counters.skipped_bytes += len(segment) + 1
-                continue
-            content = framing.stuffing.decode(segment) if len(segment) <= self._longest_segment else None
-            if content == b"" and self._shortest:
-                counters.idle_bytes += len(segment) + 1
-                continue
-            if content is None or not self._shortest <= len(content) <= self._longest:
-                counters.refused += 1
-                counters.skipped_bytes += len(segment) + 1
-                continue
-            if framing.checksum is not None:
-                size = framing.checksum.size
-                if framing.checksum.to_bytes(content[:-size]) != content[-size:]:
-                    counters.checksum_errors += 1
-                    counters.skipped_bytes += len(segment) + 1
-                    continue
-                content = content[:-size]
-            counters.frame_bytes += len(segment) + 1
-            bodies.append(content[framing.body_start :])
-            identifiers.append(framing.identifier.of(content) if framing.identifier is not None else 0)
-            ends.append(end)
-        found = Framed.of_bodies(bodies, identifiers, ends) if bodies else NOTHING
-        return found, len(stream) - self._keep(len(rest))
+        ends = list(accumulate([len(segment) + 1 for segment in segments], initial=self._before))
+        if self._discarding and segments:
+            self._discarding = False
+            self.counters.skipped_bytes += len(segments[0]) + 1
+            segments[0] = b""
+            ends[0] = -1
+        found = [
+            (content, begin, end)
+            for segment, (begin, end) in zip(segments, pairwise(ends), strict=True)
+            if begin >= 0 and (content := self._content(segment)) is not None
+        ]
+        done = len(stream) - self._keep(len(rest))
+        if not found:
+            return NOTHING, done
+        self.counters.frame_bytes += sum([end - begin for _, begin, end in found])
+        framing, first = self._framing, self._framing.body_start
+        field = framing.identifier
+        framed = Framed.of_bodies(
+            [content[first:] for content, _, _ in found],
+            [0] * len(found) if field is None else [field.of(content) for content, _, _ in found],
+            [end for _, _, end in found],
+        )
+        return framed, done
+
+    def _content(self, segment: bytes) -> bytes | None:
+        """Header and body of a segment; None, and counted, if it is no frame."""
+        content = self._decode(segment) if len(segment) <= self._longest_segment else None
+        if content is not None and self._shortest <= len(content) <= self._longest:
+            checksum = self._framing.checksum
+            if checksum is None:
+                return content
+            size = self._checksum_size
+            covered = content[:-size]
+            if checksum.of(covered) == int.from_bytes(content[-size:], checksum.order):
+                return covered
+            self.counters.checksum_errors += 1
+        elif content == b"":
+            self.counters.idle_bytes += len(segment) + 1
+            return None
+        else:
+            self.counters.refused += 1
+        self.counters.skipped_bytes += len(segment) + 1
+        return None
 
     def _find_many(self, stream: bytes) -> tuple[Framed, int]:
         counters, framing = self.counters, self._framing

@@ -13,6 +13,7 @@ from msgspec import Meta
 from serial.tools import list_ports
 
 from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.status import BusReason
 from skinware_drivers.serial.ports import DescriptorPort, Port, ThreadedPort
 
 DEFAULT_BAUDRATE = 115_200
@@ -90,13 +91,13 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
             rtscts=options.rtscts,
             exclusive=None if is_url else True,
             timeout=_READ_TIMEOUT_S,
-            write_timeout=_WRITE_TIMEOUT_S,
+            write_timeout=None if path.startswith("rfc2217:") else _WRITE_TIMEOUT_S,  # which knows none
         )
     except (serial.SerialException, ValueError) as error:
         raise ConfigurationError(f"{path}: {error}") from None
     try:
         line.open()
-    except (OSError, ValueError, EOFError) as error:  # SerialException is an OSError
+    except (OSError, ValueError, EOFError, NotImplementedError) as error:  # SerialException is an OSError
         raise _refusal(path, error, baudrate) from None
     if not is_url or path.startswith("socket://"):
         port: Port = DescriptorPort(path, line)
@@ -121,12 +122,17 @@ def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | Co
         return BusNotAvailable(f"no serial port {path}; {_known_ports(list(list_ports.comports()))}")
     if number in (errno.EACCES, errno.EPERM):
         group = _group_of(path)
-        return BusNotAvailable(f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again")
+        return BusNotAvailable(
+            f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again",
+            reason=BusReason.REFUSED,
+        )
     if number in (errno.EAGAIN, errno.EBUSY):
-        return BusNotAvailable(f"{path}: another program has it open; which one: fuser -v {path}")
+        return BusNotAvailable(
+            f"{path}: another program has it open; which one: fuser -v {path}", reason=BusReason.REFUSED
+        )
     if isinstance(error, ValueError) and "baud" in str(error).lower():
         return ConfigurationError(f"{path}: it cannot do {baudrate} baud")
-    return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}")
+    return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}", reason=BusReason.FAILED)
 
 
 def _group_of(path: str) -> str:

@@ -218,6 +218,8 @@ class PacketFramer(Framer):
         if framing.confirmed:
             self._look_ahead = framing.longest if framing.trailer else len(framing.sync)
         self._bare = framing.checksum.size if framing.bare_when_empty and framing.checksum else 0
+        self._checksum_at = framing.checksum_place(0)  # from the end, if negative
+        self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end
         self._padding = bytes(max(64, 2 * framing.longest))
         self._follows_at = -1  # place in the stream at which a frame would follow the last one at once
 
@@ -302,10 +304,10 @@ class PacketFramer(Framer):
         checksum = self._framing.checksum
         if checksum is None:
             return True
-        covered_from, covered_to = self._framing.covered(total)
-        at = place + self._framing.checksum_place(total)
-        sent = stream[at : at + checksum.size]
-        return checksum.to_bytes(stream[place + covered_from : place + covered_to]) == sent
+        end = place + total
+        at = (end if self._checksum_at < 0 else place) + self._checksum_at
+        covered = stream[place + self._covered_from : end + self._covered_to]
+        return checksum.of(covered) == int.from_bytes(stream[at : at + checksum.size], checksum.order)
 
     # All at once
 
@@ -417,14 +419,13 @@ class PacketFramer(Framer):
 
     def _judge(self, data: Bytes, at: Indices, total: Indices, state: npt.NDArray[np.uint8], some: Indices) -> None:
         """Work out the checksums of some beginnings."""
-        checksum, framing = self._framing.checksum, self._framing
+        checksum = self._framing.checksum
         if checksum is None:
             return
         begin, size = at[some], total[some]
-        sent_at = begin + (size - framing.behind if framing.checksum_at is None else framing.checksum_at)
-        covered_from, covered_to = framing.covered(0)
+        sent_at = begin + self._checksum_at + (size if self._checksum_at < 0 else 0)
         right = checksum.read_many(data, sent_at) == checksum.of_many(
-            data, begin + covered_from, begin + size + covered_to
+            data, begin + self._covered_from, begin + size + self._covered_to
         )
         state[some] = np.where(right, _GOOD, _BAD_CHECKSUM)
 

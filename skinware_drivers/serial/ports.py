@@ -17,6 +17,7 @@ from skinware.errors import BusNotAvailable
 _MOST_THREADED = 1 << 16
 """Bytes that a port with threads holds in each direction."""
 _THREAD_TURN_S = 0.1
+_THREAD_END_S = 1.0
 
 
 class Port(ABC):
@@ -176,8 +177,10 @@ class ThreadedPort(Port):
             self._closing = True
             self._changed.notify_all()
         for thread in self._threads:
+            thread.join(_THREAD_END_S)
+        self._serial.close()  # which ends a write that nobody takes
+        for thread in self._threads:
             thread.join()
-        self._serial.close()
         os.close(self._event)
 
     def _work(self, work: Any) -> None:

@@ -95,6 +95,11 @@ class VirtualCanBus(Bus):
 
     # Bus
 
+    @property
+    def name(self) -> str:
+        """As a user writes it, for the hardware that is emulated."""
+        return f"bus virtual:{self._emulated}"
+
     def open(self) -> None:
         """Listen to the devices. They are powered up by the first time; what they sent meanwhile is gone.
 
@@ -103,7 +108,7 @@ class VirtualCanBus(Bus):
             PlatformError: this system has no timerfd.
         """
         if not self._present:
-            raise BusNotAvailable(f"{self!r}: the emulated interface is away")
+            raise BusNotAvailable(f"{self.name}: the emulated interface is away")
         if self._timer is None:
             self._timer = self._make_timer()
             self.hardware.skip(self._clock())
@@ -123,7 +128,7 @@ class VirtualCanBus(Bus):
             error, self._next_error = self._next_error, None
             raise error
         if self._timer is None or not self._present:
-            raise BusNotAvailable(f"{self!r} is not open")
+            raise BusNotAvailable(f"{self.name} is not open")
         now_ns = self._clock()
         if len(self._pending) < batch.free:
             self._fetch(now_ns)
@@ -143,7 +148,7 @@ class VirtualCanBus(Bus):
         refusal = self._refusal(payload)
         if refusal:
             self.counters.send_failures += 1
-            raise BusSendError(f"{self!r}: {refusal}")
+            raise BusSendError(f"{self.name}: {refusal}")
         self.hardware.receive(identifier, payload, self._clock())
         self.counters.sent += 1
         self._wake_when_due()
@@ -170,7 +175,7 @@ class VirtualCanBus(Bus):
     def vanish(self) -> None:
         """Go away as an unplugged interface does: ``receive`` raises, and ``open`` until :meth:`come_back`."""
         self._present = False
-        self.fail_next_receive(BusNotAvailable(f"{self!r}: the emulated interface went away"))
+        self.fail_next_receive(BusNotAvailable(f"{self.name}: the emulated interface went away"))
 
     def come_back(self) -> None:
         """End :meth:`vanish`. Who has not noticed it yet is still told once."""

@@ -6,8 +6,10 @@ heartbeat, event timers and SYNC (CiA 301) are done here, in the time of the emu
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Collection, Sequence
+from functools import partial
 from importlib import resources
 from typing import Annotated, Any, ClassVar
 
@@ -17,12 +19,15 @@ from msgspec import Meta
 
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator_options import Seconds
+from skinware_drivers.virtual.stage import Actor
 
 _HEARTBEAT = "heartbeat"
 _BOOT_UP, _STOPPED, _OPERATIONAL, _PRE_OPERATIONAL = 0, 4, 5, 127
 _STATES = {1: _OPERATIONAL, 2: _STOPPED, 128: _PRE_OPERATIONAL}
 _RESETS = (129, 130)
 _TYPE_EVENT = 254
+_TOO_HOT = 0x4210
 _REAL32 = 8
 
 
@@ -31,6 +36,9 @@ class EmulatedCanopenOptions(EmulatorOptions, frozen=True, forbid_unknown_fields
 
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127")] = (5, 6)
     eds: Annotated[str, Meta(description="EDS file; default: the example's")] = ""
+    faulty: Annotated[tuple[int, ...], Meta(description="nodes that report an error for a while (EMCY 4210)")] = ()
+    faulty_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the error")] = 2.0
+    faulty_for_s: Annotated[Seconds, Meta(description="seconds until it is over")] = 2.0
 
 
 class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
@@ -61,6 +69,15 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         mapped = [variable for _, entries in _tpdos(_make_node(self.options.eds, 1, None)) for variable, _ in entries]
         count = sum(_is_felt(variable) for variable in mapped)
         return on_a_grid(count, max(1, round(count**0.5)))
+
+    def power_up(self, now_ns: int) -> Sequence[Actor]:
+        """Make the nodes, and plan their errors."""
+        actors, options = super().power_up(now_ns), self.options
+        for number in options.faulty:
+            for after_s, code in ((0, _TOO_HOT), (options.faulty_for_s, 0)):
+                at_ns = now_ns + round((options.faulty_after_s + after_s) * 1e9)
+                self.schedule(at_ns, partial(self._report, self.devices[number], code))
+        return actors
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Say so, and be pre-operational; with ``streaming``, operational."""
@@ -104,14 +121,17 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def report_error(self, number: int, code: int, now_ns: int) -> None:
         """Send an EMCY: an error, or with code 0 that there is none any more."""
-        now_ns = self.run_to(now_ns)
-        self.reply(self.devices[number], (0x080 + number, struct.pack("<HB5x", code, int(code != 0))), now_ns)
-        self.log.append(events.ErrorReported(time_ns=now_ns, board=number, code=code))
+        self._report(self.devices[number], code, self.run_to(now_ns))
         self.find_next_event()
+
+    def _report(self, device: Device, code: int, now_ns: int) -> None:
+        if device.alive and now_ns >= device.ready_ns:
+            self.reply(device, (0x080 + device.number, struct.pack("<HB5x", code, int(code != 0))), now_ns)
+            self.log.append(events.ErrorReported(time_ns=now_ns, board=device.number, code=code))
 
     def _command(self, device: Device, command: int, now_ns: int) -> bool:
         if command in _RESETS:
-            self.restart(device.number, now_ns)
+            self.lose_power_for_a_moment(device, now_ns)
         elif command in _STATES:
             self._go_to(device, _STATES[command], now_ns)
         else:
@@ -154,6 +174,7 @@ class _Ports:
 def _make_node(eds: str, number: int, ports: _Ports | None) -> Any:
     import canopen
 
+    logging.getLogger("canopen").setLevel(logging.WARNING)  # it tells of every transfer
     source = eds or str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds")
     node = canopen.LocalNode(number, source)
     if ports is not None:

@@ -130,8 +130,8 @@ class Emulator(Stage, Generic[OptionsT]):
         self._random: dict[int, np.random.Generator] = {}
         self._press: dict[int, Press] = {}
         self._n_values = 0
-        for name in ("dead", "restart"):
-            for number in getattr(options, name):
+        for name in ("dead", "restart", "faulty"):
+            for number in getattr(options, name, ()):
                 if number not in self.numbers:
                     known = ",".join(map(str, self.numbers))
                     raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")
@@ -209,6 +209,19 @@ class Emulator(Stage, Generic[OptionsT]):
         device.cycle += 1
         self.counts["bursts"] += 1
 
+    def lose_power_for_a_moment(self, device: Device, now_ns: int) -> None:
+        """Restart a device, as a command that tells it to may do."""
+        self._lose_power(device, now_ns)
+        ready_ns = now_ns + round(self.options.boot_s * 1e9)
+        self.log.append(events.BoardRestarted(time_ns=now_ns, board=device.number, ready_ns=ready_ns))
+        device.alive, device.ready_ns = True, ready_ns
+
+        def boot(time_ns: int) -> None:
+            if device.alive and device.ready_ns == ready_ns:  # else it lost its power again
+                self.boot(device, time_ns)
+
+        self.schedule(ready_ns, boot)
+
     # Faults at a moment of the caller's choice
 
     def kill(self, number: int, now_ns: int) -> None:
@@ -218,7 +231,7 @@ class Emulator(Stage, Generic[OptionsT]):
 
     def restart(self, number: int, now_ns: int) -> None:
         """Cut a device's power for a moment (a dead one lives again): configuration lost, deaf for a while."""
-        self._restart(self.devices[number], self.run_to(now_ns))
+        self.lose_power_for_a_moment(self.devices[number], self.run_to(now_ns))
         self.find_next_event()
 
     # Within
@@ -235,7 +248,7 @@ class Emulator(Stage, Generic[OptionsT]):
             self.boot(device, now_ns)
         for numbers, after_s, action in (
             (options.dead, options.dead_after_s, self._die),
-            (options.restart, options.restart_after_s, self._restart),
+            (options.restart, options.restart_after_s, self.lose_power_for_a_moment),
         ):
             for number in numbers:
                 self.schedule(now_ns + round(after_s * 1e9), partial(action, self.devices[number]))
@@ -308,18 +321,6 @@ class Emulator(Stage, Generic[OptionsT]):
     def _die(self, device: Device, now_ns: int) -> None:
         self._lose_power(device, now_ns)
         self.log.append(events.BoardDied(time_ns=now_ns, board=device.number))
-
-    def _restart(self, device: Device, now_ns: int) -> None:
-        self._lose_power(device, now_ns)
-        ready_ns = now_ns + round(self.options.boot_s * 1e9)
-        self.log.append(events.BoardRestarted(time_ns=now_ns, board=device.number, ready_ns=ready_ns))
-        device.alive, device.ready_ns = True, ready_ns
-
-        def boot(time_ns: int) -> None:
-            if device.alive and device.ready_ns == ready_ns:  # else it lost its power again
-                self.boot(device, time_ns)
-
-        self.schedule(ready_ns, boot)
 
     def _lose_power(self, device: Device, now_ns: int) -> None:
         device.alive = False

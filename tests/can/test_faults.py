@@ -5,6 +5,7 @@ Every test has a second bus in order, which nothing may hold up.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -332,3 +333,29 @@ def test_an_adapter_of_the_slcan_line_discipline_that_is_unplugged() -> None:
         for descriptor in (ours, theirs):
             if descriptor >= 0:
                 os.close(descriptor)
+
+
+def test_what_the_machine_drops_before_any_socket_is_told_apart(
+    can_pair: tuple[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A queue of one packet between the controller's interrupt, which takes several frames, and the sockets."""
+    setting = Path("/proc/sys/net/core/netdev_max_backlog")
+    before = setting.read_text()
+    with caplog.at_level(logging.WARNING), skin(can_pair[0]) as (driver, tips), sender(can_pair[1]) as out:
+        tips._interfaces[0] = can_pair[1]
+        setting.write_text("0")
+        try:
+
+            def is_dropped() -> bool:
+                for _ in range(200):
+                    with contextlib.suppress(OSError):  # the queue of the sending controller may be full
+                        out.send(can_frame(0x100, bytes(8)))
+                return bool(driver.status()["machine"]["softnet_dropped"])
+
+            wait_until(is_dropped, 60)
+        finally:
+            setting.write_text(before)
+        (bus,) = driver.status()["buses"]
+        assert bus["lost"] == 0  # the socket knows nothing of it
+        assert bus["load"] is not None
+    assert caplog.text.count("before any socket saw them") == 1

@@ -52,6 +52,11 @@ class Case:
         """Of each device."""
         return len(self.emulator(self.emulator.Options(**self.emulated)).places())
 
+    @property
+    def n_shown(self) -> int:
+        """Sensors of each patch."""
+        return len(self.shown([0] * self.n_values))
+
     def adapter(self) -> AnyAdapter:
         return self.driver(self.driver.Options(**self.options))
 
@@ -135,7 +140,18 @@ class Bench:
             self.now_ns += MS
             if poll:
                 self._poll()
-            self._receive()
+            self._take(lambda batch: self.bus.receive(batch, 0))
+            await asyncio.sleep(0)
+
+    async def inject(self, frames: Sequence[tuple[int, bytes]]) -> None:
+        """Have frames arrive, whoever may have sent them."""
+
+        def fill(batch: FrameBatch) -> None:
+            for frame in frames:
+                batch.append(0, self.now_ns, *frame)
+
+        self._take(fill)
+        for _ in range(len(frames)):
             await asyncio.sleep(0)
 
     async def stop(self) -> None:
@@ -152,6 +168,12 @@ class Bench:
 
     def faults(self, kind: str = "") -> list[FrameFault]:
         return [e for e in self.log if isinstance(e, FrameFault) and kind in ("", e.fault)]
+
+    @property
+    def attends(self) -> bool:
+        """Whether ``attend`` has not failed."""
+        task = self._attending
+        return task is not None and (not task.done() or task.exception() is None)
 
     @property
     def fresh(self) -> bool:
@@ -171,13 +193,13 @@ class Bench:
                 self._polled_ns[number] = self.now_ns + round(poll.period_s * 1e9)
                 self.bus.send(poll.identifier, poll.payload)
 
-    def _receive(self) -> None:
+    def _take(self, fill: Callable[[FrameBatch], object]) -> None:
         batch, decoder = self._batch, self._decoder
         if decoder is None:
             batch.clear()
         else:
             decoder.put_back(batch)
-        self.bus.receive(batch, 0)
+        fill(batch)
         if decoder is None:
             self.link.offer(batch, np.arange(batch.start, batch.stop))
             return

@@ -30,7 +30,7 @@ def with_temperature(values: Sequence[int]) -> list[int]:
 
 
 CASES = [
-    pytest.param(Case(CanopenDriver, EmulatedCanopen, shown=with_temperature), id="canopen"),
+    pytest.param(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)}, shown=with_temperature), id="canopen"),
     pytest.param(Case(XelaDriver, EmulatedXela), id="xela"),
     pytest.param(
         Case(

@@ -23,7 +23,7 @@ from skinware_drivers.description import assemble
 from skinware_drivers.registry import make_bus
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
-from skinware_drivers.virtual.events import CommandReceived
+from skinware_drivers.virtual.events import CommandReceived, ErrorReported
 from tests.conftest import wait_until
 from tests.drivers.bench import Bench, Case
 from tests.drivers.test_every_driver import play
@@ -235,12 +235,26 @@ def test_a_node_that_boots_is_configured_at_once_and_alone(stage: Stage, caplog:
 
 
 def test_errors_make_a_node_suspect_until_they_are_over(stage: Stage, caplog: pytest.LogCaptureFixture) -> None:
-    stage.do("report_error", 5, 0x4210)
+    for code in (0x4210, 0x4210, 0x4210):
+        stage.do("report_error", 5, code)
     frame = stage.read(lambda f: bool(f.status[0]))
     assert frame.status.tolist() == [SUSPECT] * 16 + [0] * 16
     stage.do("report_error", 5, 0)
     stage.read(lambda f: not f.status.any())
-    assert "node 5 reports an error: Temperature (code 4210)" in caplog.text
+    assert caplog.text.count("node 5 reports an error: Temperature (code 4210)") == 1
+
+
+def test_emulated_nodes_report_errors_when_told_to() -> None:
+    async def scenario() -> None:
+        faults = {"faulty": (6,), "faulty_after_s": 0.5, "faulty_for_s": 0.2}
+        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)}), **faults) as bench:
+            await bench.run(1000)
+            assert bench.notices == [("node 6", Notice.SUSPECT), ("node 6", Notice.SOUND)]
+            assert [e.code for e in bench.log if isinstance(e, ErrorReported)] == [0x4210, 0]
+
+    play(scenario())
+    with pytest.raises(ConfigurationError, match="option faulty: there is no device 7"):
+        EmulatedCanopen(EmulatedCanopenOptions(faulty=(7,)))
 
 
 def test_a_node_that_boots_after_an_error_is_sound(stage: Stage) -> None:
@@ -258,7 +272,7 @@ def test_a_node_that_somebody_stopped_is_stale_and_started_again(stage: Stage) -
 
 def test_a_node_without_a_heartbeat_is_lost_however_seldom_it_sends() -> None:
     async def scenario() -> None:
-        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"period_ms": 60_000})) as bench:
+        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6), "period_ms": 60_000})) as bench:
             await bench.run(300)
             assert bench.notices == []
             bench.hardware.devices[5].stop("heartbeat")
@@ -267,6 +281,26 @@ def test_a_node_without_a_heartbeat_is_lost_however_seldom_it_sends() -> None:
             assert bench.notices == [("node 5", Notice.LOST)]  # once
 
     play(scenario())
+
+
+def test_the_heartbeat_of_a_node_that_keeps_its_own_period_is_not_missed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    eds = tmp_path / "own.eds"
+    head, rest = EXAMPLE.read_text().split("[1017]")
+    eds.write_text(f"{head}[1017]{rest.replace('AccessType=rw', 'AccessType=ro', 1)}")
+
+    async def scenario() -> None:
+        case = Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)}, {"eds": str(eds), "nodes": (5,)})
+        async with Bench(case) as bench:
+            assert isinstance(bench.adapter, CanopenDriver)
+            assert bench.adapter.expects_heartbeat_of == set()
+        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)})) as bench:
+            assert isinstance(bench.adapter, CanopenDriver)
+            assert bench.adapter.expects_heartbeat_of == {5, 6}
+
+    play(scenario())
+    assert "object 1017:0 of node 5: Attempt to write a read only object" in caplog.text
 
 
 def test_a_dead_node_is_stale_and_the_other_one_goes_on(stage: Stage) -> None:

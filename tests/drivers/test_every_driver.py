@@ -116,6 +116,25 @@ def test_random_bytes_under_the_devices_own_identifiers_raise_nothing(case: Case
 
 
 @pytest.mark.parametrize("case", CASES)
+def test_random_frames_raise_nothing_and_all_are_accounted_for(case: Case) -> None:
+    random = np.random.default_rng(5)
+
+    async def scenario() -> None:
+        async with Bench(case) as bench:
+            own = sorted(bench.hardware.identifiers)
+            n_frames = 2000
+            before = sum(bench.count(name) for name in ("unknown", "bad_length", "bad_content"))
+            for _ in range(n_frames // 50):
+                identifiers = [*random.choice(own, 40), *random.integers(0, 0x8000_07FF, 10)]
+                await bench.inject([(int(i), random.bytes(int(random.integers(0, 9)))) for i in identifiers])
+            refused = sum(bench.count(name) for name in ("unknown", "bad_length", "bad_content")) - before
+            assert n_frames / 10 < refused <= n_frames
+            assert bench.attends
+
+    play(scenario())
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_foreign_frames_are_counted_and_disturb_nothing(case: Case) -> None:
     async def scenario() -> None:
         async with Bench(case, foreign_hz=500) as bench:
@@ -193,8 +212,7 @@ def test_a_restarted_device_comes_back_by_itself(case: Case) -> None:
         read_until(reader, lambda f: not f.status.any())
         first = hardware.numbers[0]
         running.do(lambda: hardware.restart(first, bus._clock()))
-        gone = read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
-        n_values = len(gone.values) // len(hardware.numbers)
-        assert (gone.status[:n_values] & Status.STALE).all()
-        assert not (gone.patch_state[1:] != PatchState.LIVE).any()
+        n_values = case.n_shown
+        stale = read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE and not f.status[n_values:].any())
+        assert (stale.status[:n_values] & Status.STALE).all()
         read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE and not f.status.any())

@@ -12,6 +12,7 @@ import pytest
 from skinware import BusState, DriverReader, Namespace, PatchState, Status
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers import bus_line
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
 from tests.conftest import wait_until
@@ -232,3 +233,41 @@ def test_what_a_bus_counts_and_notes_is_told(caplog: pytest.LogCaptureFixture) -
         assert [[row[name] for name in names] for row in told] == [[0, 0, 0, 0], [3, 5, 2, 1]]
         assert shown[1]["sent"] == 4
     assert caplog.text.count("emulated EmulatedRoboskin") == 2  # the note of a bus
+
+
+class Talkative(RoboskinDriver):
+    """Sends thousands of frames to set its boards up, while they send data already."""
+
+    async def configure(self, link: Link) -> None:
+        """Far more than any board needs."""
+        await super().start(link)
+        for number in range(4000):
+            await link.send(0x7E0, number.to_bytes(4, "little"))
+
+
+def test_a_set_up_of_thousands_of_frames_starves_no_reception() -> None:
+    """By conditions, not by time: whatever the machine does, few frames are sent between two looks at the buses."""
+    bus = troubled(boards=(7,))
+    other = emulated(boards=(8,))
+    sent_between = [0]
+    looks = [0]
+    real = other.receive
+
+    def look(batch: FrameBatch, ordinal: int) -> int:
+        looks[0] += 1
+        sent_between.append(0)
+        return real(batch, ordinal)
+
+    def before_send(identifier: int, _payload: bytes) -> None:
+        if identifier == 0x7E0:
+            sent_between[-1] += 1
+
+    bus.before_send = before_send
+    other.receive = look  # type: ignore[method-assign]
+    with driving(bus, other, driver=Talkative) as running, DriverReader("roboskin") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        assert all(row["lost"] == 0 for row in running.status()["buses"])
+        assert running.status()["buses"][0]["sent"] >= 4000
+    assert sum(sent_between) == 4000
+    assert max(sent_between) < 1000  # the boards deliver every 50 ms, in which the pace allows 200
+    assert looks[0] > 4

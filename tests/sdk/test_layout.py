@@ -27,6 +27,7 @@ from skinware_drivers.layout import (
     Packed,
     Sentinel,
     Stamp,
+    StatusBytes,
     Values,
 )
 from skinware_drivers.skin_state import PATCH_COUNTERS
@@ -208,6 +209,30 @@ def test_sentinels_and_flags() -> None:
     payload = np.array([np.nan, 0.5], "<f4").tobytes()
     decoder = decode(nan, [Module(taxels(2))], "<f4", [(0x100, payload)])
     assert decoder.state.status.tolist() == [int(Status.NOT_CONNECTED), 0]
+
+
+def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
+    mask = Status.NO_ACK | Status.SUSPECT
+    frame = Frame("d", [Identifier(0x100)], (2, 4), Values(0, "u1", 2, to=(1, 0)), flags=[StatusBytes(2, mask)])
+    modules = [Module(taxels(2))]
+    decoder = decode(Layout([frame]), modules, "u1", [(0x100, bytes((5, 6, 0xF7, 0x08)))])
+    assert decoder.state.status.tolist() == [int(Status.NO_ACK), int(Status.SUSPECT)]
+    assert decoder.state.values.tolist() == [6, 5]
+    decoder = decode(Layout([frame]), modules, "u1", [(0x100, bytes((5, 6, 0xF7, 0x08))), (0x100, bytes((7, 8)))])
+    assert decoder.state.status.tolist() == [0, 0]
+
+
+def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
+    layout = one(Values(2, "u1", 1), stamp=Stamp(0, "<u2"))
+    decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, (40000).to_bytes(2, "little") + bytes(6))])
+    decoder.forget(0)
+    batch = FrameBatch(16, 8, decoder.headroom)
+    decoder.put_back(batch)
+    batch.append(0, 1, 0x100, bytes(8))
+    decoder.decode(batch)
+    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
+    assert counters["updates"] == 2
+    assert sum(counters.values()) == 2
 
 
 def test_sequence_numbers_tell_losses_and_repeats() -> None:

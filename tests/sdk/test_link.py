@@ -7,8 +7,9 @@ import asyncio
 import numpy as np
 import pytest
 
+from skinware.errors import BusSendError
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.link import AT_ONCE, Link, Match, Reply
 
 
 class Nowhere:
@@ -62,3 +63,96 @@ def test_who_follows_hears_everything_that_matches_in_order_until_it_stops() -> 
         assert offer(link, (0x705, b"\x05")) == [0]
 
     asyncio.run(scenario())
+
+
+# -- sending ------------------------------------------------------------------------------------------------------
+
+
+class Clocked(asyncio.SelectorEventLoop):
+    """A loop whose time the test moves: sleeping costs nothing and takes as long as it should."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_s = 100.0
+
+    def time(self) -> float:
+        return self.now_s
+
+    def _run_once(self) -> None:
+        scheduled = self._scheduled  # type: ignore[attr-defined]
+        if not self._ready and scheduled:  # type: ignore[attr-defined]
+            self.now_s = max(self.now_s, scheduled[0].when())
+        super()._run_once()  # type: ignore[misc]
+
+
+class Full(Nowhere):
+    """A bus whose queue is full until a given time."""
+
+    def __init__(self, loop: Clocked, until_s: float) -> None:
+        self._loop, self._until_s = loop, until_s
+        self.tries_s: list[float] = []
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Refused or gone."""
+        self.tries_s.append(self._loop.time())
+        if self._loop.time() < self._until_s:
+            raise BusSendError("No buffer space available")
+
+
+def test_a_full_queue_is_tried_with_growing_pauses_until_the_deadline() -> None:
+    loop = Clocked()
+    bus = Full(loop, until_s=1e9)
+    link = Link(bus)  # type: ignore[arg-type]
+    with pytest.raises(BusSendError, match="No buffer space"):
+        loop.run_until_complete(link.send(0x100, b"", timeout_s=1.0))
+    pauses = np.diff(bus.tries_s)
+    assert bus.tries_s[-1] == pytest.approx(101.0, abs=0.001)
+    assert pauses[:4] == pytest.approx([0.002, 0.004, 0.008, 0.016])
+    assert len(pauses) < 30  # not a flood
+    loop.close()
+
+
+def test_a_frame_goes_out_once_there_is_room() -> None:
+    loop = Clocked()
+    bus = Full(loop, until_s=100.3)
+    link = Link(bus)  # type: ignore[arg-type]
+    loop.run_until_complete(link.send(0x100, b"", timeout_s=0.5))
+    assert 100.3 <= bus.tries_s[-1] <= 100.36
+    loop.close()
+
+
+@pytest.mark.parametrize("pace_per_ms", [0.5, 4.0])
+def test_thousands_of_frames_go_out_at_the_pace(pace_per_ms: float) -> None:
+    loop = Clocked()
+    bus = Full(loop, until_s=0)
+    link = Link(bus, pace_per_ms)  # type: ignore[arg-type]
+
+    async def flood() -> None:
+        for _ in range(4000):
+            await link.send(0x100, b"")
+
+    loop.run_until_complete(flood())
+    sent_s = np.array(bus.tries_s)
+    assert len(sent_s) == 4000
+    window = 100  # in no stretch of frames are there more than the pace allows, and eight at once
+    fastest_s = (sent_s[window:] - sent_s[:-window]).min()
+    assert fastest_s >= (window - AT_ONCE) / (1e3 * pace_per_ms) - 1e-6
+    assert sent_s[-1] - sent_s[0] < 1.01 * 4000 / (1e3 * pace_per_ms)  # and not slower either
+    loop.close()
+
+
+def test_frames_after_a_rest_are_not_made_up_for() -> None:
+    loop = Clocked()
+    bus = Full(loop, until_s=0)
+    link = Link(bus)  # type: ignore[arg-type]
+
+    async def now_and_then() -> None:
+        for _ in range(3):
+            for _ in range(3 * AT_ONCE):
+                await link.send(0x100, b"")
+            await asyncio.sleep(60)
+
+    loop.run_until_complete(now_and_then())
+    at_once = [bus.tries_s.count(time_s) for time_s in dict.fromkeys(bus.tries_s)]
+    assert max(at_once) <= AT_ONCE + 1
+    loop.close()

@@ -34,6 +34,7 @@ def test_a_driver_tells_what_it_can_do() -> None:
             "enable": "Make",
             "rate": "Change",
             "rebaseline": "Make",
+            "versions": "Type,",
         }
 
 
@@ -211,7 +212,7 @@ def test_requests_go_on_after_the_files_were_removed() -> None:
         place.ring_path("roboskin").unlink()
         wait_until(lambda: place.ring_path("roboskin").exists() and place.socket_path("roboskin").exists())
         with DriverReader("roboskin") as another:
-            assert another.operations().keys() == {"enable", "rate", "rebaseline"}
+            assert another.operations().keys() == {"enable", "rate", "rebaseline", "versions"}
             assert another.request().sequence > 0
 
 

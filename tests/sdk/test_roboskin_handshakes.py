@@ -80,6 +80,16 @@ def test_only_applications_of_possible_addresses_are_boards() -> None:
         assert patches_of(reader) == ["board 7"]
 
 
+def test_boards_without_skin_are_left_alone_unless_they_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    strain2 = Chatter((0x790, bytes.fromhex("FF0C010200")))
+    both = Together(EmulatedRoboskin(EmulatorOptions(boards=(7, 8), mtb3=(8,))), strain2)
+    with driving(VirtualCanBus.with_hardware(both)), DriverReader("roboskin") as reader:
+        assert patches_of(reader) == ["board 7", "board 8"]
+        read_until(reader, lambda f: not f.status.any())
+    assert {identifier for identifier, _ in strain2.heard} == {0x70F, 0x207, 0x208}
+    assert "board 9 is of type 12, which is not known to have skin: left alone" in caplog.text
+
+
 def test_boards_named_in_any_order_are_sorted_by_address() -> None:
     with driving(emulated(boards=(9, 7)), boards=(9, 7)), DriverReader("roboskin") as reader:
         assert patches_of(reader) == ["board 7", "board 9"]

@@ -7,6 +7,7 @@ from dataclasses import astuple
 from itertools import pairwise
 from typing import NamedTuple
 
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.serial import framing as framing_module
@@ -15,6 +16,9 @@ from skinware_drivers.serial.framing import Framer, Framing
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.serial.stuffing import LINES
 from tests.serial.framings import Example
+
+BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+"""For machines that do other things too."""
 
 
 class Found(NamedTuple):

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.packets import Packet
 from tests.serial.framings import EXAMPLES, Example
-from tests.serial.streams import Found, cut, feed, frames, noise, outcome, streams
+from tests.serial.streams import BUSY, Found, cut, feed, frames, noise, outcome, streams
 
 ALWAYS, NEVER = 0, 1 << 60
-each = pytest.mark.parametrize("name", EXAMPLES)
+names = st.sampled_from(list(EXAMPLES))
 
 
 def starting(example: Example) -> bytes:
@@ -30,9 +30,8 @@ def ending(example: Example) -> bytes:
     return b""
 
 
-@each
-@settings(max_examples=6)
-@given(data=st.data())
+@settings(BUSY, max_examples=50)
+@given(name=names, data=st.data())
 def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     sent = data.draw(st.lists(frames(example), min_size=1, max_size=6))
@@ -43,9 +42,8 @@ def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
         assert [(f.identifier, f.body) for f in found[: len(sent)]] == [(i, body) for i, body, _ in sent]
 
 
-@each
-@settings(max_examples=20)
-@given(data=st.data())
+@settings(BUSY, max_examples=120)
+@given(name=names, data=st.data())
 def test_chunking_and_the_way_of_working_change_nothing(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     stream = data.draw(streams(example))
@@ -56,9 +54,8 @@ def test_chunking_and_the_way_of_working_change_nothing(name: str, data: st.Data
     assert outcome(example.framing, chunks, NEVER) == whole
 
 
-@each
-@settings(max_examples=3)
-@given(data=st.data())
+@settings(BUSY, max_examples=20)
+@given(name=names, data=st.data())
 def test_a_trickle_of_single_bytes_gives_the_same(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     stream = data.draw(streams(example))[:400]
@@ -73,9 +70,8 @@ CHECKED = [
 ]
 
 
-@pytest.mark.parametrize("name", CHECKED)
-@settings(max_examples=10)
-@given(data=st.data())
+@settings(BUSY, max_examples=80)
+@given(name=st.sampled_from(CHECKED), data=st.data())
 def test_whole_frames_behind_noise_are_found(name: str, data: st.DataObject) -> None:
     """All of them, in order; beyond them at most what the noise happens to hold."""
     example = EXAMPLES[name]
@@ -148,6 +144,7 @@ def test_half_a_line_before_the_first_end_of_line_is_no_line() -> None:
 def test_without_a_checksum_a_false_beginning_is_told_by_what_follows() -> None:
     """skintalk: 0x55 at the beginning of two frames in a row, or nothing."""
     framing = EXAMPLES["octocan"].framing
-    stream = b"".join(framing.encode(number, b"\x55\x55\x01") for number in range(9))
-    found = feed(framing.framer(), [b"\x01\x55\x02\x03" + stream[3:]])
-    assert [f.identifier for f in found] == list(range(1, 9))
+    stream = b"".join(framing.encode(number, b"\x01\x02\x03") for number in range(9))
+    framer = framing.framer()
+    assert [f.identifier for f in feed(framer, [b"\x01\x55\x09" + stream])] == list(range(9))
+    assert (framer.counters.skipped_bytes, framer.counters.refused) == (3, 1)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from tests.serial.framings import EXAMPLES
 from tests.serial.fuzzing import examples_of_drivers, run
 
 SEEDS = Path(__file__).parent / "seeds"
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_seeds(name: str) -> None:
-    lines = (SEEDS / f"{name}.hex").read_text().split()
-    assert lines
-    for line in lines:
-        run(EXAMPLES[name], bytes.fromhex(line))
+def test_seeds() -> None:
+    assert {path.stem for path in SEEDS.iterdir()} == set(EXAMPLES)
+    for name, example in EXAMPLES.items():
+        for line in (SEEDS / f"{name}.hex").read_text().split():
+            run(example, bytes.fromhex(line))
 
 
 def test_framings_of_installed_drivers() -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import socket
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
+from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import make_bus, parse_bus_name
 from skinware_drivers.serial.bus import PtyBus, SerialBus
@@ -231,6 +235,7 @@ def test_ports_by_vendor_and_product(usb: Usb) -> None:
         with pytest.raises(BusNotAvailable, match=r"2 serial ports have VID:PID 0483:5700: .*serial_number=A9"):
             bus.open()
         both = SerialBus("", {"vid_pid": "0483:5700", "serial_number": "A7"})
+        assert both.channel == "serial_number=A7&vid_pid=0483:5700"
         both.open()
         both.close()
 
@@ -249,21 +254,24 @@ def test_a_second_program_on_the_port_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "message"),
+    ("number", "message", "reason"),
     [
-        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER"),
-        (errno.EBUSY, "another program has it open"),
-        (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all"),
-        (errno.EIO, "cannot be opened as a serial port"),
+        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER", BusReason.REFUSED),
+        (errno.EBUSY, "another program has it open", BusReason.REFUSED),
+        (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all", BusReason.INTERFACE_GONE),
+        (errno.EIO, "cannot be opened as a serial port", BusReason.FAILED),
     ],
 )
-def test_refusals_say_what_to_do(number: int, message: str, usb: Usb, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refusals_say_what_to_do(
+    number: int, message: str, reason: BusReason, usb: Usb, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(self: serial.Serial) -> None:
         raise serial.SerialException(number, os.strerror(number))
 
     monkeypatch.setattr(serial.Serial, "open", refuse)
-    with pytest.raises(BusNotAvailable, match=message):
+    with pytest.raises(BusNotAvailable, match=message) as raised:
         SerialBus("/dev/ttyS9").open()
+    assert raised.value.reason == reason
 
 
 def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:
@@ -330,6 +338,39 @@ def test_a_line_without_a_descriptor() -> None:
             bus.send(value, bytes(40))
         assert [identifier for identifier, _, _ in receive(bus, 5)] == list(range(5))
         assert not is_readable(bus)
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial 3.5
+def test_a_port_of_another_machine() -> None:
+    """rfc2217: pyserial's own server, with a port that gives back what it gets."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ending = threading.Event()
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            peer.settimeout(0.05)
+            with peer, serial.serial_for_url("loop://", timeout=0.01) as port:
+                stream = peer.makefile("wb", buffering=0)
+                manager = PortManager(port, stream)
+                while not ending.is_set():
+                    with contextlib.suppress(TimeoutError):
+                        data = peer.recv(1024)
+                        if not data:
+                            break
+                        port.write(b"".join(manager.filter(data)))
+                    peer.sendall(b"".join(manager.escape(port.read(port.in_waiting or 1))))
+                stream.close()
+
+        serving = threading.Thread(target=serve, daemon=True)
+        serving.start()
+        try:
+            with opened(f"rfc2217://127.0.0.1:{server.getsockname()[1]}") as bus:
+                bus.send(7, bytes(range(200, 256)))
+                assert receive(bus, 1)[0][:2] == (7, bytes(range(200, 256)))
+        finally:
+            ending.set()
+            serving.join(30)
+        assert not serving.is_alive()
 
 
 def test_pyserial_can_spy_on_a_port(capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,258 @@
+"""``skin-config``: set up what hangs on a bus, through its running driver or without one."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+)
+from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
+
+if TYPE_CHECKING:
+    from skinware_drivers.adapter import AnyAdapter
+    from skinware_drivers.description import Patch
+    from skinware_drivers.finding.running import RunningDriver
+
+_OWN_PARAMETERS = 3
+
+
+class Declined(SkinwareError):
+    """The person who was asked said no."""
+
+
+@click.command(
+    "skin-config",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-config can0                        what can be done on can0",
+        "skin-config can0 versions               who is there, with which firmware",
+        "skin-config torso rebaseline            of a running driver's boards",
+        "skin-config torso rate hz=50 --yes      without asking back",
+        "skin-config can0 set_address address=9 patch='board 7'",
+    ),
+)
+@click.argument("target", metavar="NAME_OR_BUS")
+@click.argument("operation", required=False)
+@click.argument("arguments", nargs=-1, metavar="[KEY=VALUE]...")
+@click.option(
+    "--driver", "driver_name", metavar="DRIVER", help="Of a bus that has no running one.  [default: roboskin]"
+)
+@click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
+@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")
+@click.option("-T", "timeout_s", type=seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
+@click.option("--yes", is_flag=True, help="Do not ask before something is changed.")
+@click.option("--force", is_flag=True, help="Change things also on a bus on which somebody sends.")
+@namespace_option
+@json_option
+def command(
+    target: str,
+    operation: str | None,
+    arguments: tuple[str, ...],
+    driver_name: str | None,
+    options: tuple[str, ...],
+    config: Path | None,
+    timeout_s: float,
+    yes: bool,
+    force: bool,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Carry out an OPERATION on boards: of the running driver NAME, or on a BUS.
+
+    A bus that a running driver has is set up through that driver, so that nobody sends behind its back. On any other
+    bus it is done directly, if nothing is sending there. Without OPERATION: what there is to choose from.
+
+    Values are JSON (hz=50, on=false) or plain text. patch=NAME means only that patch.
+
+    Exit status: 0 done, 1 failed or declined, 2 wrong usage or a bus in use, 3 bus not available.
+    """
+    from skinware.memory.namespace import Namespace
+
+    place = Namespace(namespace)
+    given = dict(_pair(text) for text in arguments)
+    owner, of_bus = _owner(target, place.name)
+    if owner is not None:
+        if driver_name or options or config or force:
+            raise click.UsageError(
+                f"{owner} runs: its own options hold, so --driver, -o, --config, --force do not apply"
+            )
+        outcome = _through_driver(owner, of_bus, operation, given, timeout_s, yes)
+    else:
+        driver_type, adapter = _adapter(target, driver_name, options, config)
+        outcome = _without_driver(target, place.name, driver_type, adapter, operation, given, yes, force)
+    if as_json:
+        print_json({"target": target, "driver": owner, "operation": operation, **outcome})
+    else:
+        click.echo("\n".join(_lines(outcome["operations" if operation is None else "results"])))
+
+
+def _owner(target: str, namespace: str) -> tuple[RunningDriver | None, str | None]:
+    """The running driver that is meant or that has the bus that is meant, and its name for that bus."""
+    from skinware_drivers.finding.running import driver_on, running_drivers
+
+    drivers = running_drivers()
+    for driver in drivers:
+        if (driver.name, driver.namespace) == (target, namespace):
+            return driver, None
+    owner = driver_on(target, drivers)
+    return owner, None if owner is None else owner.bus_named(target)
+
+
+def _through_driver(
+    owner: RunningDriver,
+    bus: str | None,
+    operation: str | None,
+    arguments: dict[str, Any],
+    timeout_s: float,
+    yes: bool,
+) -> dict[str, Any]:
+    """Let a running driver do it."""
+    from skinware import DriverReader
+    from skinware_drivers.operations import operations_of
+    from skinware_drivers.options import nearest_name
+    from skinware_drivers.registry import load_driver
+
+    with DriverReader(owner.name, namespace=owner.namespace, announce=False) as reader:
+        offered = reader.operations(timeout_s=timeout_s)
+        if operation is None:
+            return {"operations": offered}
+        try:
+            declared = operations_of(load_driver(owner.driver_type), alone=True)
+        except ConfigurationError:  # a driver that is not installed here
+            declared = {}
+        known = declared.get(operation)
+        if operation not in offered:
+            if known is not None and known.alone:
+                raise ConfigurationError(f"{operation} needs the bus without a driver: end {owner} first")
+            raise ConfigurationError(f"{owner} has no operation {operation!r}{nearest_name(operation, offered)}")
+        if bus is not None:
+            arguments = {**arguments, "bus": bus}
+        if known is None or not known.looks:
+            on = " ".join(f"{key}={value}" for key, value in arguments.items())
+            _ask_back(f"{owner}: {operation} {on}".rstrip(), offered[operation], yes)
+        return {"results": reader.call(operation, timeout_s=timeout_s, **arguments)}
+
+
+def _without_driver(
+    bus_name: str,
+    namespace: str,
+    driver_type: str,
+    adapter: AnyAdapter,
+    operation: str | None,
+    arguments: dict[str, Any],
+    yes: bool,
+    force: bool,
+) -> dict[str, Any]:
+    """Do it ourselves."""
+    from skinware_drivers.finding.running import driver_on, running_drivers
+    from skinware_drivers.finding.without_driver import carry_out
+    from skinware_drivers.operations import operations_of
+    from skinware_drivers.registry import make_bus
+
+    declared = operations_of(type(adapter), alone=True)
+    if operation is None:
+        return {"operations": {name: _description(one.method) for name, one in declared.items()}}
+
+    def agree(patches: Sequence[Patch]) -> None:
+        names = ", ".join(patch.name for patch in patches)
+        _ask_back(f"{bus_name}: {operation} of {names}", _description(declared[str(operation)].method), yes)
+        owner = driver_on(bus_name, running_drivers())
+        if owner is not None:
+            raise ConfigurationError(f"{owner} was started meanwhile; nothing was changed")
+
+    bus = make_bus(bus_name, payload_size=adapter.payload_size, driver=driver_type)
+    try:
+        result = asyncio.run(carry_out(bus, bus_name, adapter, operation, arguments, agree=agree, force=force))
+    except BusNotAvailable as error:
+        if ":" in bus_name:
+            raise
+        raise BusNotAvailable(f"no driver {bus_name!r} runs in namespace {namespace!r}; as a bus: {error}") from None
+    return {"results": {bus_name: result}}
+
+
+def _adapter(
+    bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
+) -> tuple[str, AnyAdapter]:
+    """Name and object of the driver for a bus that has none running."""
+    from skinware_drivers.config import DriverConfig, options_of_bus, read_config
+    from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
+
+    settings = read_config(config) if config else DriverConfig()
+    driver_type = driver_name or settings.driver or DEFAULT_DRIVER
+    driver = load_driver(driver_type)
+    given = {}
+    for text in options:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
+        given[key] = value
+    return driver_type, driver(options_of_bus(driver.Options, settings, bus_name, given))
+
+
+def _ask_back(what: str, description: str, yes: bool) -> None:
+    """Have a person agree.
+
+    Raises:
+        Declined: no.
+        ConfigurationError: there is nobody to ask.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise ConfigurationError(f"{what}: this changes something, and there is no terminal to ask at; say --yes")
+    click.echo(f"{what}\n  {description}", err=True)
+    if not click.confirm("Go on?", err=True):
+        raise Declined("nothing was changed")
+
+
+def _pair(text: str) -> tuple[str, Any]:
+    """``key=value``; the value is JSON, or else text."""
+    import msgspec
+
+    key, equals, value = text.partition("=")
+    if not equals or not key.isidentifier():
+        raise click.UsageError(f"{text}: write arguments as KEY=VALUE")
+    try:
+        return key, msgspec.json.decode(value)
+    except msgspec.DecodeError:
+        return key, value
+
+
+def _description(method: Any) -> str:
+    """What an operation does and takes."""
+    first = (inspect.getdoc(method) or "").partition("\n")[0]
+    takes = ", ".join(map(str, list(inspect.signature(method).parameters.values())[_OWN_PARAMETERS:]))
+    return f"{first} Takes {takes.replace(chr(39), '')}" if takes else first
+
+
+def _lines(value: dict[str, Any], indent: str = "") -> list[str]:
+    """A result for people."""
+    lines = []
+    for key, one in value.items():
+        if isinstance(one, dict) and any(isinstance(inner, dict | None) for inner in one.values()):
+            lines += [f"{indent}{key}:", *_lines(one, indent + "  ")]
+        elif isinstance(one, dict):
+            lines.append(f"{indent}{key}: {', '.join(f'{name} {inner}' for name, inner in one.items())}")
+        else:
+            nothing = "no answer" if indent else "done"
+            lines.append(f"{indent}{key}: {nothing if one is None else one}")
+    return lines
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

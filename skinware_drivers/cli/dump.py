@@ -1,0 +1,148 @@
+"""``skin-dump``: print what drivers publish (``skinware.cli.dump``), or with ``--raw`` what is heard on a CAN bus."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, print_json, run, warn
+from skinware.cli.dump import command as frames_command
+
+if TYPE_CHECKING:
+    from skinware_drivers.bus import Bus, FrameBatch
+
+_CAN_PAYLOAD = 64
+_BATCH_FRAMES = 2048
+_SERIAL = ("serial", "pty")
+_SHARED = ("socketcan", "udp_multicast", "virtual")
+"""Interfaces on which a second listener takes nothing away from the first."""
+_OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "physical": "--physical"}
+
+
+def dump(raw: str | None, **options: Any) -> None:
+    """Frames of a driver, or of a bus."""
+    if raw is None:
+        click.get_current_context().invoke(frames_command, **options)
+        return
+    for option, flag in _OF_DRIVERS.items():
+        if options[option]:
+            raise click.UsageError(f"{flag} is about the frames of a driver, --raw about those of a bus")
+    dump_bus(raw, options["count"], options["timeout_s"], options["as_json"])
+
+
+def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json: bool) -> None:
+    """Print the frames of a CAN bus as they come; nothing is sent.
+
+    Raises:
+        ConfigurationError: not a CAN bus, or one that only one program can have, and that is a driver.
+        BusNotAvailable: the bus cannot be opened, or went away.
+        BusError: nothing came for ``timeout_s``.
+    """
+    from skinware.realtime import now_ns
+    from skinware_drivers.can.candump import channel_name, text_frames
+    from skinware_drivers.registry import make_bus, parse_bus_name
+
+    interface, channel, _ = parse_bus_name(bus_name)
+    _refuse_what_has_one_owner(bus_name, interface)
+    name = channel_name(interface, channel)
+    bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
+    left = count
+    bus.open()
+    try:
+        for batch in _batches(bus, bus_name, timeout_s):
+            offset_ns = time.time_ns() - now_ns()
+            frames = list(text_frames(batch, offset_ns))[:left]
+            for frame in frames if as_json else ():
+                print_json(
+                    {
+                        "bus": name,
+                        "time": frame.time_us / 1e6,
+                        "identifier": frame.identifier,
+                        "extended": frame.extended,
+                        "fd": frame.fd is not None,
+                        "data": frame.payload.hex().upper(),
+                    }
+                )
+            if not as_json and frames:
+                click.echo("\n".join(frame.line(name) for frame in frames))
+            if left is not None:
+                left -= len(frames)
+                if not left:
+                    return
+    finally:
+        bus.close()
+        _tell_what_is_missing(bus)
+
+
+def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
+    from skinware.errors import ConfigurationError
+    from skinware_drivers.finding.running import driver_on, running_drivers
+
+    if interface in _SERIAL:
+        raise ConfigurationError(
+            f"{bus_name}: a serial port has one owner, nobody can listen beside it; what its driver makes of it:"
+            " skin-dump NAME"
+        )
+    owner = None if interface in _SHARED else driver_on(bus_name, running_drivers())
+    if owner is not None:
+        raise ConfigurationError(f"{bus_name}: {owner} has it, and nobody can listen beside it: skin-dump {owner.name}")
+
+
+def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[FrameBatch]:
+    """What arrives, at once and for ever."""
+    from skinware.errors import BusError
+    from skinware_drivers.bus import FrameBatch
+
+    batch = FrameBatch(_BATCH_FRAMES, bus.payload_size)
+    poll = select.poll()
+    poll.register(bus.fileno(), select.POLLIN)
+    end_s = None if timeout_s is None else time.monotonic() + timeout_s
+    while True:
+        poll.poll(None if end_s is None else max(0.0, end_s - time.monotonic()) * 1000)
+        batch.clear()
+        if bus.receive(batch, 0):
+            yield batch
+            end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        elif end_s is not None and time.monotonic() >= end_s:
+            raise BusError(f"{bus_name}: no frame for {timeout_s:g} s")
+
+
+def _tell_what_is_missing(bus: Bus) -> None:
+    counters = bus.counters
+    missing = {
+        "lost": counters.lost,
+        "error frames, not shown": counters.error_frames,
+        "remote frames, not shown": counters.refused,
+    }
+    text = ", ".join(f"{count} {what}" for what, count in missing.items() if count)
+    if text:
+        warn(text)
+
+
+command = click.Command(
+    "skin-dump",
+    context_settings=CONTEXT_SETTINGS,
+    callback=dump,
+    params=[
+        *frames_command.params,
+        click.Option(
+            ["--raw"], metavar="BUS", help="Instead: what is heard on a CAN bus, as candump -L; sends nothing."
+        ),
+    ],
+    help=frames_command.help,
+    epilog=examples(
+        "skin-dump -n 3                              three frames",
+        "skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s",
+        "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
+        "skin-dump --raw can0 -n 1000 > can.log      CAN frames, for canplayer -I can.log",
+    ),
+)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

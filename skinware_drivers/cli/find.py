@@ -1,0 +1,255 @@
+"""``skin-find``: what is on the buses and ports of this machine."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, seconds, warn
+
+if TYPE_CHECKING:
+    from skinware_drivers.adapter import AnyAdapter
+    from skinware_drivers.finding.interfaces import CanInterface
+    from skinware_drivers.finding.looking import Answer, HeardOnBus
+    from skinware_drivers.finding.ports import SerialPort
+    from skinware_drivers.finding.running import RunningDriver
+
+_DETECTION_S = 10.0
+
+
+@click.command(
+    "skin-find",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-find                     everything: CAN interfaces, adapters, serial ports",
+        "skin-find can0 --probe        ask who is on can0",
+        "skin-find --udev              names for the serial ports that stay",
+        "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
+    ),
+)
+@click.argument("buses", nargs=-1, metavar="[BUS]...")
+@click.option("--listen", "listen_s", type=seconds, default="1", show_default=True, help="Listen for SECONDS.")
+@click.option("--probe", is_flag=True, help="Send requests that disturb nobody, to see who answers.")
+@click.option("--driver", "driver_names", multiple=True, metavar="DRIVER", help="Only this driver guesses and asks.")
+@click.option("--force", is_flag=True, help="With --probe: ask also where that may disturb somebody.")
+@click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")
+@json_option
+def command(
+    buses: tuple[str, ...],
+    listen_s: float,
+    probe: bool,
+    driver_names: tuple[str, ...],
+    force: bool,
+    udev: bool,
+    as_json: bool,
+) -> None:
+    """Show what is plugged in, what is heard on it, and who could use it. Sends nothing unless told to.
+
+    With BUS, as can0 or /dev/ttyUSB0: only that. Asking (--probe) never sends a discovery where boards are sending,
+    as it would silence some of them; --force does.
+
+    Exit status: 0 done, 1 failed, 2 wrong usage, 3 a BUS that is not there.
+    """
+    if force and not probe:
+        raise click.UsageError("--force is about --probe: give both")
+    if udev:
+        _print_rules(buses, as_json)
+        return
+    from skinware_drivers.registry import load_driver
+
+    for name in driver_names:
+        load_driver(name)  # refuses one that is not there
+    found = asyncio.run(look(buses, listen_s, probe=probe, force=force, driver_names=driver_names))
+    if as_json:
+        print_json(found)
+    else:
+        from skinware_drivers.cli.find_text import as_text
+
+        click.echo("\n".join(as_text(found)))
+
+
+async def look(
+    buses: tuple[str, ...],
+    listen_s: float,
+    *,
+    probe: bool = False,
+    force: bool = False,
+    driver_names: tuple[str, ...] = (),
+) -> dict[str, Any]:
+    """Everything that ``skin-find`` tells, as JSON has it.
+
+    Raises:
+        BusNotAvailable: one of ``buses`` is not there.
+    """
+    from skinware_drivers.finding.adapters import Detection, detect_adapters
+    from skinware_drivers.finding.guess import known_drivers
+    from skinware_drivers.finding.interfaces import can_interfaces
+    from skinware_drivers.finding.running import running_drivers
+
+    drivers = known_drivers("can", driver_names)
+    running = running_drivers()
+    interfaces, ports, others = _chosen(buses, can_interfaces())
+    buses_to_hear = [(one.name, one.bit_rate) for one in interfaces if one.up] + [(name, None) for name in others]
+    searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
+    heard = {}
+    detection: Detection
+    detection, *listened = await asyncio.gather(
+        searching, *(_hear(name, listen_s, drivers, bit_rate) for name, bit_rate in buses_to_hear)
+    )
+    for one in listened:
+        heard[one.bus] = one
+    answers = await _ask(heard, ports, running, force, driver_names) if probe else {}
+    return {
+        "can": _can_data(interfaces, heard, answers, running, whole=not buses),
+        "buses": [_heard_data(name, heard, answers, running) for name in others],
+        "adapters": detection.found,
+        "adapters_problem": detection.problem,
+        "ports": [_port_data(port, answers, running) for port in ports],
+    }
+
+
+def _chosen(
+    buses: tuple[str, ...], interfaces: list[CanInterface]
+) -> tuple[list[CanInterface], list[SerialPort], list[str]]:
+    """CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
+    from skinware.errors import BusNotAvailable
+    from skinware_drivers.finding.ports import serial_ports
+    from skinware_drivers.finding.running import same_bus
+    from skinware_drivers.registry import parse_bus_name
+
+    if not buses:
+        return interfaces, serial_ports(), []
+    chosen: tuple[list[CanInterface], list[SerialPort], list[str]] = [], [], []
+    for name in buses:
+        interface, channel, _ = parse_bus_name(name)
+        if interface in ("serial", "pty"):
+            port = next((port for port in serial_ports() if channel and same_bus(port.path, channel)), None)
+            if port is None:
+                raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
+            chosen[1].append(port)
+        elif interface == "socketcan" and channel in [one.name for one in interfaces]:
+            chosen[0].extend(one for one in interfaces if one.name == channel)
+        else:
+            chosen[2].append(name)
+    return chosen
+
+
+async def _hear(name: str, listen_s: float, drivers: dict[str, type[AnyAdapter]], bit_rate: int | None) -> HeardOnBus:
+    from skinware.errors import BusNotAvailable
+    from skinware_drivers.finding.looking import listen
+
+    heard = await listen(name, listen_s, drivers, bit_rate)
+    if heard.problem:
+        raise BusNotAvailable(heard.problem)
+    return heard
+
+
+async def _ask(
+    heard: dict[str, HeardOnBus],
+    ports: list[SerialPort],
+    running: list[RunningDriver],
+    force: bool,
+    driver_names: tuple[str, ...],
+) -> dict[str, Answer]:
+    from skinware_drivers.finding.guess import known_drivers
+    from skinware_drivers.finding.looking import Answer, ask, ask_port
+    from skinware_drivers.finding.running import driver_on
+
+    answers = {}
+    for name, one in heard.items():
+        owner = driver_on(name, running)
+        answers[name] = await ask(
+            one, known_drivers("can", driver_names), force=force, owner="" if owner is None else str(owner)
+        )
+    for port in ports:
+        owner = driver_on(port.path, running)
+        users = [f"{user.program} (pid {user.pid})" for user in port.users]
+        if owner is not None or users:
+            answers[port.path] = Answer(port.path, refused=f"{owner or ', '.join(users)} has it")
+        elif not port.may_open:
+            answers[port.path] = Answer(port.path, refused="you may not open it")
+        else:
+            answers[port.path] = await ask_port(port.path, known_drivers("serial", driver_names))
+    return answers
+
+
+def _no_adapters(_timeout_s: float) -> Any:
+    from skinware_drivers.finding.adapters import Detection
+
+    return Detection()
+
+
+def _can_data(
+    interfaces: list[CanInterface],
+    heard: dict[str, HeardOnBus],
+    answers: dict[str, Answer],
+    running: list[RunningDriver],
+    *,
+    whole: bool,
+) -> dict[str, Any]:
+    import msgspec
+
+    from skinware_drivers.finding.interfaces import NO_CAN, NO_INTERFACE, kernel_has_can
+
+    in_kernel = kernel_has_can()
+    advice = []
+    if whole and not interfaces:
+        advice.append(NO_INTERFACE if in_kernel else NO_CAN)
+    return {
+        "in_kernel": in_kernel,
+        "advice": advice,
+        "interfaces": [
+            {
+                **msgspec.to_builtins(one),
+                "advice": one.advice(),
+                **_heard_data(one.name, heard, answers, running),
+            }
+            for one in interfaces
+        ],
+    }
+
+
+def _heard_data(
+    name: str, heard: dict[str, HeardOnBus], answers: dict[str, Answer], running: list[RunningDriver]
+) -> dict[str, Any]:
+    from skinware_drivers.finding.running import driver_on
+
+    return {"bus": name, "used_by": driver_on(name, running), "heard": heard.get(name), "probe": answers.get(name)}
+
+
+def _port_data(port: SerialPort, answers: dict[str, Answer], running: list[RunningDriver]) -> dict[str, Any]:
+    import msgspec
+
+    from skinware_drivers.finding.running import driver_on
+
+    return {
+        **msgspec.to_builtins(port),
+        "name": port.name,
+        "advice": port.advice(),
+        "used_by": driver_on(port.path, running),
+        "probe": answers.get(port.path),
+    }
+
+
+def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
+    from skinware_drivers.finding.udev import PLACE, RELOAD, rules_for, shipped_rules
+
+    _, ports, others = _chosen(buses, [])
+    if others:
+        raise click.UsageError(f"{others[0]} is no serial port, and needs no udev rule")
+    rules = rules_for(ports)
+    if not rules:
+        warn("no serial device is plugged in by USB; these are the rules for the adapters that are usual")
+        rules = shipped_rules()
+    if as_json:
+        print_json({"place": PLACE, "rules": rules, "then": list(RELOAD)})
+    else:
+        click.echo(rules, nl=False)
+        warn(f"to use them: skin-find --udev | sudo tee {PLACE}; {'; '.join(RELOAD)}")
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

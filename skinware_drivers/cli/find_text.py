@@ -1,0 +1,154 @@
+"""What ``skin-find`` found, for people: lines that fit a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any
+
+import click
+
+from skinware.cli._format import count_text, plural
+
+_WIDTH = 80
+_MOST_CLASSES = 6
+
+
+def as_text(found: dict[str, Any]) -> list[str]:
+    """The whole report, with colours (which ``click.echo`` takes out where there is no terminal)."""
+    can = found["can"]
+    lines: list[str] = []
+    if can["interfaces"] or can["advice"]:
+        lines += [_title("CAN interfaces of the kernel")]
+        for interface in can["interfaces"]:
+            lines += ["", *_interface_lines(interface)]
+        lines += _advice(can["advice"])
+    for bus in found["buses"]:
+        lines += ["", _title(bus["bus"]), *_bus_lines(bus)]
+    if found["adapters"] or found["adapters_problem"]:
+        lines += ["", _title("other CAN adapters, by python-can")]
+        for adapter in found["adapters"]:
+            details = ", ".join(f"{key} {value}" for key, value in adapter.details.items())
+            lines += _wrapped(f"{click.style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
+        lines += _advice([found["adapters_problem"]] if found["adapters_problem"] else [])
+    if found["ports"]:
+        lines += ["", _title("serial ports")]
+        for port in found["ports"]:
+            lines += ["", *_port_lines(port)]
+    elif not can["interfaces"] and not found["buses"] and not found["adapters"]:
+        lines += ["", "no serial port and no other CAN adapter"]
+    return lines[1:] if lines and not lines[0] else lines
+
+
+def _interface_lines(one: dict[str, Any]) -> list[str]:
+    state = click.style("up", fg="green") if one["up"] else click.style("down", fg="yellow")
+    parts = [state, one["driver"] or one["kind"]]
+    if one["bit_rate"]:
+        parts.append(_bit_rate(one))
+    elif one["kind"] == "can":
+        parts.append("no bit rate known")
+    if one["state"]:
+        parts.append(one["state"].lower())
+    parts += ["FD" if one["is_fd"] else "no FD", f"queue {one['queue_length']}"]
+    counts = one["statistics"]
+    went = [f"received {count_text(counts['rx_packets'])}", f"sent {count_text(counts['tx_packets'])}"]
+    went += [f"{name.replace('_', ' ')} {count_text(count)}" for name, count in _troubles(one).items()]
+    lines = [*_wrapped(f"{click.style(one['name'], bold=True)}  {', '.join(parts)}", first="")]
+    return [*lines, *_wrapped(", ".join(went)), *_bus_lines(one), *_advice(one["advice"])]
+
+
+def _bit_rate(one: dict[str, Any]) -> str:
+    text = f"{one['bit_rate'] / 1000:g} kbit/s"
+    return text + (f", data {one['data_bit_rate'] / 1000:g} kbit/s" if one["data_bit_rate"] else "")
+
+
+def _troubles(one: dict[str, Any]) -> dict[str, int]:
+    counted = {**one["statistics"], **one["controller_errors"]}
+    return {name: count for name, count in counted.items() if count and not name.endswith("_packets")}
+
+
+def _bus_lines(bus: dict[str, Any]) -> list[str]:
+    lines = []
+    if bus["used_by"] is not None:
+        lines += _wrapped(f"{bus['used_by']} runs on it")
+    heard, probe = bus["heard"], bus["probe"]
+    if heard is not None:
+        load = f", {100 * heard.load:.0f} % of the bus' time" if heard.load is not None and heard.frames else ""
+        what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
+        errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""
+        errors += f"; the controller tells: {heard.trouble}" if heard.trouble else ""
+        lines += _wrapped(f"heard in {heard.duration_s:g} s: {what}{errors}")
+        for one in heard.classes[:_MOST_CLASSES]:
+            span = f"{one.first:X}" if one.first == one.last else f"{one.first:X} to {one.last:X}"
+            which = f"{plural(one.identifiers, 'identifier')}, {span}"
+            lines += _wrapped(f"{one.name}: {plural(one.frames, 'frame')} of {which}", first="    ")
+        for one in heard.guesses:
+            share = "all frames" if one.share == 1 else f"{100 * one.share:.0f} % of the frames"
+            patches = ", ".join(one.patches)
+            how = "looks like" if one.likely else "or perhaps"
+            name = click.style(one.driver, bold=one.likely)
+            lines += _wrapped(f"{how} {name}{'' if one.likely else '?'}: {patches} ({share})")
+        if heard.frames and not heard.guesses:
+            lines += _wrapped("no installed driver knows these frames")
+        if not heard.frames and probe is None and bus["used_by"] is None:
+            lines += _wrapped(f"to ask who is there: skin-find {bus['bus']} --probe")
+    return lines + _probe_lines(probe)
+
+
+def _probe_lines(probe: Any) -> list[str]:
+    if probe is None:
+        return []
+    if probe.refused:
+        return _wrapped(f"not asked: {probe.refused}")
+    lines = []
+    for text in probe.answers.values():
+        lines += _wrapped(f"answers: {text}")
+    for driver, text in probe.problems.items():
+        lines += _wrapped(f"{driver} could not ask: {text}")
+    return lines or _wrapped(f"nobody answers (asked by {', '.join(probe.asked)})")
+
+
+def _port_lines(port: dict[str, Any]) -> list[str]:
+    usb = port["usb"]
+    parts = [port["name"]]
+    if usb is not None:
+        parts.append(f"{usb['vendor_id']}:{usb['product_id']}")
+        parts.append(f"serial number {usb['serial_number']}" if usb["serial_number"] else "no serial number")
+    if port["driver"]:
+        parts.append(port["driver"])
+    lines = _wrapped(f"{click.style(port['path'], bold=True)}  {', '.join(parts)}", first="")
+    for link in port["links"]:
+        lines.append(f"  {link}")
+    if port["used_by"] is not None:
+        lines += _wrapped(f"{port['used_by']} runs on it")
+    elif port["users"]:
+        lines += _wrapped("in use by " + ", ".join(f"{user['program']} (pid {user['pid']})" for user in port["users"]))
+    elif not port["users_known"]:
+        lines += _wrapped("whether a program of another user has it open is not known")
+    return [*lines, *_advice(port["advice"]), *_probe_lines(port["probe"])]
+
+
+def _advice(texts: list[str]) -> list[str]:
+    """What is wrong and what to do, marked; commands in it can be copied as they are."""
+    lines = []
+    for text in texts:
+        why, colon, commands = text.partition(": sudo ")
+        mark = click.style("!", fg="yellow")
+        lines += _wrapped(f"{mark} {why}{':' if colon else ''}")
+        if colon:
+            lines += [f"      sudo {command}" for command in commands.replace("; sudo ", ";").split(";")]
+    return lines
+
+
+def _title(text: str) -> str:
+    return click.style(text, underline=True)
+
+
+def _wrapped(text: str, first: str = "  ") -> list[str]:
+    return textwrap.wrap(
+        text,
+        _WIDTH + len(text) - len(click.unstyle(text)),
+        initial_indent=first,
+        subsequent_indent=first + "    ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

@@ -1,0 +1,215 @@
+"""Whose frames are these: the layouts of all drivers are held against what was heard on a CAN bus."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BusError, BusSendError, ConfigurationError
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import EXTENDED_FLAG, Bus
+from skinware_drivers.description import Patch
+from skinware_drivers.finding.traffic import Traffic
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout
+from skinware_drivers.link import Heard, Link
+from skinware_drivers.registry import DRIVERS, load_driver
+
+_NAMING_S = 0.5
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A driver that knows some of the frames.
+
+    Attributes:
+        driver: its name.
+        frames: how many of them.
+        share: of all frames, 0 to 1.
+        patches: what they would be, as the driver calls them.
+        likely: no driver that explains these frames better; False: a possibility.
+    """
+
+    driver: str
+    frames: int
+    share: float
+    patches: tuple[str, ...]
+    likely: bool
+
+
+@dataclass(frozen=True)
+class _Match:
+    name: str
+    adapter: AnyAdapter
+    rows: npt.NDArray[np.bool_]
+    keys: frozenset[int]
+    weight: float
+
+
+def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[AnyAdapter]]:
+    """Registered drivers for a kind of bus that can be loaded, by name.
+
+    Args:
+        medium: kind of bus, ``can``.
+        only: names of those to take; none: all.
+    """
+    found = {}
+    for name in sorted({entry.name for entry in entry_points(group=DRIVERS)}):
+        try:
+            driver = load_driver(name)
+        except ConfigurationError:
+            continue
+        if driver.medium == medium and (not only or name in only):
+            found[name] = driver
+    return found
+
+
+async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]) -> list[Guess]:
+    """Which drivers know what was heard, the most likely first.
+
+    A driver knows a frame if identifier, length and constant bytes are right, and of those that only count together
+    all have come. Where several know the same frames, the one that asks for more wins.
+
+    Args:
+        traffic: what was heard.
+        bus: on which bus; only its name is used.
+        drivers: those in question.
+    """
+    wire = traffic.wire()
+    adapters = {
+        name: adapter for name, driver in drivers.items() if (adapter := with_default_options(driver)) is not None
+    }
+    matches = [match for name, adapter in adapters.items() if (match := _match(name, adapter, wire)) is not None]
+    explained = np.zeros(len(wire), bool)
+    guesses = []
+    for match in sorted(matches, key=lambda match: -match.weight):
+        is_new = match.rows & ~explained
+        explained |= match.rows
+        count = int(match.rows.sum())
+        patches = await _names(match, bus, traffic.heard())
+        guesses.append(Guess(match.name, count, count / len(wire), patches, bool(is_new.any())))
+    return sorted(guesses, key=lambda one: not one.likely)
+
+
+async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list[Patch]:
+    """The patches of one driver that were heard, as it describes them; nothing is sent.
+
+    Args:
+        traffic: what was heard.
+        bus: on which bus; only its name is used.
+        adapter: the driver's object.
+    """
+    match = _match(type(adapter).__name__, adapter, traffic.wire())
+    if match is None:
+        return []
+    return [patch for patch in await _describe(adapter, bus, traffic.heard()) if patch.key in match.keys]
+
+
+def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """(n,) bool: which frames are of a kind."""
+    identifier, payload, length = wire["identifier"], wire["payload"], wire["length"]
+    match = np.isin(length, list(frame.length))
+    match &= ((identifier & EXTENDED_FLAG) != 0) == frame.extended
+    for condition in frame.when:
+        if isinstance(condition, Identifier):
+            match &= (identifier & condition.mask) == condition.value
+        elif condition.offset < payload.shape[1]:
+            match &= (payload[:, condition.offset] & condition.mask) == condition.value
+            match &= length > condition.offset
+        else:
+            match[:] = False
+    return match
+
+
+def with_default_options(driver: type[AnyAdapter]) -> AnyAdapter | None:
+    """A driver's object with default options; None if it has options that must be given."""
+    try:
+        return driver(driver.Options())
+    except (TypeError, ConfigurationError):
+        return None
+
+
+def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | None:
+    """How much a driver knows; None if nothing, or if it only learns from the hardware what frames mean."""
+    layout: Layout | None = getattr(adapter, "layout", None)
+    if layout is None or not len(wire):
+        return None
+    members = set(layout.cycle.members) if layout.cycle else set()
+    heard: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
+    bits = 0.0
+    for frame in layout.frames:
+        rows = matching_rows(frame, wire)
+        bits += _constant_bits(frame) * int(rows.sum())
+        keys = _patch_keys(frame, wire["identifier"])
+        for key in np.unique(keys[rows]).tolist():
+            heard.setdefault(key, {})[frame.name] = rows & (keys == key)
+    whole = {key: frames for key, frames in heard.items() if members <= set(frames) or (set(frames) - members)}
+    if not whole:
+        return None
+    rows = np.zeros(len(wire), bool)
+    for frames in whole.values():
+        for name_of_frame, of_frame in frames.items():
+            if name_of_frame not in members or members <= set(frames):
+                rows |= of_frame
+    return _Match(name, adapter, rows, frozenset(whole), bits / len(wire))
+
+
+def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
+    """(n,) key of the patch that each frame would be of."""
+    patch: object = frame.patch
+    if isinstance(patch, Bits):
+        return identifier.astype(np.int64) >> patch.shift & ((1 << patch.width) - 1)
+    return np.full(len(identifier), patch if isinstance(patch, int) else 0, np.int64)
+
+
+def _constant_bits(frame: Frame) -> int:
+    """How much a kind of frame asks for."""
+    return sum((condition.mask & 0x1FFF_FFFF).bit_count() for condition in frame.when)
+
+
+class _Replay(Link):
+    """A driver's link to what was heard already: it listens without waiting, and cannot send."""
+
+    def __init__(self, bus: Bus, heard: dict[Heard, int]) -> None:
+        super().__init__(bus)
+        self._known = Counter(heard)
+
+    @property
+    def listen_only(self) -> bool:
+        return True
+
+    async def send(self, identifier: int, payload: bytes, *, timeout_s: float = 0.0) -> None:  # noqa: ARG002
+        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: this only replays what was heard")
+
+    async def listen(self, duration_s: float) -> Counter[Heard]:
+        del duration_s
+        return self._known
+
+    async def sleep(self, duration_s: float) -> None:
+        del duration_s
+        await asyncio.sleep(0)
+
+
+async def _names(match: _Match, bus: Bus, heard: dict[Heard, int]) -> tuple[str, ...]:
+    """What the driver itself would call the patches that were heard."""
+    names = {patch.key: patch.name for patch in await _describe(match.adapter, bus, heard)}
+    return tuple(names.get(key, f"patch {key}") for key in sorted(match.keys))
+
+
+async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
+    """What a driver that only listens would make of what was heard."""
+    try:
+        return await asyncio.wait_for(adapter.describe(_Replay(bus, heard)), _NAMING_S)
+    except (BusError, TimeoutError):
+        return ()
+
+
+def likely(guesses: Iterable[Guess]) -> list[Guess]:
+    """Those that are more than a possibility."""
+    return [one for one in guesses if one.likely]

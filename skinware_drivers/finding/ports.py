@@ -1,0 +1,233 @@
+"""Serial ports: what they are, whether this user may open them, and who has.
+
+Sources: Documentation/ABI/testing/sysfs-tty and sysfs-bus-usb; drivers/usb/serial/ftdi_sio.c (latency_timer, in ms).
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+SLOW_LATENCY_MS = 1
+"""A latency timer above this holds back what a device has sent: FTDI's default is 16 ms."""
+_UNKNOWN_UART = "0"
+
+
+@dataclass(frozen=True)
+class UsbIdentity:
+    """What a USB device says of itself.
+
+    Attributes:
+        vendor_id: ``0403``.
+        product_id: ``6001``.
+        serial_number: empty if it has none.
+        manufacturer: in words.
+        product: in words.
+        place: where it is plugged in: ``1-1.2``.
+        interface: number of its interface that the port is: ``00``.
+    """
+
+    vendor_id: str
+    product_id: str
+    serial_number: str
+    manufacturer: str
+    product: str
+    place: str
+    interface: str
+
+
+@dataclass(frozen=True)
+class User:
+    """A process that has a port open."""
+
+    pid: int
+    program: str
+
+
+@dataclass(frozen=True)
+class SerialPort:
+    """One port.
+
+    Attributes:
+        path: ``/dev/ttyUSB0``.
+        driver: of the kernel: ``ftdi_sio``, ``cdc_acm``.
+        usb: None for a port that is not on USB.
+        links: other names that stay the same when ports are numbered anew.
+        may_open: this user may read and write.
+        group: whose members may, empty if none is.
+        in_group: this user is a member of it, if perhaps not yet in this session.
+        users: who has it open.
+        users_known: all processes could be looked at; False: there may be other users.
+        latency_ms: how long the adapter holds data back, of FTDI; None: it has no such thing.
+    """
+
+    path: str
+    driver: str
+    usb: UsbIdentity | None
+    links: tuple[str, ...]
+    may_open: bool
+    group: str
+    in_group: bool
+    users: tuple[User, ...] = ()
+    users_known: bool = False
+    latency_ms: int | None = None
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        if self.usb is None:
+            return "built-in port"
+        return " ".join(part for part in (self.usb.manufacturer, self.usb.product) if part) or "USB serial device"
+
+    def advice(self) -> list[str]:
+        """What to do so that it works well, a line each; empty if it does."""
+        told = []
+        if not self.may_open and self.in_group:
+            told.append(f"you may not open it yet: log out and in again, you are in group {self.group} since then")
+        elif not self.may_open and self.group:
+            told.append(f"you may not open it: sudo usermod -aG {self.group} $USER, then log out and in again")
+        elif not self.may_open:
+            told.append("you may not open it: give it a group or uaccess by a udev rule (skin-find --udev)")
+        if self.latency_ms is not None and self.latency_ms > SLOW_LATENCY_MS:
+            told.append(
+                f"holds data back for up to {self.latency_ms} ms, unless a program asks it not to, as skin-driver does;"
+                " for all programs, a udev rule: skin-find --udev"
+            )
+        return told
+
+
+@dataclass(frozen=True)
+class Machine:
+    """Where to look, so that tests can look elsewhere.
+
+    Attributes:
+        sys: sysfs.
+        dev: device files.
+        proc: procfs.
+    """
+
+    sys: Path = Path("/sys")
+    dev: Path = Path("/dev")
+    proc: Path = Path("/proc")
+
+
+def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
+    """All serial ports that have hardware, in the order of their numbers."""
+    machine = machine or Machine()
+    devices = {
+        folder.name: (folder / "device").resolve()
+        for folder in (machine.sys / "class/tty").glob("*")
+        if (folder / "device").exists() and _text(folder / "type") != _UNKNOWN_UART
+    }
+    present = {name: machine.dev / name for name in devices if (machine.dev / name).exists()}
+    links = _links(machine, set(present.values()))
+    users, all_seen = _users(machine, set(present.values()))
+    return [
+        _port(path, devices[name], links.get(path, ()), users.get(path, ()), all_seen)
+        for name, path in sorted(present.items(), key=lambda item: _natural(item[0]))
+    ]
+
+
+def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, ...], all_seen: bool) -> SerialPort:
+    info = path.stat()
+    group = _group_that_may(info)
+    latency = _text(device / "latency_timer")
+    driver = device / "driver"
+    return SerialPort(
+        path=str(path),
+        driver=driver.resolve().name if driver.exists() else "",
+        usb=_usb_identity(device),
+        links=links,
+        may_open=os.access(path, os.R_OK | os.W_OK),
+        group=group.gr_name if group else "",
+        in_group=group is not None and _user_name() in group.gr_mem,
+        users=users,
+        users_known=all_seen,
+        latency_ms=int(latency) if latency.isdigit() else None,
+    )
+
+
+def _usb_identity(device: Path) -> UsbIdentity | None:
+    """The USB device that a port's device in sysfs is part of: port, interface, device."""
+    for folder in (device, *device.parents):
+        if (folder / "idVendor").exists():
+            return UsbIdentity(
+                vendor_id=_text(folder / "idVendor"),
+                product_id=_text(folder / "idProduct"),
+                serial_number=_text(folder / "serial"),
+                manufacturer=_text(folder / "manufacturer"),
+                product=_text(folder / "product"),
+                place=folder.name,
+                interface=_interface_number(device, folder),
+            )
+    return None
+
+
+def _interface_number(device: Path, usb_device: Path) -> str:
+    for folder in (device, *device.parents):
+        if folder == usb_device:
+            return ""
+        if (folder / "bInterfaceNumber").exists():
+            return _text(folder / "bInterfaceNumber")
+    return ""
+
+
+def _group_that_may(info: os.stat_result) -> grp.struct_group | None:
+    """The group whose members may read and write."""
+    if info.st_mode & (stat.S_IRGRP | stat.S_IWGRP) != stat.S_IRGRP | stat.S_IWGRP or info.st_gid == 0:
+        return None
+    try:
+        return grp.getgrgid(info.st_gid)
+    except KeyError:
+        return None
+
+
+def _user_name() -> str:
+    try:
+        return pwd.getpwuid(os.geteuid()).pw_name
+    except KeyError:
+        return ""
+
+
+def _links(machine: Machine, paths: set[Path]) -> dict[Path, tuple[str, ...]]:
+    """Links of the kinds that stay: by identity, by place, and our own."""
+    found: dict[Path, list[str]] = {}
+    for folder in ("skin", "serial/by-id", "serial/by-path"):
+        for link in sorted((machine.dev / folder).glob("*")):
+            if link.is_symlink() and link.resolve() in paths:
+                found.setdefault(link.resolve(), []).append(str(link))
+    return {path: tuple(links) for path, links in found.items()}
+
+
+def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, ...]], bool]:
+    """Who has the paths open, and whether every process could be looked at."""
+    found: dict[Path, list[User]] = {}
+    all_seen = True
+    for process in machine.proc.glob("[0-9]*"):
+        try:
+            targets = {os.readlink(link) for link in (process / "fd").iterdir()}
+        except PermissionError:
+            all_seen = False
+            continue
+        except OSError:  # it ended meanwhile
+            continue
+        for path in paths:
+            if str(path) in targets and int(process.name) != os.getpid():
+                found.setdefault(path, []).append(User(int(process.name), _text(process / "comm")))
+    return {path: tuple(users) for path, users in found.items()}, all_seen
+
+
+def _natural(name: str) -> tuple[str, int]:
+    letters = name.rstrip("0123456789")
+    return letters, int(name[len(letters) :] or 0)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip()
+    except OSError:
+        return ""

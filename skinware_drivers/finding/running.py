@@ -1,0 +1,81 @@
+"""Which drivers run on this machine, and on which buses: nobody may send behind a driver's back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from skinware.driver_service import DriverReader
+from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
+from skinware.memory.namespace import ROOT, Namespace
+from skinware_drivers.registry import parse_bus_name
+
+_PREFIX = "skinware."
+
+
+@dataclass(frozen=True)
+class RunningDriver:
+    """A driver whose process lives.
+
+    Attributes:
+        name: under which programs find it.
+        namespace: where.
+        driver_type: ``roboskin``.
+        pid: of its process.
+        buses: as it was told them.
+    """
+
+    name: str
+    namespace: str
+    driver_type: str
+    pid: int
+    buses: tuple[str, ...]
+
+    def bus_named(self, bus_name: str) -> str | None:
+        """Its own name for a bus, None if it has no such bus."""
+        return next((own for own in self.buses if same_bus(own, bus_name)), None)
+
+    def __str__(self) -> str:
+        return f"driver {self.name!r} (namespace {self.namespace}, pid {self.pid})"
+
+
+def running_drivers() -> list[RunningDriver]:
+    """All living drivers in namespaces that this user may read."""
+    found = []
+    for folder in sorted(ROOT.glob(f"{_PREFIX}*")):
+        try:
+            namespace = Namespace(folder.name.removeprefix(_PREFIX))
+            services = namespace.services()
+        except (ConfigurationError, NamespaceError, NotADirectoryError):
+            continue
+        for name in services:
+            driver = _look_at(namespace, name)
+            if driver is not None:
+                found.append(driver)
+    return found
+
+
+def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver | None:
+    """The driver that has a bus."""
+    return next((driver for driver in drivers if driver.bus_named(bus_name) is not None), None)
+
+
+def same_bus(one: str, other: str) -> bool:
+    """Whether two names mean one bus: what is set behind ``?`` does not count, and links are followed."""
+    return _place(one) == _place(other)
+
+
+def _place(bus_name: str) -> tuple[str, str]:
+    interface, channel, _ = parse_bus_name(bus_name.partition("?")[0])
+    return interface, os.path.realpath(channel) if channel.startswith("/dev/") else channel
+
+
+def _look_at(namespace: Namespace, name: str) -> RunningDriver | None:
+    try:
+        with DriverReader(name, namespace=namespace, announce=False) as reader:
+            if not reader.alive:
+                return None
+            return RunningDriver(name, namespace.name, reader.driver_type, reader.writer_pid, reader.structure.buses)
+    except (BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound):
+        return None  # no driver, just withdrawn, or nothing that may be read

@@ -1,0 +1,109 @@
+"""Warns once when a bus or this machine comes close to what it can carry."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import Bus
+
+log = logging.getLogger("skinware.driver")
+
+HIGH_LOAD = 0.8
+"""Of what the wire can carry. Beyond it, frames of low priority wait for long."""
+HIGH_FILL = 0.5
+"""Of the receive buffer."""
+SOFTNET = Path("/proc/net/softnet_stat")
+_LOOK_PAUSE_NS = NS_PER_S
+
+
+class BusLimits:
+    """Compares one bus with its limits once a second.
+
+    Args:
+        name: of the bus, for people.
+        bus: the bus.
+        clock: CLOCK_MONOTONIC ns.
+
+    Attributes:
+        load: share of the wire's time in use, over the last second; None where the bit rate is not known.
+    """
+
+    def __init__(self, name: str, bus: Bus, clock: Callable[[], int] = now_ns) -> None:
+        self._name = name
+        self._bus = bus
+        self._clock = clock
+        self._looked_ns = clock()
+        self._bits = bus.wire_bits
+        self._lost = bus.counters.lost
+        self._told: set[str] = set()
+        self.load: float | None = None
+
+    def look(self) -> None:
+        """Look at the bus, if the last look was a second ago."""
+        time_ns = self._clock()
+        passed_ns = time_ns - self._looked_ns
+        if passed_ns < _LOOK_PAUSE_NS:
+            return
+        bus, self._looked_ns = self._bus, time_ns
+        bits, self._bits = bus.wire_bits - self._bits, bus.wire_bits
+        self.load = bits * NS_PER_S / (bus.bit_rate * passed_ns) if bus.bit_rate else None
+        fill, bus.fullest = bus.fullest, 0.0
+        if self.load is not None and self.load > HIGH_LOAD:
+            self._tell("load", f"about {self.load:.0%} of {bus.bit_rate} bit/s are in use: what has low priority waits")
+        if fill > HIGH_FILL:
+            self._tell("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time")
+        if bus.counters.lost > self._lost:
+            lost = bus.counters.lost - self._lost
+            self._tell("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+
+    def _tell(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            log.warning("bus %s: %s; told once, see docs/troubleshooting.md", self._name, text)
+
+
+class MachineLimits:
+    """What this machine as a whole lost: no socket and no bus knows of it.
+
+    Packets of *all* network interfaces wait for a processor in a queue (``net.core.netdev_max_backlog``) before they
+    reach sockets; CAN frames too. What does not fit is only counted in /proc/net/softnet_stat, for the machine.
+
+    Args:
+        source: the file to read.
+        clock: CLOCK_MONOTONIC ns.
+
+    Attributes:
+        softnet_dropped: packets dropped there since this object was made.
+    """
+
+    def __init__(self, source: Path = SOFTNET, clock: Callable[[], int] = now_ns) -> None:
+        self._source = source
+        self._clock = clock
+        self._looked_ns = clock()
+        self._before = self._read()
+        self.softnet_dropped = 0
+
+    def look(self) -> None:
+        """Read the file, if the last look was a second ago."""
+        time_ns = self._clock()
+        if time_ns - self._looked_ns < _LOOK_PAUSE_NS:
+            return
+        self._looked_ns = time_ns
+        was_none = not self.softnet_dropped
+        self.softnet_dropped = max(self.softnet_dropped, self._read() - self._before)
+        if was_none and self.softnet_dropped:
+            log.warning(
+                "this machine dropped %d network packets before any socket saw them, CAN frames perhaps among them;"
+                " more room: sysctl net.core.netdev_max_backlog=10000; told once, see docs/troubleshooting.md",
+                self.softnet_dropped,
+            )
+
+    def _read(self) -> int:
+        try:
+            rows = self._source.read_text().splitlines()
+            return sum(int(row.split()[1], 16) for row in rows)
+        except (OSError, ValueError, IndexError):  # no such file, or of another form: nothing is known
+            return 0

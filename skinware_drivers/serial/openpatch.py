@@ -1,0 +1,354 @@
+"""Driver of patches that speak the open patch protocol: they say themselves what they are.
+
+The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch hangs on
+each serial line.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import BusError, HandshakeTimeout
+from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.adapter import Notice
+from skinware_drivers.description import Patch
+from skinware_drivers.device_time import DeviceClock
+from skinware_drivers.link import Link, Match
+from skinware_drivers.operations import operation
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import CRC32
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.openpatch_description import (
+    ALL_MODULES,
+    DATA,
+    DATA_HEADER,
+    MAJOR,
+    MINOR,
+    MOST_PAYLOAD,
+    STAMP,
+    BadDescription,
+    Description,
+    Greeting,
+    Report,
+    read_description,
+)
+from skinware_drivers.serial.stuffing import COBS
+
+log = logging.getLogger("skinware.driver")
+
+HELLO, DESCRIBE, START, STOP, PERIOD, ENABLE, TARE, STATUS = range(1, 9)
+BOOT, REPORT, NOTE = 0x60, 0x61, 0x62
+_REPLY = 0x40
+
+_TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
+_TRIES = 3
+_LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
+_QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
+_ERRORS = (
+    "it is done",
+    "it does not know this request",
+    "the request is too short",
+    "there is no such module or item",
+    "the value is not one it can have",
+    "it is busy",
+    "its hardware failed",
+    "it cannot do this",
+    "its description is not the one that was read",
+)
+_OTHER_DESCRIPTION = 8
+_SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR)
+
+
+class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    rate_hz: Annotated[
+        float, Meta(ge=0, le=1e6, description="cycles per second, as the patches are told; 0: what each does by itself")
+    ] = 0.0
+
+
+class Refused(BusError):
+    """A patch does not do what it was asked for.
+
+    Attributes:
+        error: the number with which it answered.
+    """
+
+    def __init__(self, request: int, error: int) -> None:
+        why = _ERRORS[error] if error < len(_ERRORS) else f"error {error}"
+        super().__init__(f"the patch refuses request {request:#04x}: {why}")
+        self.error = error
+
+
+class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
+    """One open patch on a serial line."""
+
+    Options = OpenPatchOptions
+    framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+
+    def __init__(self, options: OpenPatchOptions) -> None:
+        super().__init__(options)
+        self._description: Description | None = None
+        self._crc = 0
+        self._patch: Patch | None = None
+        self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
+        self._period_us = 0
+        self._disabled: set[int] = set()
+        self._clock = DeviceClock(1e-6)
+        self._clock_fails = False
+        self._number = 0
+        self._report: Report | None = None
+        self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
+        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
+
+    @property
+    def period_s(self) -> float:
+        """Time between two updates of every module, s."""
+        return self._period_us / 1e6 or 0.02
+
+    @property
+    def payload_size(self) -> int:
+        """Longest payload of the protocol: what the patch will send is known only when it was asked."""
+        return MOST_PAYLOAD
+
+    # -- setting up -----------------------------------------------------------------------------------------------
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the patch what it is.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
+        greeting = await self._greet(link)
+        if self._patch is not None and greeting.crc == self._crc:
+            return [self._patch]
+        items = []
+        for number in range(greeting.n_items):
+            wanted = number.to_bytes(2, "little")
+            answer = await self._ask(link, DESCRIBE, wanted)
+            if answer[:2] != wanted:
+                raise BadDescription(f"the patch was asked for item {number} and sent another")
+            items.append(answer[2:])
+        found = read_description(items, greeting.crc)
+        log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
+        self._description, self._crc, self._patch = found, greeting.crc, found.patch
+        self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
+        self._period_us = self._wanted_us or found.period_us
+        self._disabled.clear()
+        return [self._patch]
+
+    async def configure(self, link: Link) -> None:
+        """Tell the patch its period and which modules are off."""
+        if self._wanted_us:
+            await self._set_period(link, self._wanted_us)
+        for module in sorted(self._disabled):
+            await self._ask(link, ENABLE, bytes((module, 0)))
+
+    async def start(self, link: Link) -> None:
+        """Start the patch, if it still is the one that was described."""
+        await self._ask(link, START, self._crc.to_bytes(4, "little"))
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent."""
+        await self._ask(link, STOP)
+
+    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
+        """Data messages tell when their samples were taken, by the patch's clock."""
+        rows = np.flatnonzero((wire["identifier"] >= DATA) & (wire["length"] >= DATA_HEADER))
+        if not len(rows):
+            return
+        stamps = np.ascontiguousarray(wire["payload"][rows, STAMP]).view("<u4")[:, 0]
+        received_ns = time_ns[rows]
+        sampled_ns = self._clock.convert(stamps, received_ns)
+        if (received_ns - sampled_ns).max() > _LONGEST_DELAY_NS:
+            self._clock = DeviceClock(1e-6)
+            self._clock_fails = True
+        else:
+            time_ns[rows] = sampled_ns
+
+    # -- looking after it -----------------------------------------------------------------------------------------
+
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        """Hear when it restarts, what it counts, and what it has to say to people."""
+        self._tell = tell
+        with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
+            while True:
+                message = await heard.get()
+                if self._clock_fails:
+                    self._say(
+                        link, logging.WARNING, "clock", "has a clock that stands still: times are those of receipt"
+                    )
+                    self._clock_fails = False
+                try:
+                    if message.identifier == BOOT:
+                        self._take_greeting(link, Greeting.read(message.payload))
+                    elif message.identifier == REPORT:
+                        self._take_report(link, Report.read(message.payload))
+                    else:
+                        self._take_note(link, message.payload)
+                except BadDescription as error:
+                    self._say(link, logging.WARNING, "announcement", str(error))
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Whether the silent patch has restarted. One that says that it streams, and does not, has not."""
+        greeting = await self._greet(link, tries=1)
+        if greeting.crc != self._crc:
+            self._changed(link)
+            return False
+        if greeting.streaming:
+            self._say(link, logging.WARNING, "sampling", "answers, but delivers no samples: its sampling hangs")
+            return False
+        self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
+        return True
+
+    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
+        """Set it up and start it again."""
+        self._clock = DeviceClock(1e-6)
+        try:
+            await self.configure(link)
+            await self.start(link)
+        except Refused as error:
+            if error.error == _OTHER_DESCRIPTION:
+                self._changed(link)
+            raise
+
+    def _take_greeting(self, link: Link, greeting: Greeting) -> None:
+        if self._patch is None:
+            return
+        self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
+        if greeting.crc != self._crc:
+            self._changed(link)
+        else:
+            self._tell(self._patch, Notice.RESTARTED)
+
+    def _take_report(self, link: Link, report: Report) -> None:
+        before, self._report = self._report, report
+        if before is None or report.uptime_s < before.uptime_s:
+            return
+        dropped, bad = report.dropped - before.dropped, report.bad_requests - before.bad_requests
+        if dropped > 0:
+            self._say(link, logging.WARNING, "dropped", f"dropped {dropped} samples: its line is too slow for its rate")
+        if bad > 0:
+            self._say(link, logging.WARNING, "damaged", f"received {bad} damaged frames: look at cable and baud rate")
+
+    def _take_note(self, link: Link, payload: bytes) -> None:
+        if payload:
+            text = payload[1:].decode("utf-8", "backslashreplace")
+            text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+            self._say(link, _SEVERITIES[min(payload[0], 2)], "note", f"says: {text}")
+
+    def _changed(self, link: Link) -> None:
+        self._say(link, logging.WARNING, "changed", "is not what it was: reading its description anew")
+        if self._patch is not None:
+            self._tell(self._patch, Notice.CHANGED)
+
+    def _say(self, link: Link, level: int, matter: str, text: str) -> None:
+        """One line in the log, at most one every ten seconds about one matter."""
+        told_ns, kept_back = self._notices.get(matter, (-_QUIET_NS, 0))
+        if now_ns() - told_ns < _QUIET_NS:
+            self._notices[matter] = told_ns, kept_back + 1
+            return
+        self._notices[matter] = now_ns(), 0
+        more = f" ({kept_back} more of these since)" if kept_back else ""
+        log.log(level, "%s: %s %s%s", link.bus_name, self._patch.name if self._patch else "the patch", text, more)
+
+    # -- operations -----------------------------------------------------------------------------------------------
+
+    @operation()
+    async def rate(self, link: Link, patches: Sequence[Patch], hz: float) -> float:  # noqa: ARG002
+        """Set the cycles per second; returns what it became."""
+        if not 0 < hz <= 1e6:
+            raise ValueError(f"{hz:g} Hz: give more than 0, up to 1000000")
+        await self._set_period(link, round(1e6 / hz))
+        return 1e6 / self._period_us
+
+    @operation()
+    async def enable(
+        self,
+        link: Link,
+        patches: Sequence[Patch],  # noqa: ARG002
+        on: bool = True,
+        module: int = ALL_MODULES,
+    ) -> None:
+        """Switch a module, or all, on or off; those that are off are shown as masked."""
+        modules = self._modules(module)
+        await self._ask(link, ENABLE, bytes((module, on)))
+        self._disabled = self._disabled - modules if on else self._disabled | modules
+
+    @operation(sets_up=True)
+    async def tare(
+        self,
+        link: Link,
+        patches: Sequence[Patch],  # noqa: ARG002
+        module: int = ALL_MODULES,
+    ) -> None:
+        """Take the present values of a module, or of all, as zero."""
+        self._modules(module)
+        await self._ask(link, TARE, bytes((module,)), timeout_s=_TARE_TIMEOUT_S, tries=1)
+
+    @operation()
+    async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:  # noqa: ARG002
+        """What the patch counts: uptime_s, sent, dropped, bad_requests."""
+        report: dict[str, Any] = vars(Report.read(await self._ask(link, STATUS)))
+        return dict(report)
+
+    def _modules(self, module: int) -> set[int]:
+        known = set(range(len(self._description.modules))) if self._description else set()
+        if module == ALL_MODULES:
+            return known
+        if module not in known:
+            raise ValueError(f"no module {module}: the patch has 0 to {len(known) - 1}, or {ALL_MODULES} for all")
+        return {module}
+
+    async def _set_period(self, link: Link, period_us: int) -> None:
+        description = self._description
+        if description is not None and not description.shortest_us <= period_us <= description.longest_us:
+            lowest, highest = 1e6 / description.longest_us, 1e6 / description.shortest_us
+            raise BusError(f"{1e6 / period_us:g} Hz: the patch can do {lowest:g} to {highest:g} Hz")
+        answer = await self._ask(link, PERIOD, period_us.to_bytes(4, "little"))
+        became_us = int.from_bytes(answer[:4], "little")
+        if len(answer) < 4 or not became_us:
+            raise BadDescription("the patch does not say which period it has now")
+        self._period_us = self._wanted_us = became_us
+
+    # -- asking ---------------------------------------------------------------------------------------------------
+
+    async def _greet(self, link: Link, tries: int = _TRIES) -> Greeting:
+        return Greeting.read(await self._ask(link, HELLO, bytes((MAJOR, MINOR)), tries=tries))
+
+    async def _ask(
+        self, link: Link, request: int, arguments: bytes = b"", *, timeout_s: float = _TIMEOUT_S, tries: int = _TRIES
+    ) -> bytes:
+        """The answer to a request, which may be sent several times: all of them can be repeated.
+
+        Raises:
+            HandshakeTimeout: no answer.
+            Refused: the patch does not do it.
+            BusSendError: the line takes nothing.
+        """
+        self._number = self._number % 255 + 1
+        number = bytes((self._number,))
+        for attempt in range(tries):
+            try:
+                reply = await link.request(
+                    request, number + arguments, Match(_REPLY + request, prefix=number), timeout_s=timeout_s
+                )
+                break
+            except HandshakeTimeout:
+                if attempt == tries - 1:
+                    raise
+        if len(reply.payload) < 2:
+            raise BadDescription(f"the answer to request {request:#04x} has {len(reply.payload)} bytes")
+        if reply.payload[1]:
+            raise Refused(request, reply.payload[1])
+        return reply.payload[2:]

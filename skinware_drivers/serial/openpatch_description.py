@@ -1,0 +1,360 @@
+"""What an open patch says of itself: its greeting and the items of its description, read and checked.
+
+The protocol is docs/protocols/patch-serial.md. Everything here comes from a wire: whatever it says, the outcome is a
+description that can be trusted or a :class:`BadDescription` that tells what is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skinware.errors import BusError, StructureError
+from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
+from skinware.status import Status
+from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.layout import Bits, Flag, Frame, Identifier, Layout, Sentinel, Stamp, StatusBytes, Values
+
+MAJOR, MINOR = 1, 0
+MOST_PAYLOAD = 1024
+MOST_ITEMS = 256
+ALL_MODULES = 0xFF
+DATA = 0x80
+DATA_HEADER = 8
+"""Bytes of a data message's payload before the values."""
+STAMP = slice(3, 7)
+"""Of these, the device time."""
+
+_MOST_KINDS, _MOST_TYPES, _MOST_MODULES, _MOST_AXES = 32, 64, 255, 9
+_MOST_VALUES = 16384  # of all modules together
+_PADDING = 0xFF
+_DTYPES = ("u1", "<i2", "<u2", "<i4", "<f4")
+_MAX_KIND_BYTES = 16
+_STATUS = Status.STALE | Status.OUT_OF_RANGE | Status.NO_ACK | Status.NOT_CONNECTED | Status.MASKED | Status.SUSPECT
+_CATALOGUE_NAMES = {known.id: known.name for known in CATALOGUE.values()}
+_RESETS = ("unknown", "power-up", "reset pin", "watchdog", "brown-out", "software", "fault")
+
+
+class BadDescription(BusError):
+    """A patch says something of itself that cannot be."""
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What a patch answers to a greeting, and announces after it was reset.
+
+    Attributes:
+        major, minor: version of the protocol that it speaks.
+        reset: why it was last reset, in words.
+        streaming: it has been told to send.
+        uptime_s: since that reset, s.
+        crc: of its description.
+        n_items: how many items that has.
+    """
+
+    major: int
+    minor: int
+    reset: str
+    streaming: bool
+    uptime_s: float
+    crc: int
+    n_items: int
+
+    @classmethod
+    def read(cls, data: bytes) -> Greeting:
+        """From the wire.
+
+        Raises:
+            BadDescription: another major version, or no greeting.
+        """
+        if data[:1] != bytes((MAJOR,)):
+            speaks = f"version {data[0]}.{data[1]}" if len(data) > 1 else "no version"
+            raise BadDescription(f"the patch speaks {speaks} of the protocol, this driver version {MAJOR}: update it")
+        reader = _Reader(data, "greeting")
+        major, minor, reset, streaming, uptime_ms, crc, n_items = reader.take("<BBBBIIH")
+        if not 1 <= n_items <= MOST_ITEMS:
+            raise BadDescription(f"a description of {n_items} items; 1 to {MOST_ITEMS} can be")
+        word = _RESETS[reset] if reset < len(_RESETS) else f"reason {reset}"
+        return cls(major, minor, word, bool(streaming), uptime_ms / 1000, crc, n_items)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Figures that a patch keeps.
+
+    Attributes:
+        uptime_s: since its last reset, s.
+        sent: data messages sent since then.
+        dropped: data messages that its line had no room for.
+        bad_requests: damaged frames that it received.
+    """
+
+    uptime_s: float
+    sent: int
+    dropped: int
+    bad_requests: int
+
+    @classmethod
+    def read(cls, data: bytes) -> Report:
+        """From the wire.
+
+        Raises:
+            BadDescription: too short.
+        """
+        uptime_ms, sent, dropped, bad = _Reader(data, "report").take("<IIII")
+        return cls(uptime_ms / 1000, sent, dropped, bad)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Taxels that are alike.
+
+    Attributes:
+        count: how many.
+        axes: type of each of their values, by place in the description's types; None: means nothing.
+    """
+
+    count: int
+    axes: Sequence[int | None]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of module.
+
+    Attributes:
+        name: for people.
+        dtype: how its values are sent, a numpy dtype.
+        runs: what they are.
+    """
+
+    name: str
+    dtype: str
+    runs: Sequence[Run]
+
+    @property
+    def n_values(self) -> int:
+        """Number of values."""
+        return sum(run.count * len(run.axes) for run in self.runs)
+
+
+@dataclass(frozen=True)
+class Description:
+    """Everything that a patch says of itself.
+
+    Attributes:
+        product, serial_number, firmware: for people.
+        period_us: of a cycle, unless it is told another; and the shortest and the longest that it can do.
+        types: the sensor types.
+        kinds: the kinds of module.
+        modules: kind of each module.
+    """
+
+    product: str = ""
+    serial_number: str = ""
+    firmware: str = ""
+    period_us: int = 0
+    shortest_us: int = 0
+    longest_us: int = 0
+    types: list[SensorType] = field(default_factory=list)
+    kinds: list[Kind] = field(default_factory=list)
+    modules: list[int] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Name of the patch."""
+        both = f"{self.product} {self.serial_number}".strip()
+        return both if len(both.encode()) <= MAX_NAME_BYTES else self.serial_number
+
+    @property
+    def dtype(self) -> np.dtype[np.generic]:
+        """The smallest dtype that holds the values of all kinds."""
+        return np.result_type(*(self.kinds[kind].dtype for kind in self.modules))
+
+    @property
+    def patch(self) -> Patch:
+        """What users see of it. The taxels of all its modules are numbered in one row: these are their uids."""
+        first_uid, modules = 0, []
+        for number, kind in enumerate(self.kinds[k] for k in self.modules):
+            channels: list[Sensor | None] = []
+            for run in kind.runs:
+                is_sensor = any(axis is not None for axis in run.axes)
+                names = [None if axis is None else self.types[axis].name for axis in run.axes]
+                for _ in range(run.count):
+                    channels += [None if name is None else Sensor(name, first_uid) for name in names]
+                    first_uid += is_sensor
+            modules.append(Module(channels, number, kind.name))
+        return Patch(self.name, modules)
+
+    @property
+    def layout(self) -> Layout:
+        """How its data messages are read."""
+        return Layout([_frame(number, kind) for number, kind in enumerate(self.kinds)])
+
+
+def read_description(items: Sequence[bytes], crc: int) -> Description:
+    """Put the items of a description together.
+
+    Raises:
+        BadDescription: they are not what the patch promised, or say what cannot be.
+    """
+    if zlib.crc32(b"".join(items)) != crc:
+        raise BadDescription("the description changed while it was being read")
+    found = Description()
+    for number, item in enumerate(items):
+        reader = _Reader(item, f"item {number} of the description")
+        try:
+            found = _take_item(found, reader)
+        except StructureError as error:
+            raise reader.bad(str(error)) from None
+    return _checked(found)
+
+
+def _take_item(found: Description, reader: _Reader) -> Description:
+    (tag,) = reader.take("B")
+    if tag == 1:
+        return _patch(found, reader)
+    if tag == 2:
+        found.types.append(_type(reader))
+    elif tag == 3:
+        found.kinds.append(_kind(reader, len(found.types)))
+    elif tag == 4:
+        (count,) = reader.take("B")
+        for _ in range(count):
+            kind, n_modules = reader.take("BB")
+            if kind >= len(found.kinds):
+                raise reader.bad(f"modules of kind {kind}, but there are only {len(found.kinds)} kinds")
+            found.modules.extend([kind] * n_modules)
+    return found  # other tags are of later versions
+
+
+def _patch(found: Description, reader: _Reader) -> Description:
+    period_us, shortest_us, longest_us = reader.take("<III")
+    product, serial_number, firmware = (reader.text(MAX_NAME_BYTES) for _ in range(3))
+    if not 0 < shortest_us <= period_us <= longest_us:
+        raise reader.bad(f"a period of {period_us} us, between {shortest_us} and {longest_us}")
+    if not serial_number and not product:
+        raise reader.bad("neither a product nor a serial number")
+    return Description(
+        product, serial_number, firmware, period_us, shortest_us, longest_us, found.types, found.kinds, found.modules
+    )
+
+
+def _type(reader: _Reader) -> SensorType:
+    (number,) = reader.take("<I")
+    scale, offset, minimum, maximum = (reader.real() for _ in range(4))
+    name, unit = reader.text(MAX_NAME_BYTES), reader.text(MAX_UNIT_BYTES)
+    if _CATALOGUE_NAMES.get(number) != (name if name in CATALOGUE else None):
+        raise reader.bad(f"type {number} is called {name!r}; in the shared catalogue it is not")
+    if minimum == maximum:
+        minimum, maximum = -math.inf, math.inf
+    if not minimum < maximum:
+        raise reader.bad(f"type {name!r} ranges from {minimum} to {maximum}")
+    return SensorType(name, number, unit, scale, offset, minimum, maximum)
+
+
+def _kind(reader: _Reader, n_types: int) -> Kind:
+    name = reader.text(_MAX_KIND_BYTES)
+    dtype, n_runs = reader.take("BB")
+    if dtype >= len(_DTYPES):
+        raise reader.bad(f"kind {name!r} has values of dtype {dtype}; known are 0 to {len(_DTYPES) - 1}")
+    runs = []
+    for _ in range(n_runs):
+        count, n_axes = reader.take("<HB")
+        axes = reader.take(f"{n_axes}B")
+        if not 1 <= n_axes <= _MOST_AXES or not count:
+            raise reader.bad(f"kind {name!r} has a run of {count} taxels with {n_axes} axes")
+        if any(axis >= n_types and axis != _PADDING for axis in axes):
+            raise reader.bad(f"kind {name!r} has values of type {max(axes)}, but there are only {n_types} types")
+        sensors = [axis for axis in axes if axis != _PADDING]
+        if len(set(sensors)) < len(sensors):
+            raise reader.bad(f"kind {name!r} has taxels with two values of one type")
+        runs.append(Run(count, [None if axis == _PADDING else axis for axis in axes]))
+    kind = Kind(name, _DTYPES[dtype], runs)
+    size = kind.n_values * int(_DTYPES[dtype][-1])
+    if not 1 <= size <= MOST_PAYLOAD - DATA_HEADER:
+        raise reader.bad(
+            f"kind {name!r} has {size} bytes of values; 1 to {MOST_PAYLOAD - DATA_HEADER} fit into a message"
+        )
+    return kind
+
+
+def _checked(found: Description) -> Description:
+    if not found.period_us:
+        raise BadDescription("the description does not say what the patch is")
+    for what, count, most in (
+        ("types", len(found.types), _MOST_TYPES),
+        ("kinds of module", len(found.kinds), _MOST_KINDS),
+        ("modules", len(found.modules), _MOST_MODULES),
+        ("values", sum(found.kinds[kind].n_values for kind in found.modules), _MOST_VALUES),
+    ):
+        if not 1 <= count <= most:
+            raise BadDescription(f"the patch has {count} {what}; 1 to {most} can be")
+    if len({t.id for t in found.types}) < len(found.types) or len({t.name for t in found.types}) < len(found.types):
+        raise BadDescription("two types of the patch share a name or an id")
+    if all(axis is None for k in set(found.modules) for run in found.kinds[k].runs for axis in run.axes):
+        raise BadDescription("the patch has no sensors")
+    if {"<i4", "<f4"} <= {found.kinds[kind].dtype for kind in found.modules}:
+        raise BadDescription("the patch has 32-bit whole numbers beside floating point: no common dtype holds both")
+    return found
+
+
+def _frame(number: int, kind: Kind) -> Frame:
+    values = Values(DATA_HEADER, kind.dtype, kind.n_values)
+    flags: list[Flag | Sentinel | StatusBytes] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
+    lengths = [values.end]
+    if values.end + kind.n_values <= MOST_PAYLOAD:
+        lengths.append(values.end + kind.n_values)
+        flags.append(StatusBytes(values.end, _STATUS))
+    if kind.dtype == "<f4":
+        flags.append(Sentinel(Status.NOT_CONNECTED, math.nan))
+    return Frame(
+        f"kind {number}",
+        [Identifier(DATA + number)],
+        lengths,
+        values,
+        module=Bits(0, 8, byte=0),
+        flags=flags,
+        stamp=Stamp(1, "<u2"),
+    )
+
+
+class _Reader:
+    """Takes a message apart."""
+
+    def __init__(self, data: bytes, what: str) -> None:
+        self._data = data
+        self._what = what
+        self._at = 0
+
+    def bad(self, why: str) -> BadDescription:
+        return BadDescription(f"{self._what}: {why}")
+
+    def take(self, form: str) -> tuple[int, ...]:
+        try:
+            values = struct.unpack_from(form, self._data, self._at)
+        except struct.error:
+            raise self.bad(f"ends too early ({len(self._data)} bytes)") from None
+        self._at += struct.calcsize(form)
+        return values
+
+    def real(self) -> float:
+        """A float of 32 bits, as a person would have written it."""
+        (bits,) = self.take("<I")
+        return float(str(np.uint32(bits).view(np.float32)))
+
+    def text(self, most: int) -> str:
+        end = self._data.find(0, self._at)
+        raw = self._data[self._at : end]
+        if end < 0 or len(raw) > most:
+            raise self.bad(f"a text that does not end within {most} bytes")
+        self._at = end + 1
+        text = raw.decode("utf-8", "replace")
+        if not text.isprintable() or "\ufffd" in text:
+            raise self.bad(f"{raw!r} is no text")
+        return text

@@ -1,0 +1,216 @@
+"""An emulated open patch: what a microcontroller with ``openpatch.h`` does, for those who have none yet.
+
+Source: docs/protocols/patch-serial.md. Frames of the wire are messages: the identifier is the type, the payload is that
+of the message. Framing is the bus' affair.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Collection, Sequence
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.serial.checksums import CRC32
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.stuffing import COBS
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+
+_TAXELS = 12
+_SHORTEST_US, _LONGEST_US = 1000, 1_000_000
+_SECOND_NS = 1_000_000_000
+_BOOT, _REPORT, _DATA = 0x60, 0x61, 0x80
+_OK, _UNKNOWN, _BAD_LENGTH, _NO_SUCH, _BAD_VALUE, _OTHER_DESCRIPTION = 0, 1, 2, 3, 4, 8
+_NEEDED = {0x01: 2, 0x02: 2, 0x03: 4, 0x04: 0, 0x05: 4, 0x06: 2, 0x07: 1, 0x08: 0}  # bytes of arguments
+_START, _ENABLE = 0x03, 0x06
+_POWER_UP, _BROWN_OUT = 1, 4
+_MASKED = 32
+
+
+class EmulatedOpenPatchOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the patch is."""
+
+    modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
+    period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
+    serial_number: Annotated[str, Meta(max_length=16, description="by which the patch is known")] = "1"
+
+
+class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
+    """One patch, device number 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+
+    Values: those of the pressure sensors of module 0, of module 1 ...
+
+    Attributes:
+        framing: of the serial line.
+        payload_size: longest payload of a message.
+    """
+
+    Options: ClassVar[type[EmulatorOptions]] = EmulatedOpenPatchOptions
+    full_scale = 0xFFFF
+    rest = 1000
+    swing = 40_000
+    framing = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
+    payload_size = 1024
+
+    def __init__(self, options: EmulatedOpenPatchOptions, **more: Any) -> None:
+        super().__init__(options, **more)
+        if options.foreign_hz:
+            raise ConfigurationError("option foreign_hz: a patch has its serial line for itself")
+        own_us = 1000 * options.period_ms
+        text = f"emulated\0{options.serial_number}\0" + "1.0\0"
+        self._items = [
+            b"\x01" + struct.pack("<III", own_us, _SHORTEST_US, _LONGEST_US) + text.encode(),
+            b"\x02" + struct.pack("<Iffff", 1, 0.01, 0.0, 0.0, 655.35) + b"pressure\0kPa\0",
+            b"\x03triangle\0" + struct.pack("<BBHBB", 2, 1, _TAXELS, 1, 0),
+            b"\x04\x01" + bytes((0, options.modules)),
+        ]
+        self._crc = zlib.crc32(b"".join(self._items))
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """The patch."""
+        return (1,)
+
+    @property
+    def period_s(self) -> float:
+        """Unless it is told another."""
+        return self.options.period_ms / 1e3
+
+    @property
+    def identifiers(self) -> Collection[int]:
+        """Every type."""
+        return range(256)
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All taxels on one square."""
+        return on_a_grid(_TAXELS * self.options.modules, _TAXELS)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """Announce the patch, every second until somebody asks."""
+        is_first = "reset" not in device.memory and device.cycle == 0
+        device.memory.update(
+            reset=_POWER_UP if is_first else _BROWN_OUT,
+            booted_ns=now_ns,
+            greeted=False,
+            period_us=1000 * self.options.period_ms,
+            off=set(),
+            tared=set(),
+            first_cycle=device.cycle,
+            us=0,  # device time of cycle us_cycle, which began when the period was last set
+            us_cycle=0,
+            stamp_us=0,
+            sent=0,
+        )
+        device.every("announce", _SECOND_NS, now_ns)
+        super().boot(device, now_ns)
+
+    def on_timer(self, device: Device, name: str, time_ns: int) -> None:
+        """Announcements, and data."""
+        if name != "announce":
+            self.burst(device, time_ns)
+        elif device.streams_from_ns is not None:
+            self.reply(device, (_REPORT, self._report(device, time_ns)), time_ns)
+        elif not device.memory["greeted"]:
+            self.reply(device, (_BOOT, self._greeting(device, time_ns)), time_ns)
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
+        """Answer a request."""
+        if not 0x01 <= identifier <= 0x1F or not payload:
+            return False
+        device.memory["greeted"] = True
+        number, arguments = payload[:1], payload[1:]
+        if identifier not in _NEEDED:
+            error, answer = _UNKNOWN, b""
+        elif len(arguments) < _NEEDED[identifier]:
+            error, answer = _BAD_LENGTH, b""
+        else:
+            error, answer = self._answer(device, identifier, arguments, now_ns)
+        self.reply(device, (0x40 + identifier, number + bytes([error]) + answer), now_ns)
+        if error == _OK and identifier == _START:
+            self._say_what_is_off(device, device.memory["off"], now_ns)
+        elif error == _OK and identifier == _ENABLE and not arguments[1]:
+            self._say_what_is_off(device, self._meant(arguments[0]), now_ns)
+        return True
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        """A message for each module that is on."""
+        memory = device.memory
+        cycles = device.cycle - memory["first_cycle"]
+        memory["stamp_us"] = memory["us"] + memory["period_us"] * (cycles - memory["us_cycle"])
+        frames = []
+        for module in range(self.options.modules):
+            if module in memory["off"]:
+                continue
+            own = [0] * _TAXELS if module in memory["tared"] else values[_TAXELS * module : _TAXELS * (module + 1)]
+            header = struct.pack("<BHIB", module, cycles & 0xFFFF, memory["stamp_us"] & 0xFFFF_FFFF, 0)
+            frames.append((_DATA, header + struct.pack(f"<{_TAXELS}H", *own)))
+        memory["sent"] += len(frames)
+        return frames
+
+    def _answer(self, device: Device, request: int, arguments: bytes, now_ns: int) -> tuple[int, bytes]:
+        memory = device.memory
+        if request == 0x01:
+            return _OK, self._greeting(device, now_ns)
+        if request == 0x02:
+            item = int.from_bytes(arguments[:2], "little")
+            return (_OK, arguments[:2] + self._items[item]) if item < len(self._items) else (_NO_SUCH, b"")
+        if request == _START:
+            if int.from_bytes(arguments[:4], "little") != self._crc:
+                return _OTHER_DESCRIPTION, b""
+            self.start(device, now_ns, memory["period_us"] / 1e6)
+        elif request == 0x04:
+            self.stop(device)
+        elif request == 0x05:
+            return self._set_period(device, int.from_bytes(arguments[:4], "little"), now_ns)
+        elif request == 0x08:
+            return _OK, self._report(device, now_ns)
+        else:
+            modules = self._meant(arguments[0])
+            if not modules:
+                return _NO_SUCH, b""
+            if request == 0x07:
+                memory["tared"] |= modules
+            elif arguments[1]:
+                memory["off"] -= modules
+            else:
+                memory["off"] |= modules
+        return _OK, b""
+
+    def _meant(self, module: int) -> set[int]:
+        known = set(range(self.options.modules))
+        return known if module == 0xFF else known & {module}
+
+    def _set_period(self, device: Device, period_us: int, now_ns: int) -> tuple[int, bytes]:
+        if not _SHORTEST_US <= period_us <= _LONGEST_US:
+            return _BAD_VALUE, b""
+        memory = device.memory
+        cycles = device.cycle - memory["first_cycle"]
+        memory["us"] += memory["period_us"] * (cycles - memory["us_cycle"])
+        memory["us_cycle"], memory["period_us"] = cycles, period_us
+        if device.streams_from_ns is not None:
+            self.stop(device)
+            self.start(device, now_ns, period_us / 1e6)
+        return _OK, struct.pack("<I", period_us)
+
+    def _say_what_is_off(self, device: Device, modules: Collection[int], now_ns: int) -> None:
+        if device.streams_from_ns is None:
+            return
+        cycles = device.cycle - device.memory["first_cycle"]
+        for module in sorted(modules):
+            header = struct.pack("<BHIB", module, cycles & 0xFFFF, device.memory["stamp_us"] & 0xFFFF_FFFF, _MASKED)
+            self.reply(device, (_DATA, header + bytes(2 * _TAXELS)), now_ns)
+
+    def _greeting(self, device: Device, now_ns: int) -> bytes:
+        uptime_ms = (now_ns - device.memory["booted_ns"]) // 1_000_000
+        streams = device.streams_from_ns is not None
+        return struct.pack("<BBBBIIH", 1, 0, device.memory["reset"], streams, uptime_ms, self._crc, len(self._items))
+
+    def _report(self, device: Device, now_ns: int) -> bytes:
+        uptime_ms = (now_ns - device.memory["booted_ns"]) // 1_000_000
+        return struct.pack("<IIII", uptime_ms, device.memory["sent"], 0, 0)

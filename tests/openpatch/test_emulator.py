@@ -1,0 +1,154 @@
+"""The emulated patch: what it says, held against the protocol as the tests know it; and the driver on it."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from skinware import DriverReader, PatchState
+from skinware.errors import ConfigurationError
+from skinware_drivers.cli.emulate import emulate
+from skinware_drivers.cli.emulation import Emulation
+from skinware_drivers.serial.bus import PtyBus, SerialBus
+from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions
+from tests.openpatch import wire
+from tests.sdk.driving import driving_lines, read_until
+
+MS = 1_000_000
+SAID = wire.Said(
+    product="emulated",
+    serial_number="A",
+    periods_us=(10_000, 1000, 1_000_000),
+    types=[(1, 0.01, 0.0, 0.0, 655.35, "pressure", "kPa")],
+    kinds=[("triangle", 2, [(12, [0])])],
+    modules=[(0, 2)],
+)
+
+
+def emulated(**options: Any) -> EmulatedOpenPatch:
+    return EmulatedOpenPatch(EmulatedOpenPatchOptions(modules=2, serial_number="A", **options))
+
+
+class Talk:
+    """A conversation with a patch whose time the test owns."""
+
+    def __init__(self, patch: EmulatedOpenPatch) -> None:
+        self.patch = patch
+        self.now_ns = 10**12
+        patch.skip(self.now_ns)
+
+    def hear(self, duration_ms: int) -> list[tuple[int, bytes]]:
+        self.now_ns += duration_ms * MS
+        return [(frame.identifier, frame.payload) for frame in self.patch.emit(self.now_ns)]
+
+    def ask(self, request: int, *arguments: int) -> list[tuple[int, bytes]]:
+        self.patch.receive(request, bytes((9, *arguments)), self.now_ns)
+        return self.hear(1)
+
+
+def test_it_speaks_the_protocol() -> None:
+    items, talk = SAID.items(), Talk(emulated())
+    crc = struct.pack("<I", wire.crc32(b"".join(items)))
+    assert talk.hear(1500) == [(0x60, wire.greeting(items, reset=1, uptime_ms=ms)) for ms in (0, 1000)]
+    assert talk.ask(1, 1, 0) == [(0x41, bytes((9, 0)) + wire.greeting(items, reset=1, uptime_ms=1500))]
+    for number, item in enumerate(items):
+        assert talk.ask(2, number, 0) == [(0x42, bytes((9, 0, number, 0)) + item)]
+    assert talk.ask(2, len(items), 0) == [(0x42, bytes((9, 3)))]
+    assert talk.hear(3000) == []
+    assert talk.ask(3, 1, 2, 3, 4) == [(0x43, bytes((9, 8)))]
+    assert talk.ask(5, 1, 0, 0, 0) == [(0x45, bytes((9, 4)))]
+    assert talk.ask(5, 0x20, 0x4E, 0, 0) == [(0x45, bytes((9, 0, 0x20, 0x4E, 0, 0)))]
+    assert talk.ask(6, 1, 0) == [(0x46, bytes((9, 0)))]
+    assert talk.ask(7, 2) == [(0x47, bytes((9, 3)))]
+    assert talk.ask(7) == [(0x47, bytes((9, 2)))]
+    assert talk.ask(0x1F) == [(0x5F, bytes((9, 1)))]
+    assert talk.ask(0x41, 0) == []
+    masked = (0x80, struct.pack("<BHIB", 1, 0, 0, 32) + bytes(24))
+    assert talk.ask(3, *crc)[:2] == [(0x43, bytes((9, 0))), masked]
+    heard = [payload[:8] for message, payload in talk.hear(200) if message == 0x80]
+    assert heard == [struct.pack("<BHIB", 0, n, 20_000 * n, 0) for n in range(len(heard))]
+    assert len(heard) in (9, 10)
+    assert talk.ask(4)[-1] == (0x44, bytes((9, 0)))
+    assert talk.hear(500) == []
+
+
+class Stop:
+    """Ends an emulation in another thread."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._reader, self._writer = socket.socketpair()
+
+    def fileno(self) -> int:
+        return self._reader.fileno()
+
+    def stop(self) -> None:
+        self.stopped = True
+        self._writer.send(b"x")
+
+    def close(self) -> None:
+        self._reader.close()
+        self._writer.close()
+
+
+class Silent:
+    def event(self, name: str, **facts: Any) -> None:
+        pass
+
+
+@contextmanager
+def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
+    bus, stop = PtyBus(str(link), payload_size=patch.payload_size), Stop()
+    bus.use(patch.framing)
+    ready = threading.Event()
+
+    class Ready(Silent):
+        def event(self, name: str, **facts: Any) -> None:
+            ready.set()
+
+    emulation = Emulation(bus, patch, Ready())
+
+    def run() -> None:
+        emulation.run(stop, bus_name="pty", driver="openpatch", options=patch.options)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert ready.wait(30)
+        yield
+    finally:
+        stop.stop()
+        thread.join(30)
+        stop.close()
+
+
+def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    with running(emulated(pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1), link):
+        driver = OpenPatchDriver(OpenPatchOptions(rate_hz=50))
+        bus = SerialBus(str(link), payload_size=driver.payload_size)
+        with driving_lines([(driver, bus)], "openpatch"), DriverReader("openpatch", timeout_s=30) as reader:
+            before = read_until(reader, lambda f: not f.status.any())
+            assert len(set(before.values.tolist())) == 1
+            assert before.structure.patch_name.tolist() == [b"emulated A"]
+            read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
+            read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE and not f.status.any())
+            assert reader.patch_counters(reader.read())[0]["sequence_lost"] == 0
+
+
+def test_it_lives_on_serial_lines_and_has_its_line_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigurationError, match="has its serial line for itself"):
+        emulated(foreign_hz=10.0)
+    monkeypatch.setattr("skinware_drivers.virtual.hardware.load_emulator", lambda name: EmulatedOpenPatch)
+    result = CliRunner().invoke(emulate, ["--driver", "openpatch", "--bus", "vcan0"])
+    assert result.exit_code == 2
+    assert "devices of openpatch hang on serial lines" in result.output

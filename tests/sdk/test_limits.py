@@ -1,0 +1,114 @@
+"""Warnings before something is lost, and when something was: once each, and only when true."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
+from skinware_drivers.can.socketcan import _wire_bits
+from skinware_drivers.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
+from tests.sdk.driving import emulated
+from tests.sdk.test_bus_states import Clock
+
+
+@pytest.fixture
+def watched() -> tuple[Bus, BusLimits, Clock]:
+    bus, clock = emulated(boards=(7,)), Clock()
+    bus.bit_rate = 1_000_000
+    return bus, BusLimits("can0", bus, clock), clock
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records]
+
+
+def test_a_bus_within_its_limits_is_not_worth_a_word(
+    watched: tuple[Bus, BusLimits, Clock], caplog: pytest.LogCaptureFixture
+) -> None:
+    bus, limits, clock = watched
+    for _ in range(100):
+        bus.wire_bits += round(1_000_000 * HIGH_LOAD)
+        bus.fullest = HIGH_FILL
+        clock.pass_s(1)
+        limits.look()
+    assert limits.load == pytest.approx(HIGH_LOAD)
+    assert warnings(caplog) == []
+
+
+def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: pytest.LogCaptureFixture) -> None:
+    bus, limits, clock = watched
+    with caplog.at_level(logging.WARNING):
+        for _ in range(10):
+            bus.wire_bits += 2 * 910_000
+            bus.fullest = 0.7
+            bus.counters.lost += 3
+            clock.pass_s(2)
+            limits.look()
+            limits.look()  # within the same second: nothing new
+    load, fill, lost = warnings(caplog)
+    assert load.startswith("bus can0: about 91% of 1000000 bit/s are in use")
+    assert fill.startswith("bus can0: the receive buffer was 70% full")
+    assert lost.startswith("bus can0: 3 frames were lost")
+    assert bus.fullest == 0.0
+
+
+def test_where_the_bit_rate_is_not_known_no_load_is_made_up(
+    watched: tuple[Bus, BusLimits, Clock], caplog: pytest.LogCaptureFixture
+) -> None:
+    bus, limits, clock = watched
+    bus.bit_rate = 0
+    bus.wire_bits = 10**9
+    clock.pass_s(1)
+    limits.look()
+    assert limits.load is None
+    assert warnings(caplog) == []
+
+
+def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:
+    batch = FrameBatch(4)
+    batch.append(0, 0, 0x123, b"")
+    batch.append(0, 0, 0x123, bytes(8))
+    batch.append(0, 0, EXTENDED_FLAG | 0x123, bytes(8))
+    bits = [_wire_bits(batch.wire[row : row + 1]) for row in range(3)]
+    for told, least, most in zip(bits, (47, 111, 131), (55, 135, 160), strict=True):
+        assert least <= told <= most
+    assert _wire_bits(batch.wire[:3]) == pytest.approx(sum(bits), abs=3)
+    assert _wire_bits(batch.wire[:0]) == 0
+    many = np.repeat(batch.wire[1:2], 8_000)
+    assert 0.8 < _wire_bits(many) / 1_000_000 < 1.0  # 8000 frames/s are a full bus of 1 Mbit/s
+
+
+def stat(*dropped: int) -> str:
+    return "".join(f"00001a2b {count:08x} 00000001 00000000\n" for count in dropped)
+
+
+def test_what_the_machine_dropped_is_summed_over_processors_and_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, clock = tmp_path / "softnet_stat", Clock()
+    file.write_text(stat(5, 0x10))
+    limits = MachineLimits(file, clock)
+    with caplog.at_level(logging.WARNING):
+        for dropped in ((5, 0x10), (6, 0x10), (6, 0x1A)):
+            file.write_text(stat(*dropped))
+            clock.pass_s(1)
+            limits.look()
+    assert limits.softnet_dropped == 11
+    (line,) = warnings(caplog)
+    assert line.startswith("this machine dropped 1 network packets")
+
+
+@pytest.mark.parametrize("text", ["", "x\n", "zz yy\n", None])
+def test_a_machine_that_does_not_tell_is_no_trouble(tmp_path: Path, text: str | None) -> None:
+    file, clock = tmp_path / "softnet_stat", Clock()
+    if text is not None:
+        file.write_text(text)
+    limits = MachineLimits(file, clock)
+    clock.pass_s(1)
+    limits.look()
+    assert limits.softnet_dropped == 0
+    assert MachineLimits().softnet_dropped == 0

@@ -129,7 +129,7 @@ class Decoder:
         payload = wire["payload"]
         slots = self._addresses.slots(bus, wire["identifier"])
         entry = self._addresses.entry[slots]
-        kind = self._tell_kinds(slots, entry, wire["length"], payload, bus)
+        kind, wrong = self._tell_kinds(slots, entry, wire["length"], payload, bus)
         for number, compiled in enumerate(self._kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
@@ -137,7 +137,9 @@ class Decoder:
         new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
         self.device_stamps.tell(kind[new], entry[new], payload[new], batch.time_ns[first:last][new])
         is_module = entry < self._n_modules
-        foreign = np.flatnonzero(~is_module)
+        is_foreign = ~is_module
+        is_foreign[wrong] = False
+        foreign = np.flatnonzero(is_foreign)
         parts = []
         for number, assembly in self._alone.items():
             rows = np.flatnonzero((kind == number) & is_module)
@@ -223,8 +225,11 @@ class Decoder:
 
     def _tell_kinds(
         self, slots: Indices, entry: Indices, length: Bytes, payload: Bytes, bus: npt.NDArray[np.uint16]
-    ) -> Bytes:
-        """(n,) kind of each frame; 255 for those of no kind, or of a wrong length (which are counted)."""
+    ) -> tuple[Bytes, Indices]:
+        """(n,) kind of each frame, 255 = none; and the rows that are ours and of no kind or of a wrong length.
+
+        Those are counted here.
+        """
         n_buses = len(self.state.bus_counters)
         ours = entry < self._n_modules + self._n_patches
         if self._header is not None:
@@ -235,14 +240,14 @@ class Decoder:
             kind = self._match_kinds(slots, payload, length)
         wrong = kind == _NO_KIND
         wrong &= ours
-        if wrong.any():
-            rows = np.flatnonzero(wrong)
+        rows = np.flatnonzero(wrong)
+        if len(rows):
             rows = rows[(entry[rows] < self._n_modules) | self._payload_names[self._addresses.candidates[slots[rows]]]]
             likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
             is_length = ~self._length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
-        return kind
+        return kind, rows
 
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
         """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""

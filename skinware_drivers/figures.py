@@ -10,22 +10,22 @@ from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
 from skinware.status import PatchState
 from skinware_drivers.bus_line import BusLine
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.generation import Generation
 from skinware_drivers.limits import MachineLimits
-from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
 
 
 def figures(
     lines: Sequence[BusLine],
     machine: MachineLimits,
     writer: DriverWriter | None,
-    decoder: Decoder | None,
-    publisher: Publisher | None,
+    generation: Generation | None,
 ) -> dict[str, Any]:
     """State and counters of every bus and patch; only the buses' states as long as nothing is published."""
-    if writer is None or decoder is None or publisher is None:
+    if writer is None or generation is None:
         return {"sequence": 0, "buses": [_bus(line) for line in lines], "machine": _machine(machine)}
-    structure, state, time_ns = decoder.tables.structure, decoder.state, now_ns()
+    publisher, state, time_ns = generation.publisher, generation.decoder.state, now_ns()
+    structure = generation.tables.structure
     buses = []
     for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
         counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))

@@ -204,9 +204,9 @@ async def _report(runner: Runner) -> None:
 
 
 def _tell_ready(runner: Runner, as_json: bool) -> None:
-    if runner.decoder is None:
+    if runner.generation is None:
         return
-    structure = runner.decoder.tables.structure
+    structure = runner.generation.tables.structure
     counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
     buses = [line.name for line in runner.lines]
     if as_json:

@@ -10,7 +10,6 @@ import click
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, seconds, warn
 
 if TYPE_CHECKING:
-    from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.finding.interfaces import CanInterface
     from skinware_drivers.finding.looking import Answer, HeardOnBus
     from skinware_drivers.finding.ports import SerialPort
@@ -83,9 +82,11 @@ async def look(
     Raises:
         BusNotAvailable: one of ``buses`` is not there.
     """
+    from skinware.errors import BusNotAvailable
     from skinware_drivers.finding.adapters import Detection, detect_adapters
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import can_interfaces
+    from skinware_drivers.finding.looking import listen
     from skinware_drivers.finding.running import running_drivers
 
     drivers = known_drivers("can", driver_names)
@@ -93,13 +94,14 @@ async def look(
     interfaces, ports, others = _chosen(buses, can_interfaces())
     buses_to_hear = [(one.name, one.bit_rate) for one in interfaces if one.up] + [(name, None) for name in others]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
-    heard = {}
     detection: Detection
     detection, *listened = await asyncio.gather(
-        searching, *(_hear(name, listen_s, drivers, bit_rate) for name, bit_rate in buses_to_hear)
+        searching, *(listen(name, listen_s, drivers, bit_rate) for name, bit_rate in buses_to_hear)
     )
-    for one in listened:
-        heard[one.bus] = one
+    heard: dict[str, HeardOnBus] = {one.bus: one for one in listened}
+    problems = [one.problem for one in listened if one.problem]
+    if buses and problems:
+        raise BusNotAvailable(problems[0])
     answers = await _ask(heard, ports, running, force, driver_names) if probe else {}
     return {
         "can": _can_data(interfaces, heard, answers, running, whole=not buses),
@@ -134,16 +136,6 @@ def _chosen(
         else:
             chosen[2].append(name)
     return chosen
-
-
-async def _hear(name: str, listen_s: float, drivers: dict[str, type[AnyAdapter]], bit_rate: int | None) -> HeardOnBus:
-    from skinware.errors import BusNotAvailable
-    from skinware_drivers.finding.looking import listen
-
-    heard = await listen(name, listen_s, drivers, bit_rate)
-    if heard.problem:
-        raise BusNotAvailable(heard.problem)
-    return heard
 
 
 async def _ask(

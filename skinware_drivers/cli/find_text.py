@@ -71,7 +71,9 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
     if bus["used_by"] is not None:
         lines += _wrapped(f"{bus['used_by']} runs on it")
     heard, probe = bus["heard"], bus["probe"]
-    if heard is not None:
+    if heard is not None and heard.problem:
+        lines += _advice([heard.problem])
+    elif heard is not None:
         load = f", {100 * heard.load:.0f} % of the bus' time" if heard.load is not None and heard.frames else ""
         what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
         errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""

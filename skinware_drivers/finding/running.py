@@ -12,6 +12,7 @@ from skinware.memory.namespace import ROOT, Namespace
 from skinware_drivers.registry import parse_bus_name
 
 _PREFIX = "skinware."
+_PRIVATE = "virtual"
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,12 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 
 
 def same_bus(one: str, other: str) -> bool:
-    """Whether two names mean one bus: what is set behind ``?`` does not count, and links are followed."""
-    return _place(one) == _place(other)
+    """Whether two names mean one bus: what is set behind ``?`` does not count, and links are followed.
+
+    A ``virtual`` bus is nobody else's: each process has its own.
+    """
+    place = _place(one)
+    return place == _place(other) and place[0] != _PRIVATE
 
 
 def _place(bus_name: str) -> tuple[str, str]:

@@ -52,6 +52,7 @@ _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
 _LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
+_MOST_MATTERS = 50
 _ERRORS = (
     "it is done",
     "it does not know this request",
@@ -156,7 +157,12 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     async def start(self, link: Link) -> None:
         """Start the patch, if it still is the one that was described."""
-        await self._ask(link, START, self._crc.to_bytes(4, "little"))
+        try:
+            await self._ask(link, START, self._crc.to_bytes(4, "little"))
+        except Refused as error:
+            if error.error == _OTHER_DESCRIPTION:
+                self._changed(link)
+            raise
 
     async def stop(self, link: Link) -> None:
         """Make it silent."""
@@ -214,13 +220,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
         """Set it up and start it again."""
         self._clock = DeviceClock(1e-6)
-        try:
-            await self.configure(link)
-            await self.start(link)
-        except Refused as error:
-            if error.error == _OTHER_DESCRIPTION:
-                self._changed(link)
-            raise
+        await self.configure(link)
+        await self.start(link)
 
     def _take_greeting(self, link: Link, greeting: Greeting) -> None:
         if self._patch is None:
@@ -245,7 +246,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if payload:
             text = payload[1:].decode("utf-8", "backslashreplace")
             text = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-            self._say(link, _SEVERITIES[min(payload[0], 2)], "note", f"says: {text}")
+            matter = f"note {text}" if len(self._notices) < _MOST_MATTERS else "note"
+            self._say(link, _SEVERITIES[min(payload[0], 2)], matter, f"says: {text}")
 
     def _changed(self, link: Link) -> None:
         self._say(link, logging.WARNING, "changed", "is not what it was: reading its description anew")

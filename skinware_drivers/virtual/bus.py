@@ -192,7 +192,7 @@ class VirtualCanBus(Bus):
         self._pending += fitting
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
-        """Write all frames at once."""
+        """Write all frames as rows of :func:`skinware_drivers.bus.wire_dtype` at once."""
         pack = _packer(batch.payload_size)
         rows = b"".join([pack(identifier, len(payload), payload) for _, identifier, payload in frames])
         stop = batch.stop + len(frames)

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import ConfigurationError
 from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field
@@ -60,8 +59,6 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
 
     def __init__(self, options: EmulatedOpenPatchOptions, **more: Any) -> None:
         super().__init__(options, **more)
-        if options.foreign_hz:
-            raise ConfigurationError("option foreign_hz: a patch has its serial line for itself")
         own_us = 1000 * options.period_ms
         text = f"emulated\0{options.serial_number}\0" + "1.0\0"
         self._items = [

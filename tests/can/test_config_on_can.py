@@ -12,7 +12,7 @@ from skinware.cli._command import exit_status
 from skinware_drivers.cli.config import command
 from tests.commands import running
 
-pytestmark = pytest.mark.can
+pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
 
 def test_a_board_gets_another_address(vcan: Callable[[], str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from skinware_drivers.cli.dump import command
 from tests.can.conftest import ip
 from tests.conftest import wait_until
 
-pytestmark = pytest.mark.can
+pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
 _SOL_CAN_RAW, _CAN_RAW_FD_FRAMES = 101, 5
 

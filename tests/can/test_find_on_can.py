@@ -14,7 +14,7 @@ from skinware_drivers.cli.find import command, look
 from tests.can.conftest import ip
 from tests.commands import running
 
-pytestmark = pytest.mark.can
+pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
 
 def interface(found: dict[str, Any], name: str) -> dict[str, Any]:

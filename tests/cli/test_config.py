@@ -12,17 +12,20 @@ import pytest
 
 from skinware import Namespace
 from skinware.cli._command import exit_status
+from skinware_drivers import registry
 from skinware_drivers.can import roboskin
 from skinware_drivers.cli.config import command
 from skinware_drivers.finding import running, without_driver
 from skinware_drivers.finding.running import RunningDriver, driver_on, running_drivers, same_bus
+from tests.finding.fakes import see_only
 from tests.sdk.driving import commands, driving, emulated
 
 VIRTUAL = "virtual?boards=7,8"
 
 
 @pytest.fixture(autouse=True)
-def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
+def hurry(monkeypatch: pytest.MonkeyPatch, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory) -> None:
+    see_only(namespace, tmp_path_factory.mktemp("shm"), monkeypatch)
     monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.05)
     monkeypatch.setattr(roboskin, "_DISCOVERY_S", 0.1)
     monkeypatch.setattr(without_driver, "_LISTEN_S", 0.1)
@@ -128,10 +131,11 @@ def test_what_needs_the_bus_alone_is_refused_while_a_driver_runs(capsys: pytest.
 def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    late = RunningDriver("torso", "default", "roboskin", 1, (VIRTUAL,))
+    late = RunningDriver("torso", "default", "roboskin", 1, ("can0",))
+    monkeypatch.setattr(registry, "make_bus", lambda *_, **__: emulated(boards=(7,)))
     looks: list[list[RunningDriver]] = [[], [late]]
     monkeypatch.setattr(running, "running_drivers", lambda: looks.pop(0))
-    assert "was started meanwhile; nothing was changed" in configured(capsys, VIRTUAL, "rebaseline", "--yes", status=2)
+    assert "was started meanwhile; nothing was changed" in configured(capsys, "can0", "rebaseline", "--yes", status=2)
 
 
 @pytest.mark.parametrize(
@@ -170,5 +174,5 @@ def test_running_drivers_are_those_that_live(namespace: Namespace) -> None:
 def test_buses_are_the_same_under_all_their_names(tmp_path: Path) -> None:
     assert same_bus("can0", "socketcan:can0?buffer=100")
     assert not same_bus("can0", "can1")
-    assert same_bus("virtual?boards=7", "virtual")
+    assert not same_bus("virtual", "virtual")
     assert same_bus("slcan:/dev/ttyACM0?bitrate=1", "slcan:/dev/ttyACM0")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from skinware import Namespace
 from skinware.cli._command import exit_status
 from skinware_drivers.can import roboskin_boards
 from skinware_drivers.cli.find import command
@@ -17,6 +18,7 @@ from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
+from tests.finding.fakes import see_only
 from tests.sdk.driving import driving, emulated
 
 STREAMING = "virtual?boards=7,8&streaming=yes"
@@ -28,8 +30,11 @@ TTY = SerialPort("/dev/ttyUSB0", "ftdi_sio", FTDI, ("/dev/skin/A50285BI",), Fals
 
 
 @pytest.fixture(autouse=True)
-def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def machine(
+    monkeypatch: pytest.MonkeyPatch, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., None]:
     """A machine of the test's making; nothing is plugged in at first."""
+    see_only(namespace, tmp_path_factory.mktemp("shm"), monkeypatch)
 
     def make(
         can: list[CanInterface] | None = None,
@@ -117,6 +122,16 @@ def test_what_is_heard_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert bus["heard"]["duration_s"] == 0.2
     assert bus["probe"] is None
     assert "no installed driver knows" not in text
+
+
+def test_a_bus_that_cannot_be_heard_does_not_spoil_the_report(
+    capsys: pytest.CaptureFixture[str], machine: Callable[..., None]
+) -> None:
+    machine([dataclasses.replace(CAN0, name="no-such-can0", up=True, bit_rate=1_000_000)], [TTY])
+    text = found(capsys)
+    assert "! there is no CAN interface" in text or "! this kernel has no CAN" in text
+    assert "/dev/ttyUSB0" in text
+    assert "CAN" in found_data(capsys, "--probe")["can"]["interfaces"][0]["probe"]["refused"]
 
 
 def test_probing_tells_who_answers(capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,6 +64,11 @@ class Case:
         options = self.emulator.Options(**self.emulated, **faults)
         return self.emulator(options, log=log, source=self.felt)
 
+    def line(self, hardware: Emulator[Any]) -> tuple[AnyAdapter, VirtualCanBus]:
+        """A driver and a bus with devices of ours."""
+        adapter = self.adapter()
+        return adapter, VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
+
     def felt(self, number: int, cycle: int) -> list[int]:
         """What a device feels: other values for each sensor, device and cycle."""
         modulo = self.emulator.full_scale + 1
@@ -86,9 +91,10 @@ class Bench:
         self.log: list[msgspec.Struct] = []
         self.now_ns = 5_000_000_000_000
         self.hardware = case.devices(self.log, **faults)
-        self.bus = VirtualCanBus.with_hardware(self.hardware, clock=lambda: self.now_ns)
-        self.link = Link(self.bus)
         self.adapter = case.adapter()
+        size = self.adapter.payload_size
+        self.bus = VirtualCanBus.with_hardware(self.hardware, payload_size=size, clock=lambda: self.now_ns)
+        self.link = Link(self.bus)
         self.updates: list[tuple[int, int, list[int]]] = []
         self.notices: list[tuple[str, Notice]] = []
         self.patches: Sequence[Patch] = ()

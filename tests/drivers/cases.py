@@ -10,9 +10,11 @@ from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.xela import EmulatedXela
 from tests.drivers.bench import Case
 
@@ -43,6 +45,7 @@ CASES = [
     ),
     pytest.param(Case(CyskinCpmDriver, EmulatedCyskinCpm), id="cyskin_cpm"),
     pytest.param(Case(BarrettDriver, EmulatedBarrett), id="barrett"),
+    pytest.param(Case(OpenPatchDriver, EmulatedOpenPatch), id="openpatch"),
     pytest.param(
         Case(
             BarrettDriver, EmulatedBarrett, {"format": "top10", "nodes": (11, 14)}, {"nodes": (11, 14)}, ten_strongest

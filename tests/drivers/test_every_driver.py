@@ -185,7 +185,7 @@ def test_a_driver_that_only_listens_sends_nothing(case: Case) -> None:
 def test_frames_hold_whole_bursts_in_order(case: Case) -> None:
     hardware = case.devices()
     expected = {number: case.expected(number, 2000) for number in hardware.numbers}
-    with driving_lines([(case.adapter(), VirtualCanBus.with_hardware(hardware))], "skin"):
+    with driving_lines([case.line(hardware)], "skin"):
         with DriverReader("skin") as reader:
             last = dict.fromkeys(hardware.numbers, 0)
             frames = reader.in_order(timeout_s=30)
@@ -207,8 +207,8 @@ def test_frames_hold_whole_bursts_in_order(case: Case) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_a_restarted_device_comes_back_by_itself(case: Case) -> None:
     hardware = case.devices(boot_s=0.5)
-    bus = VirtualCanBus.with_hardware(hardware)
-    with driving_lines([(case.adapter(), bus)], "skin") as running, DriverReader("skin") as reader:
+    adapter, bus = case.line(hardware)
+    with driving_lines([(adapter, bus)], "skin") as running, DriverReader("skin") as reader:
         read_until(reader, lambda f: not f.status.any())
         first = hardware.numbers[0]
         running.do(lambda: hardware.restart(first, bus._clock()))

@@ -25,7 +25,7 @@ class Wire:
     """A bus on which every request is answered at once: by ``answer``, with frames of 0x585 in hexadecimal."""
 
     listen_only = False
-    channel = "wire"
+    name = "bus wire"
 
     def __init__(self, answer: Answer) -> None:
         self._answer = answer

@@ -6,9 +6,19 @@ import os
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from skinware.memory.namespace import Namespace
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.finding import running
 from skinware_drivers.finding.ports import Machine
 from skinware_drivers.finding.traffic import Traffic
+
+
+def see_only(namespace: Namespace, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let only the drivers of one namespace run on this machine: other tests may have theirs."""
+    (folder / namespace.path.name).mkdir()
+    monkeypatch.setattr(running, "ROOT", folder)
 
 
 def write(folder: Path, **files: object) -> None:

@@ -241,6 +241,29 @@ def test_a_probe_tells_what_happened() -> None:
     assert told == [Notice.CHANGED]
 
 
+def test_another_patch_in_its_place_is_not_started() -> None:
+    items = wire.Said().items()
+    driver = describe(answering(items))
+    told: list[Notice] = []
+
+    def answer(request: int, arguments: bytes) -> bytes:
+        assert (request, arguments) == (3, struct.pack("<I", wire.crc32(b"".join(items))))
+        return b"\x08"
+
+    async def start() -> None:
+        link = ScriptedLink(answer)
+        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
+        await asyncio.sleep(0)
+        try:
+            await driver.start(link)
+        finally:
+            attending.cancel()
+
+    with pytest.raises(BusError, match="its description is not the one that was read"):
+        asyncio.run(start())
+    assert told == [Notice.CHANGED]
+
+
 def data(module: int, values: bytes, *, status: int = 0, sequence: int = 0) -> bytes:
     return struct.pack("<BHIB", module, sequence, 123, status) + values
 
@@ -265,7 +288,9 @@ def test_status_bits_of_modules_and_values() -> None:
 def test_data_of_a_wrong_form_is_not_shown(payload: bytes, is_module: bool) -> None:
     state = decoded(wire.Said(), [(0x80, payload), (0x81, data(0, bytes(8)))]).state
     assert (state.status == int(Status.NEVER_SEEN)).all()
-    assert dict(zip(BUS_COUNTERS, state.bus_counters[0].tolist(), strict=True))["bad_length"] == is_module
+    counters = dict(zip(BUS_COUNTERS, state.bus_counters[0].tolist(), strict=True))
+    assert counters["bad_length"] == is_module
+    assert counters["unknown"] == 1 + (not is_module)  # a kind that there is not, a module that there is not
 
 
 def stamped(driver: OpenPatchDriver, stamps: Sequence[int], received_ns: Sequence[int]) -> list[int]:

@@ -14,7 +14,6 @@ import pytest
 from click.testing import CliRunner
 
 from skinware import DriverReader, PatchState
-from skinware.errors import ConfigurationError
 from skinware_drivers.cli.emulate import emulate
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
@@ -146,9 +145,11 @@ def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(tmp_path: Path
 
 
 def test_it_lives_on_serial_lines_and_has_its_line_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="has its serial line for itself"):
-        emulated(foreign_hz=10.0)
     monkeypatch.setattr("skinware_drivers.virtual.hardware.load_emulator", lambda name: EmulatedOpenPatch)
-    result = CliRunner().invoke(emulate, ["--driver", "openpatch", "--bus", "vcan0"])
-    assert result.exit_code == 2
-    assert "devices of openpatch hang on serial lines" in result.output
+    for more, reason in (
+        (["--bus", "vcan0"], "devices of openpatch hang on serial lines"),
+        (["--bus", "pty", "--foreign-hz", "5"], "nothing else hangs on a serial line"),
+    ):
+        result = CliRunner().invoke(emulate, ["--driver", "openpatch", *more])
+        assert result.exit_code == 2
+        assert reason in result.output

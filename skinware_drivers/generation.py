@@ -1,0 +1,121 @@
+"""What belongs to one structure of a driver's skin: tables, decoder, batch, watch and publisher, made together."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import now_ns
+from skinware.status import PatchState
+from skinware_drivers.adapter import Watch
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus_line import BusLine
+from skinware_drivers.decoder import Decoder
+from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.link import split_by_bus
+from skinware_drivers.publisher import Publisher
+
+log = logging.getLogger("skinware.driver")
+
+BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
+
+
+def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
+    """Room for what arrives at once; of long frames, fewer do."""
+    payload_size = max(line.adapter.payload_size for line in lines)
+    return FrameBatch(max(64, min(BATCH_FRAMES, _BATCH_BYTES // payload_size)), payload_size, headroom)
+
+
+@dataclass
+class Generation:
+    """One structure in service.
+
+    Attributes:
+        lines: the buses; the list may change, their places do not.
+        decoder: frames to updates.
+        watch: marks doubtful modules.
+        publisher: updates to frames in the ring.
+        period_s: nominal time between two updates that the publisher counts on.
+        batch: what buses fill.
+        begun_ns: when it began.
+    """
+
+    lines: Sequence[BusLine]
+    decoder: Decoder
+    watch: Watch
+    publisher: Publisher
+    period_s: float
+    batch: FrameBatch = field(init=False)
+    begun_ns: int = field(init=False)
+    _known_state: npt.NDArray[np.uint8] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.batch = make_batch(self.lines, self.decoder.headroom)
+        self.begun_ns = now_ns()
+        self._known_state = self.publisher.patch_state.copy()
+        self.publisher.bus_counters = [line.bus.counters for line in self.lines]
+        for line in self.lines:
+            if line.patches:
+                line.link.narrow(line.adapter.layout)
+            for key in line.suspects:
+                if (line.ordinal, key) in self.tables.patch_key:
+                    self.watch.suspect(self.tables.patch_key[line.ordinal, key])
+
+    @property
+    def tables(self) -> SkinTables:
+        """What hangs on the buses."""
+        return self.decoder.tables
+
+    def empty_batch(self) -> FrameBatch:
+        """The batch, with nothing in it but frames that wait for their partners."""
+        self.decoder.put_back(self.batch)
+        return self.batch
+
+    def digest(self, batch: FrameBatch) -> None:
+        """Decode a batch and publish what is due."""
+        found, foreign = self.decoder.decode(batch)
+        if len(foreign):
+            for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
+                self.decoder.count_unknown(batch, line.link.offer(batch, own))
+        self.update_bus_states()
+        self.publisher.take(found)
+
+    def update_bus_states(self) -> None:
+        """Tell the publisher what the buses do."""
+        for line in self.lines:
+            line.look(self.publisher.silence_ns)
+            self.publisher.bus_state[line.ordinal] = line.state
+            self.publisher.bus_reason[line.ordinal] = line.reason
+            self.publisher.bus_since_ns[line.ordinal] = line.since_ns
+
+    def number_of(self, line: BusLine, patch: Patch) -> int | None:
+        """Number of a patch in the structure, None if it is not in it (any more)."""
+        return self.tables.patch_key.get((line.ordinal, patch.key))
+
+    def name_of(self, patch: int) -> str:
+        """Name of a patch, for people."""
+        return bytes(self.tables.structure.patch_name[patch]).decode()
+
+    def patches_in(self, line: BusLine, state: PatchState) -> list[tuple[int, Patch]]:
+        """Numbers and descriptions of the patches of a bus that are in a state."""
+        if not line.patches:
+            return []
+        of_bus = self.tables.structure.patch_bus == line.ordinal
+        first = int(np.argmax(of_bus))
+        found: list[int] = np.flatnonzero(of_bus & (self.publisher.patch_state == state)).tolist()
+        return [(number, line.patches[number - first]) for number in found]
+
+    def log_patches(self) -> None:
+        """Tell each change of a patch's state once."""
+        now, before = self.publisher.patch_state, self._known_state
+        for patch in np.flatnonzero(now != before).tolist():
+            line = self.lines[int(self.tables.structure.patch_bus[patch])]
+            if now[patch] == PatchState.STALE:
+                log.warning("%s: %s fell silent", line.name, self.name_of(patch))
+            elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
+                log.warning("%s: %s is live again", line.name, self.name_of(patch))
+        self._known_state = now.copy()

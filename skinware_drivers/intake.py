@@ -1,0 +1,93 @@
+"""Takes frames from all buses of a driver: one epoll, one batch, every bus its share."""
+
+from __future__ import annotations
+
+import asyncio
+import select
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from skinware.errors import BusNotAvailable
+from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus_line import BusLine
+
+_TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
+_REST, _LONGEST_REST_S = 4, 0.005  # after a take: so many times its duration, while more arrives (decision 0006)
+
+
+class Intake:
+    """Wakes up when something has arrived, takes it, and then rests for a moment so that more comes together.
+
+    Args:
+        epoll: in which open buses are registered.
+        lines: the buses; the list may change.
+        empty_batch: gives the batch to fill.
+        digest: gets it, filled.
+    """
+
+    def __init__(
+        self,
+        epoll: select.epoll,
+        lines: Sequence[BusLine],
+        empty_batch: Callable[[], FrameBatch],
+        digest: Callable[[FrameBatch], None],
+    ) -> None:
+        self._epoll = epoll
+        self._lines = lines
+        self._empty_batch = empty_batch
+        self._digest = digest
+        self._rest: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Begin to listen, in the running loop."""
+        asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._on_readable)
+
+    def stop(self) -> None:
+        """Listen no more."""
+        asyncio.get_running_loop().remove_reader(self._epoll.fileno())
+        if self._rest is not None:
+            self._rest.cancel()
+
+    def take(self) -> Literal["nothing", "all", "some"]:
+        """Take what has arrived, now. ``some``: more is waiting."""
+        for turn in range(_TURNS):
+            events = self._epoll.poll(0)
+            if not events:
+                return "all" if turn else "nothing"
+            batch = self._empty_batch()
+            is_behind = self._fill(batch, [fd for fd, _ in events])
+            self._digest(batch)
+            if not is_behind:
+                return "all"
+        return "some"
+
+    def _on_readable(self) -> None:
+        """Take, then let more arrive before the next look: a batch costs little more than a frame."""
+        loop = asyncio.get_running_loop()
+        begun_ns = now_ns()
+        taken = self.take()
+        if taken == "nothing":
+            self.start()
+        else:
+            loop.remove_reader(self._epoll.fileno())
+            rest_s = min(_REST * (now_ns() - begun_ns) / NS_PER_S, _LONGEST_REST_S)
+            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
+
+    def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:
+        """Fill a batch from those buses that have something; whether one of them has more than its share."""
+        time_ns = now_ns()
+        by_fd = {line.bus.fileno(): line for line in self._lines}
+        ready = [by_fd[fd] for fd in fds if fd in by_fd]
+        is_behind = False
+        for number, line in enumerate(ready):
+            batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
+            first = batch.stop
+            try:
+                if line.bus.receive(batch, line.ordinal):
+                    line.adapter.stamp(batch.wire[first : batch.stop], batch.time_ns[first : batch.stop])
+                    line.heard_ns = time_ns
+                    is_behind |= not batch.free
+            except BusNotAvailable as error:
+                line.lose(error)
+        return is_behind

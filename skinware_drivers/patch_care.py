@@ -1,0 +1,158 @@
+"""Looks after the patches of one bus: those that send nothing, that restart, and that speak of themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from functools import partial
+from typing import Any
+
+from skinware.errors import BusError
+from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware.status import PatchState
+from skinware_drivers.adapter import Notice
+from skinware_drivers.bus_line import BusLine
+from skinware_drivers.description import Patch
+from skinware_drivers.generation import Generation
+
+log = logging.getLogger("skinware.driver")
+
+_DATA_TIMEOUT_S = 1.0
+_DATA_CHECKS_HZ = 100
+
+Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
+
+
+class PatchCare:
+    """Looks after the patches of one bus.
+
+    Args:
+        line: the bus.
+        generation: what is in service now, None before anything is.
+        listen_only: nothing may be sent.
+        join: asks for the structure to be looked at again.
+        beside: starts a task of the driver.
+    """
+
+    def __init__(
+        self,
+        line: BusLine,
+        generation: Callable[[], Generation | None],
+        listen_only: bool,
+        join: Callable[[], None],
+        beside: Beside,
+    ) -> None:
+        self._line = line
+        self._generation = generation
+        self._listen_only = listen_only
+        self._join = join
+        self._beside = beside
+
+    async def check_data(self) -> None:
+        """Wait for the first data of every patch, and name those that send none."""
+        timer = Periodic(_DATA_CHECKS_HZ)
+        for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * self._line.adapter.period_s))):
+            if not self._line.lost.is_set() and not self._patches_in(PatchState.EXPECTED):
+                break
+            await asyncio.sleep((timer.deadline_ns - now_ns()) / NS_PER_S)
+            timer.advance(now_ns())
+        for _, patch in self._patches_in(PatchState.EXPECTED):
+            log.warning("%s: %s sends no data", self._line.name, patch.name)
+
+    async def recover_silent(self) -> None:
+        """Ask silent patches whether they are there, and set up those that answer."""
+        line, generation = self._line, self._generation()
+        if generation is None or self._listen_only or line.lost.is_set() or line.busy.locked():
+            return
+        silence_ns = generation.publisher.silence_ns
+        if now_ns() - max(line.opened_ns, generation.begun_ns) < 2 * silence_ns:
+            return  # nobody listened, the boards may send: to set them up again would move their baseline
+        silent = [*self._patches_in(PatchState.STALE), *self._patches_in(PatchState.EXPECTED)]
+        if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
+            silent += self._patches_in(PatchState.RESTARTED)
+        for _, patch in silent:
+            try:
+                if not await line.adapter.probe(line.link, patch):
+                    continue
+                log.warning("%s: %s is silent but answers: it has restarted", line.name, patch.name)
+            except BusError as error:
+                log.debug("%s: %s", line.name, str(error))
+                continue
+            await self._revive(patch)
+
+    async def attend(self, pause_s: Callable[[], float]) -> None:
+        """Hear what devices say of themselves, for ever.
+
+        Args:
+            pause_s: what to wait after the bus failed.
+        """
+        reviving: dict[int, asyncio.Task[None]] = {}
+        try:
+            while True:
+                try:
+                    await self._line.adapter.attend(self._line.link, partial(self._note, reviving))
+                    return
+                except BusError as error:
+                    log.debug("%s: %s", self._line.name, str(error))
+                await asyncio.sleep(pause_s())
+        finally:
+            for task in reviving.values():
+                task.cancel()
+
+    def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
+        """A patch says something of itself."""
+        line, generation = self._line, self._generation()
+        number = None if generation is None else generation.number_of(line, patch)
+        if generation is None or number is None:
+            return
+        if notice is Notice.SUSPECT:
+            line.suspects.add(patch.key)
+            generation.watch.suspect(number)
+        elif notice is Notice.SOUND:
+            line.suspects.discard(patch.key)
+            generation.watch.forget(number)
+        elif notice is Notice.LOST or self._listen_only:
+            generation.publisher.lose(number, PatchState.STALE)
+        elif notice is Notice.CHANGED:
+            generation.publisher.lose(number, PatchState.STALE)
+            self._join()
+        elif patch.key not in reviving or reviving[patch.key].done():
+            log.warning("%s: %s has restarted", line.name, patch.name)
+            generation.publisher.lose(number, PatchState.RESTARTED)
+            reviving[patch.key] = self._beside(self._revive(patch))
+
+    async def _revive(self, patch: Patch) -> None:
+        """Set one patch up anew."""
+        line = self._line
+        async with line.busy:
+            generation = self._generation()
+            number = None if generation is None else generation.number_of(line, patch)
+            if generation is None or number is None:
+                return
+            generation.publisher.lose(number, PatchState.RESTARTED)
+            generation.decoder.forget(number)
+            error = await self._set_up(patch)
+            generation = self._generation()  # it may be another one by now
+            number = None if generation is None else generation.number_of(line, patch)
+            if generation is None or number is None:
+                return
+            if error is None:
+                generation.watch.forget(number)
+            else:
+                log.debug("%s: %s", line.name, error)
+                generation.publisher.lose(number, PatchState.STALE)
+
+    async def _set_up(self, patch: Patch) -> str | None:
+        """Have the driver set one patch up; what went wrong, if anything."""
+        try:
+            await self._line.adapter.revive(self._line.link, patch)
+        except BusError as error:
+            return str(error)
+        self._line.revived_ns = now_ns()
+        self._line.suspects.discard(patch.key)
+        return None
+
+    def _patches_in(self, state: PatchState) -> list[tuple[int, Patch]]:
+        generation = self._generation()
+        return [] if generation is None else generation.patches_in(self._line, state)

@@ -96,7 +96,7 @@ def _emulate(
     if bus.medium not in (None, medium):
         where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty or a port"
         raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
-    if medium == "serial" and getattr(options, "foreign_hz", 0):
+    if medium == "serial" and getattr(options, "foreign_hz", False):
         raise ConfigurationError("--foreign-hz: nothing else hangs on a serial line")
     if framing is not None:
         from skinware_drivers.serial.bus import SerialBus

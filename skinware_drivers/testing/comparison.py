@@ -130,9 +130,11 @@ class Comparison:
         """Whether something happened on the wire to a burst of that time, or may have."""
         damaged_ns = np.array(sorted(damage.time_ns for damage in self.rig.wire.damages))
         reach_ns = self.rig.period_ns + _LATE_NS
+        # on a serial line a frame can lose its end, and the next one its beginning
+        back_ns = _LATE_NS + (self.rig.period_ns if self.rig.adapter.medium == "serial" else 0)
 
         def is_spoilt(time_ns: int) -> bool:
-            first = np.searchsorted(damaged_ns, time_ns - _LATE_NS - 1)
+            first = np.searchsorted(damaged_ns, time_ns - back_ns - 1)
             return bool(first < len(damaged_ns) and damaged_ns[first] <= time_ns + reach_ns)
 
         return is_spoilt

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import msgspec
@@ -16,6 +16,7 @@ from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.runner import PublishMode, Runner
 from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.pty import emulated_on_a_pty
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
@@ -139,7 +140,7 @@ class EmulatedSkin:
     Attributes:
         driver: the running driver.
         reader: reads it.
-        hardware: the devices; touch them only within ``driver.do``.
+        hardware: the devices; touch them only within ``driver.do``. None: they are on a serial line, or a bus of yours.
         bus: the bus; it can ``vanish`` and ``come_back``, also only within ``driver.do``.
     """
 
@@ -164,7 +165,8 @@ def emulated_skin(
 
     Args:
         driver: its registered name, or its class.
-        emulator: a class; by default the one registered under the driver's name.
+        emulator: a class; by default the one registered under the driver's name. Those of serial drivers get a pseudo
+            terminal.
         name: of the driver in the namespace.
         driver_options: options of the driver.
         bus: a bus' name (``vcan0``, a pseudo terminal), where the devices are already; then nothing is emulated here.
@@ -172,15 +174,21 @@ def emulated_skin(
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver
     adapter = driver_class(msgspec.convert(dict(driver_options or {}), driver_class.Options, strict=False))
+    factory = emulator or (load_emulator(driver) if isinstance(driver, str) else None)
     hardware: EmulatedHardware | None = None
-    if bus:
-        line = make_bus(bus, payload_size=adapter.payload_size)
-    else:
-        factory = emulator or load_emulator(driver if isinstance(driver, str) else driver.__name__)
-        hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))
-        line = VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
-    with driving_lines([(adapter, line)], name) as running, DriverReader(name, timeout_s=_LONGEST_S) as reader:
-        yield EmulatedSkin(running, reader, line, hardware)
+    with ExitStack() as running:
+        if not bus:
+            require(factory is not None, f"say which emulator {driver} is to run on")
+            if adapter.medium == "serial":
+                bus = running.enter_context(emulated_on_a_pty(factory, **emulator_options))
+        if bus:
+            line = make_bus(bus, payload_size=adapter.payload_size)
+        else:
+            hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))
+            line = VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
+        driving = running.enter_context(driving_lines([(adapter, line)], name))
+        reader = running.enter_context(DriverReader(name, timeout_s=_LONGEST_S))
+        yield EmulatedSkin(driving, reader, line, hardware)
 
 
 __all__ = ["Driving", "EmulatedSkin", "driving_lines", "emulated_skin"]

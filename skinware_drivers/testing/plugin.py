@@ -137,6 +137,8 @@ def vcan() -> Iterator[Callable[[], str]]:
         try:
             ip("link", "add", "dev", name, "type", "vcan")
         except (OSError, subprocess.CalledProcessError) as error:
+            if os.environ.get("SKINWARE_CAN_LAB") == "1":
+                raise  # there is nothing better
             pytest.skip(f"no vcan ({getattr(error, 'stderr', None) or error}): {_NO_CAN}")
         made.append(name)
         ip("link", "set", name, "up")

@@ -49,12 +49,15 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     """Run emulated devices as long as the ``with`` lasts; yields the path of their serial port.
 
     Args:
-        emulator: class or registered name of an emulator whose frames are the bytes on the line.
+        emulator: class or registered name of an emulator whose frames are the bytes on the line, or have a ``framing``.
         options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     hardware = factory(msgspec.convert(options, factory.Options, strict=False))
     bus, control = PtyBus("", payload_size=_LONGEST_WRITE), _Control()
+    framing = getattr(factory, "framing", None)
+    if framing is not None:
+        bus.use(framing)
 
     def run() -> None:
         try:

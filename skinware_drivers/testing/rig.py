@@ -21,13 +21,21 @@ from skinware_drivers.link import Link
 from skinware_drivers.runner import Runner
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.wire import EmulatedBus, EmulatedSerialBus, Interference, Pattern, Truth, make_bus
+from skinware_drivers.testing.wire import (
+    EmulatedBus,
+    EmulatedSerialBus,
+    Interference,
+    OnTheLine,
+    Pattern,
+    Truth,
+    make_bus,
+)
 
 T = TypeVar("T")
 NAME = "driver_under_test"
 _BUS = "bus"
 _SLOTS = 64
-_LONGEST_START_S = 30.0
+_LONGEST_START_S = 12.0
 SHOWN_ANYWAY = int(Status.SUSPECT | Status.OUT_OF_RANGE)
 """Status bits of values that are shown as they were sent."""
 
@@ -74,7 +82,7 @@ class Recorder:
     def look(self, runner: Runner) -> None:
         """Take what was published."""
         if self.reader is None:
-            if runner.writer is None:
+            if runner.writer is None or runner.writer.closed:
                 return
             self.reader = DriverReader(runner.name)
         while True:
@@ -121,11 +129,12 @@ class Rig:
         self.clock = clock
         self.adapter = case.adapter()
         options = case.options(**emulated)
-        n_values = len(case.emulator(options).places())
-        self.truth = Truth(clock, n_values, pattern, case.shown)
+        n_felt = len(case.emulator(options).places())
+        self.truth = Truth(clock, n_felt, pattern, case.shown)
         self.devices = case.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
-        self.wire = Interference(self.devices)
+        framing = getattr(self.devices, "framing", None)
+        self.wire = Interference(self.devices if framing is None else OnTheLine(self.devices, framing))
         self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
 
     @property
@@ -203,7 +212,7 @@ class Running(Rig):
 
         def offer_and_count(batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
             unwanted = offer(batch, rows)
-            self.answers += len(rows) if runner.decoder is None else len(rows) - len(unwanted)
+            self.answers += len(rows) if runner.generation is None else len(rows) - len(unwanted)
             return unwanted
 
         link.offer = offer_and_count  # type: ignore[method-assign]

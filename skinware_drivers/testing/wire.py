@@ -8,7 +8,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.testing.clock import HandClock, HandTimer
 from skinware_drivers.testing.defect import defect
@@ -49,16 +50,22 @@ class Truth:
 
     Args:
         clock: the time.
-        n_values: values of each device.
+        n_felt: values that each device feels.
         pattern: what is felt.
         shown: of what was felt, what the protocol can tell.
+
+    Attributes:
+        n_values: values that each device tells.
+        bursts: what was felt so far.
+        remember: whether to write down what is felt.
     """
 
     def __init__(
-        self, clock: HandClock, n_values: int, pattern: Pattern, shown: Callable[[Sequence[int]], Sequence[int]]
+        self, clock: HandClock, n_felt: int, pattern: Pattern, shown: Callable[[Sequence[int]], Sequence[int]]
     ) -> None:
         self.pattern = pattern
-        self.n_values = n_values
+        self.n_felt = n_felt
+        self.n_values = len(shown([0] * n_felt))
         self.bursts: dict[int, list[Burst]] = {}
         self.remember = True
         self._clock = clock
@@ -66,11 +73,50 @@ class Truth:
 
     def __call__(self, number: int, cycle: int) -> Sequence[int]:
         """What a device feels now."""
-        felt: list[int] = self.pattern(number, cycle, self.n_values).tolist()
+        felt: list[int] = self.pattern(number, cycle, self.n_felt).tolist()
         if self.remember:
             burst = Burst(self._clock.now_ns, np.array(self._shown(felt)))
             self.bursts.setdefault(number, []).append(burst)
         return felt
+
+
+class OnTheLine:
+    """Devices that speak in messages, as the bytes on their serial line.
+
+    Args:
+        hardware: the devices.
+        framing: how their messages lie in the stream.
+    """
+
+    def __init__(self, hardware: EmulatedHardware, framing: Framing) -> None:
+        self._hardware = hardware
+        self._framing = framing
+        self._framer = framing.framer()
+
+    def receive(self, _identifier: int, payload: bytes, now_ns: int) -> None:
+        """Take bytes from the line."""
+        framed = self._framer.feed(payload)
+        for identifier, body in zip(framed.identifier.tolist(), framed.bodies(), strict=True):
+            self._hardware.receive(identifier, body, now_ns)
+
+    def next_due_ns(self) -> int | None:
+        """When ``emit`` is worth calling again."""
+        return self._hardware.next_due_ns()
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        """The bytes of each message."""
+        return [
+            WireFrame(time_ns, 0, self._framing.encode(identifier, payload))
+            for time_ns, identifier, payload in self._hardware.emit(now_ns)
+        ]
+
+    def skip(self, now_ns: int) -> int:
+        """Let the devices run on with nobody listening."""
+        return self._hardware.skip(now_ns)
+
+    def totals(self) -> dict[str, int]:
+        """Of the devices."""
+        return self._hardware.totals()
 
 
 @dataclass(frozen=True)
@@ -232,6 +278,8 @@ class _EmulatedPort(Port):
 class EmulatedSerialBus(SerialBus):
     """A serial line with emulated devices, in a clock's time."""
 
+    opens_slowly: ClassVar[bool] = False  # a thread would know nothing of that time
+
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
         self._hardware = hardware
@@ -289,6 +337,7 @@ __all__ = [
     "EmulatedSerialBus",
     "Fault",
     "Interference",
+    "OnTheLine",
     "Pattern",
     "Truth",
     "foreign_identifiers",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self, TypeVar
@@ -24,6 +24,11 @@ from skinware_drivers.virtual.events import FrameFault
 
 MS = 1_000_000
 T = TypeVar("T")
+
+
+def play(scenario: Coroutine[Any, Any, None]) -> None:
+    """Run a scenario to its end, a minute at the most."""
+    asyncio.run(asyncio.wait_for(scenario, 60))
 
 
 def as_sent(values: Sequence[int]) -> Sequence[int]:
@@ -63,11 +68,6 @@ class Case:
     def devices(self, log: list[msgspec.Struct] | None = None, **faults: Any) -> Emulator[Any]:
         options = self.emulator.Options(**self.emulated, **faults)
         return self.emulator(options, log=log, source=self.felt)
-
-    def line(self, hardware: Emulator[Any]) -> tuple[AnyAdapter, VirtualCanBus]:
-        """A driver and a bus with devices of ours."""
-        adapter = self.adapter()
-        return adapter, VirtualCanBus.with_hardware(hardware, payload_size=adapter.payload_size)
 
     def felt(self, number: int, cycle: int) -> list[int]:
         """What a device feels: other values for each sensor, device and cycle."""

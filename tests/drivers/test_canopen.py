@@ -25,8 +25,7 @@ from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
 from skinware_drivers.virtual.events import CommandReceived, ErrorReported
 from tests.conftest import wait_until
-from tests.drivers.bench import Bench, Case
-from tests.drivers.test_every_driver import play
+from tests.drivers.bench import Bench, Case, play
 from tests.sdk.driving import Driving, driving_lines, read_until
 
 EXAMPLE = Path(str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds"))

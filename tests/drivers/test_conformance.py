@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.can.barrett import BarrettDriver
+from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.barrett import EmulatedBarrett
+from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.hardware import EventLog
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
 from skinware_drivers.virtual.xela import EmulatedXela
@@ -36,6 +42,16 @@ class TestXela4x6(DriverConformance):
         "columns": 6,
     }
     emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (1, 3), "model": "4x6"}
+
+
+class TestCanopen(DriverConformance):
+    driver = CanopenDriver
+    emulator = EmulatedCanopen
+    driver_options: ClassVar[Mapping[str, Any]] = {"nodes": (5, 6)}
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        """The example patch also sends that it has 25.0 degrees."""
+        return [*felt, 250]
 
 
 class TestCyskinCpm(DriverConformance):
@@ -98,3 +114,17 @@ class TestRoboskinMtb3(DriverConformance):
     emulator = EmulatedTriangles
     driver_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4)}
     emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 4), "mtb3": (3,)}
+
+
+class TestOpenPatch(DriverConformance):
+    driver = OpenPatchDriver
+    emulator = EmulatedOpenPatch
+
+
+def test_every_driver_that_ships_is_here() -> None:
+    """As the package's metadata names them; installed metadata may be older."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    names = set(project["project"]["entry-points"]["skinware.drivers"].values())
+    suites = [suite for suite in globals().values() if isinstance(suite, type) and issubclass(suite, DriverConformance)]
+    tested = [suite.driver for suite in suites if suite is not DriverConformance]
+    assert names == {f"{driver.__module__}:{driver.__qualname__}" for driver in tested}

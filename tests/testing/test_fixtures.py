@@ -14,17 +14,19 @@ import pytest
 
 from skinware import PatchState, Status
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
+from skinware_drivers.adapter import AnyAdapter, NoOptions
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.stuffing import COBS
 from skinware_drivers.testing import lab
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.driving import EmulatedSkin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 
 
 class TapeDriver(SerialAdapter[NoOptions]):
@@ -74,6 +76,15 @@ def test_a_driver_on_emulated_devices_and_a_reader(emulated_skin: Callable[..., 
     read_until(skin.reader, lambda frame: bool((frame.status & Status.STALE).all()))
     skin.driver.do(skin.bus.come_back)  # type: ignore[attr-defined]
     read_until(skin.reader, lambda frame: frame.patch_state[0] == PatchState.LIVE and not frame.status.any())
+
+
+@pytest.mark.parametrize(("driver", "emulator"), [(TapeDriver, EmulatedTape), (OpenPatchDriver, EmulatedOpenPatch)])
+def test_serial_drivers_get_a_pseudo_terminal(
+    emulated_skin: Callable[..., EmulatedSkin], driver: type[AnyAdapter], emulator: object
+) -> None:
+    skin = emulated_skin(driver, emulator, pattern="cycle")
+    frame = read_until(skin.reader, lambda frame: not frame.status.any())
+    assert len(set(frame.values.tolist())) == 1
 
 
 def test_emulated_devices_on_a_pseudo_terminal(

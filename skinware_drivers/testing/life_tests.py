@@ -1,0 +1,260 @@
+"""What a driver says of itself, and how it begins, ends, listens and keeps house."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import tracemalloc
+from collections.abc import Sequence
+from typing import Any
+
+from skinware.errors import BusError, StructureError
+from skinware.memory.namespace import Namespace
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.description import SkinTables, assemble
+from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.leaks import Belongings, files_left
+from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.suite import Suite
+from skinware_drivers.virtual.hardware import WireFrame
+
+_ABSENT_S = 1.5
+_LISTEN_S = 2.0
+_MANY_BURSTS = 200
+_MOST_GROWN = 1.5
+
+
+class LifeTests(Suite):
+    """Description, handshakes, stop, listening, leaks."""
+
+    def test_the_description_is_valid_complete_and_stable(self) -> None:
+        """The structure holds every sensor of the devices once, and is the same at every `describe`."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.handshakes(clock) as rig:
+                first = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
+                require(
+                    first.structure.n_sensors == rig.n_values,
+                    f"the driver declares {first.structure.n_sensors} sensors, the devices have {rig.n_values}: is a"
+                    " module missing in `describe` or `patches`, or a channel that is no sensor?",
+                )
+                second = self._tables(rig.adapter, await rig.adapter.describe(rig.link))
+                require(
+                    first.structure == second.structure,
+                    "`describe` says something else when it is asked again, of the same devices: readers would have to"
+                    " follow a new structure each time",
+                )
+                other = self.case.adapter()
+                third = self._tables(other, await other.describe(rig.link))
+                require(
+                    first.structure == third.structure,
+                    "another object of the driver describes the same devices in another way: what is kept in the class"
+                    " that belongs to the object?",
+                )
+
+        play(scenario)
+
+    @staticmethod
+    def _tables(adapter: AnyAdapter, patches: Sequence[Any]) -> SkinTables:
+        require(patches, "`describe` found no patch, though the emulated devices have power")
+        names = [patch.name for patch in patches]
+        require(len(set(names)) == len(names), f"two patches of one bus have the same name: {names}")
+        try:
+            return assemble([("bus", patches)], adapter.types, adapter.dtype)
+        except StructureError as error:
+            return defect(f"the description is not valid: {error}")
+
+    def test_handshakes_in_any_order(self) -> None:
+        """Stop without start, twice, start again, close twice, use after close: only bus errors may come of it."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.handshakes(clock) as rig:
+                adapter, link = rig.adapter, rig.link
+
+                async def step(name: str, *arguments: Any) -> Any:
+                    try:
+                        return await getattr(adapter, name)(link, *arguments)
+                    except BusError as error:
+                        return defect(f"`{name}` failed ({story}) though the devices are there: {error}")
+                    except Exception as error:  # noqa: BLE001  (told to the author)
+                        return defect(
+                            f"`{name}` raised {type(error).__name__}: {error} ({story}); only BusError may be"
+                        )
+
+                for story in (
+                    "describe stop stop",
+                    "configure start stop",
+                    "stop configure configure start start stop",
+                    "describe configure start stop",
+                ):
+                    for name in story.split():
+                        result = await step(name)
+                        if name == "describe":
+                            patches = result
+                for patch in patches:
+                    story = "revive without start, then probe"
+                    await step("revive", patch)
+                    await step("probe", patch)
+                await step("stop")
+                rig.close()
+                rig.close()
+                for name in ("describe", "configure", "start", "stop"):
+                    try:
+                        await getattr(adapter, name)(link)
+                    except BusError:
+                        continue
+                    except Exception as error:  # noqa: BLE001  (told to the author)
+                        defect(f"`{name}` raised {type(error).__name__} on a closed bus: {error}; only BusError may be")
+                rig.open()
+                story = "after the bus was closed and opened again"
+                for name in ("describe", "configure", "start", "stop"):
+                    await step(name)
+
+        play(scenario)
+
+    def test_it_can_be_stopped_at_any_moment(self) -> None:
+        """Between any two steps of its start, also while it waits for devices that are not there."""
+        before = Belongings()
+
+        async def scenario(clock: HandClock, after_s: float, silent: bool) -> None:
+            rig = self.running(clock)
+            rig.wire.silent = silent
+            async with rig:
+                await rig.sleep(after_s)
+
+        for silent in (False, True):
+            for after_s in (0.0, 0.0003, 0.002, 0.03, 0.15, 0.6, 1.3):
+                play(lambda clock, after_s=after_s, silent=silent: scenario(clock, after_s, silent))  # type: ignore[misc]
+        self._require_nothing_left(before, "after it was stopped in the middle of its start")
+
+    def test_devices_that_come_late_are_found(self) -> None:
+        """Nobody is there when the driver starts; devices that get their power later are set up and shown."""
+
+        async def scenario(clock: HandClock) -> None:
+            rig = self.running(clock)
+            rig.wire.silent = True
+            async with rig:
+                await rig.sleep(_ABSENT_S)
+                rig.wire.silent = False
+                await rig.until_fresh()
+
+        play(scenario)
+
+    def test_devices_are_silent_again_after_stop(self) -> None:
+        """Devices that were silent before a driver started them are silent after it has stopped."""
+
+        async def scenario(clock: HandClock) -> None:
+            rig = self.running(clock)
+            async with rig:
+                rig.wire.skip(clock.now_ns)
+                if self._frames_alone(clock):
+                    return  # they send by themselves: nothing stops them
+                await rig.until_fresh()
+            self._let_pass(rig, 0.1)
+            sent = len(self._let_pass(rig, 1.0))
+            require(
+                not sent,
+                f"the devices go on sending after the driver was stopped ({sent} frames in a second): `stop` does not"
+                " make them silent",
+            )
+
+        play(scenario)
+
+    def _frames_alone(self, clock: HandClock) -> int:
+        """How much devices send in a second, to which nobody has said anything."""
+        devices = self.emulator(self.case.options(), log=None, source=self.handshakes(clock).truth)
+        devices.skip(clock.now_ns)
+        return len(devices.emit(clock.now_ns + 1_000_000_000))
+
+    @staticmethod
+    def _let_pass(rig: Running, duration_s: float) -> list[WireFrame]:
+        """What devices send while nobody listens."""
+        rig.clock.now_ns += round(duration_s * 1e9)
+        return rig.devices.emit(rig.clock.now_ns)  # type: ignore[no-any-return]
+
+    def test_nothing_leaks(self) -> None:
+        """Started and stopped again and again, with its bus lost in between, it leaves nothing behind."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                rig.bus.vanish()
+                await rig.sleep(0.5)
+                rig.bus.come_back()
+                await rig.sleep(1.0)
+
+        play(scenario)  # what is made once and kept
+        before = Belongings()
+        for _ in range(2):
+            play(scenario)
+        self._require_nothing_left(before, "after it was started and stopped twice")
+
+    @staticmethod
+    def _require_nothing_left(before: Belongings, when: str) -> None:
+        left = before.left_since() + files_left(Namespace().path)
+        require(not left, f"left behind {when}: {', '.join(left)}: what `start` opens, `stop` must close")
+
+    def test_memory_does_not_grow(self) -> None:
+        """Data for ever, in the same memory."""
+
+        async def scenario(clock: HandClock) -> None:
+            rig = self.running(clock)
+            rig.record.keep = False
+            async with rig:
+                await rig.until_fresh()
+                await rig.sleep(10 * rig.adapter.period_s)
+                rig.truth.remember = rig.wire.remember = False  # what grows is then the driver's
+                await rig.sleep(20 * rig.adapter.period_s)  # what is made once and kept
+                before = _pieces()
+                await rig.sleep(_MANY_BURSTS * rig.adapter.period_s)
+                grown = _pieces() - before
+                if grown > _MANY_BURSTS * _MOST_GROWN:
+                    where = await _where_it_grows(rig)
+                    defect(
+                        f"memory grows with the data: {grown} pieces more after {_MANY_BURSTS} bursts; most of them"
+                        f" seem to be made at {where}"
+                    )
+
+        play(scenario)
+
+    def test_a_listener_sends_nothing(self) -> None:
+        """With `--listen-only` nothing is sent, and nothing is even tried, whatever the devices do."""
+
+        async def scenario(clock: HandClock, streaming: bool) -> None:
+            async with self.running(clock, listen_only=True, streaming=streaming) as rig:
+                await rig.sleep(_LISTEN_S)
+                tried = rig.bus.counters.send_failures
+                require(
+                    not tried and not rig.wire.sent,
+                    f"it was told to listen only, and tried to send {tried} frames: ask `link.listen_only` before"
+                    " sending in `describe`, `attend` and `join`",
+                )
+
+        for streaming in (True, False):
+            play(lambda clock, streaming=streaming: scenario(clock, streaming))  # type: ignore[misc]
+
+
+def _pieces() -> int:
+    """Pieces of memory that are in use."""
+    gc.collect()
+    return sys.getallocatedblocks()
+
+
+async def _where_it_grows(rig: Running) -> str:
+    """Where most of what comes and stays is made; of small pieces, Python does not always know it rightly."""
+    snapshots = []
+    tracemalloc.start(1)
+    try:
+        for _ in range(2):
+            await rig.sleep(20 * rig.adapter.period_s)
+            gc.collect()
+            snapshots.append(tracemalloc.take_snapshot())
+    finally:
+        tracemalloc.stop()
+    ours = [tracemalloc.Filter(False, f"*/skinware_drivers/{part}/*") for part in ("testing", "virtual")]
+    first, second = (snapshot.filter_traces(ours) for snapshot in snapshots)
+    return str(max(second.compare_to(first, "lineno"), key=lambda change: change.count_diff).traceback)
+
+
+__all__ = ["LifeTests"]

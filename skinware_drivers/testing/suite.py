@@ -1,0 +1,67 @@
+"""What all tests of the suite have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.patterns import lively
+from skinware_drivers.testing.rig import Case, Handshakes, Running
+
+
+class Suite:
+    """A driver, its emulator, and rigs of both.
+
+    Attributes:
+        driver: the adapter class.
+        emulator: emulated hardware for it; see :mod:`.conformance`.
+        driver_options: options of the driver, as in a configuration file.
+        emulator_options: options of the emulator, beside what the tests need.
+    """
+
+    driver: ClassVar[type[AnyAdapter]]
+    emulator: ClassVar[Any]
+    driver_options: ClassVar[Mapping[str, Any]] = {}
+    emulator_options: ClassVar[Mapping[str, Any]] = {}
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        """Of the values that a device felt, what its protocol can tell: to be overridden where that is less."""
+        return felt
+
+    @property
+    def case(self) -> Case:
+        """What is tested."""
+        return Case(self.driver, self.emulator, self.driver_options, self.emulator_options, self.shown)
+
+    def running(self, clock: HandClock, **more: Any) -> Running:
+        """The driver on its devices, which feel other values all the time."""
+        return Running(self.case, clock, more.pop("pattern", lively)(self.emulator), **more)
+
+    def handshakes(self, clock: HandClock, **more: Any) -> Handshakes:
+        """The driver's handshakes alone."""
+        return Handshakes(self.case, clock, lively(self.emulator), **more)
+
+    @staticmethod
+    def require_all_counted(rig: Running) -> None:
+        """Every frame that came in was shown, or counted as something."""
+        counters = rig.counters()
+        came = counters["frames"] + counters["refused"] + counters["lost"]
+        if rig.adapter.medium == "can":
+            require(came == rig.wire.frames, f"{rig.wire.frames} frames came, the bus counted {came}")
+        layout = rig.adapter.layout
+        if layout.cycle is not None and len(layout.cycle.members) < len(layout.frames):
+            return  # how many frames an update had cannot be told from the counters
+        used = counters["updates"] * layout.cycle_length + rig.answers
+        used += sum(counters[name] for name in ("unknown", "bad_length", "bad_content", "orphans"))
+        structure = rig.record.frames[-1].structure
+        groups = structure.n_patches if layout.cycle and layout.cycle.within == "patch" else structure.n_modules
+        require(
+            0 <= counters["frames"] - used <= groups * (layout.cycle_length - 1),  # which may still wait for others
+            f"{counters['frames']} frames came in, {used} were shown, counted, or answers to the driver: {counters}",
+        )
+
+
+__all__ = ["Suite"]

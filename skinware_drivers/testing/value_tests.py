@@ -1,0 +1,118 @@
+"""That a driver shows what was felt, all of it, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skinware.status import Status
+from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.testing.comparison import Comparison
+from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.patterns import extreme
+from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.suite import Suite
+
+_BURSTS = 24
+_SILENCE_S = 1.5
+_RATE_TOLERANCE = 0.3
+_NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_content", "orphans", "late")
+
+
+class ValueTests(Suite):
+    """Values of good data."""
+
+    def test_nothing_is_valid_before_the_first_data(self) -> None:
+        """As long as no data came, every sensor is NEVER_SEEN; and what has come makes only itself valid."""
+
+        async def scenario(clock: HandClock) -> None:
+            rig = self.running(clock)
+            is_data = self._data_of(rig)
+            rig.wire.keep = lambda identifier, payload: not is_data(identifier, payload)
+            async with rig:
+                await rig.sleep(_SILENCE_S)
+                for frame in rig.record.frames:
+                    seen = np.flatnonzero((frame.status & Status.NEVER_SEEN) == 0)
+                    require(
+                        not len(seen),
+                        f"{len(seen)} sensors are shown as seen before any data came, with values"
+                        f" {frame.values[seen[:4]].tolist()}: nothing may be filled in beforehand",
+                    )
+                passed: set[tuple[int, bytes]] = set()
+
+                def first_of_each_burst(identifier: int, payload: bytes) -> bool:
+                    if not is_data(identifier, payload):
+                        return True
+                    passed.add((identifier, payload[:1]))
+                    return (identifier, payload[:1]) == min(passed)
+
+                rig.wire.keep = first_of_each_burst
+                await rig.sleep(_SILENCE_S)
+                rig.wire.keep = lambda _identifier, _payload: True
+                await rig.until_fresh()
+                Comparison(rig).require_right(
+                    "with most frames missing on the wire, sensors were filled in that no frame had told of"
+                )
+
+        play(scenario)
+
+    def _data_of(self, rig: Running) -> Any:
+        """Tells data from answers: a device that has sent data before it was asked for any does not exist."""
+        bursts = rig.truth.bursts
+
+        def is_data(_identifier: int, _payload: bytes) -> bool:
+            return bool(bursts)
+
+        return is_data
+
+    def test_every_value_is_right_and_in_order(self) -> None:
+        """Each sensor shows what it felt, every burst is shown once, and nothing is counted as wrong."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                await rig.sleep(_BURSTS * rig.adapter.period_s)
+                comparison = Comparison(rig)
+                comparison.require_right()
+                comparison.require_complete()
+                wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
+                require(
+                    not wrong,
+                    f"of good data, something was counted as wrong: {wrong}: does the layout know every frame and every"
+                    " length that the devices send?",
+                )
+                self.require_all_counted(rig)
+
+        play(scenario)
+
+    def test_extreme_values(self) -> None:
+        """Least and greatest values, alternating bits, the sign bit alone: also these are shown as they were sent."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock, pattern=extreme) as rig:
+                await rig.until_fresh()
+                await rig.sleep(24 * rig.adapter.period_s)
+                Comparison(rig).require_right()
+
+        play(scenario)
+
+    def test_the_rate_is_the_one_it_tells(self) -> None:
+        """Updates come every ``period_s``: readers, staleness and pairing depend on it."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                await rig.sleep(2 * _BURSTS * rig.adapter.period_s)
+                for number in rig.numbers:
+                    times_ns = np.array([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])
+                    real_s = float(np.median(np.diff(times_ns))) / 1e9
+                    require(
+                        abs(real_s / rig.adapter.period_s - 1) < _RATE_TOLERANCE,
+                        f"`period_s` is {rig.adapter.period_s:g} s, but device {number} sends every {real_s:g} s",
+                    )
+
+        play(scenario)
+
+
+__all__ = ["ValueTests"]

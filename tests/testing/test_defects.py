@@ -1,0 +1,110 @@
+"""The suite finds what is wrong with a driver, and says it in words that name the defect."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.testing.conformance import DriverConformance
+from tests.conftest import wait_until
+from tests.testing import fingertips as f
+
+VALUES = "test_every_value_is_right_and_in_order"
+DAMAGE = "test_a_damaged_frame_costs_its_own_burst_only"
+DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
+    (f.SwappedBytes, VALUES, (), r"12 of 12 sensors .*(?s:.*)two bytes swapped — look at the byte order"),
+    (f.Signed, VALUES, (), r"the unsigned value as if it were signed — look at the sign of the dtype"),
+    (f.Signed, "test_extreme_values", (), r"the unsigned value as if it were signed"),
+    (f.OneByteEarly, VALUES, (), r"bytes of two values — look at `offset`|one byte off"),
+    (f.NextTaxel, VALUES, (), r"sensor 0 .*shows what sensor 5(?s:.*)sensor 1 .*what sensor 0 .*off by -1"),
+    (
+        f.WrongPermutation,
+        VALUES,
+        (),
+        r"4 of 12 sensors(?s:.*)sensor 0 .*shows what sensor 2 .*look at `offset` and `to`",
+    ),
+    (f.TwoOnOne, VALUES, (), r"2 of 12 declared sensors: was never seen: sensor 2 .*two channels `to` one"),
+    (f.ForgottenFrame, VALUES, (), r"6 of 12 declared sensors: was never seen: sensor 3 .*a frame.*missing"),
+    (f.HalvesApart, VALUES, (), r"bursts before the rest of its module|not of the same burst"),
+    (
+        f.TakesForeignFrames,
+        "test_foreign_frames_disturb_nothing",
+        (),
+        r"frames of other devices came, \d+ were counted",
+    ),
+    (f.FilledIn, "test_nothing_is_valid_before_the_first_data", (), r"filled in that no frame had told of"),
+    (f.RaisesOnGarbage, "test_garbage_raises_nothing", (), r"raised an exception(?s:.*)there is no such half"),
+    (
+        f.AnyLength,
+        DAMAGE,
+        ("truncated",),
+        r"frames were truncated on the wire: \d+ updates show values that were never",
+    ),
+    (
+        f.MissingModule,
+        "test_the_description_is_valid_complete_and_stable",
+        (),
+        r"declares 6 sensors, the devices have 12",
+    ),
+    (f.SameUids, "test_the_description_is_valid_complete_and_stable", (), r"the description is not valid: .*uid"),
+    (
+        f.ChangesItsMind,
+        "test_the_description_is_valid_complete_and_stable",
+        (),
+        r"says something else when it is asked",
+    ),
+    (f.WrongPeriod, "test_the_rate_is_the_one_it_tells", (), r"`period_s` is 0.04 s, but device 1 sends every 0.02 s"),
+    (f.Sleeps, VALUES, (), r"blocks: .*fingertips.py:\d+, in start, calls time.sleep\(0.01\)"),
+    (f.Hangs, VALUES, (), r"blocks, nothing is read(?s:.*)go_on.wait"),
+    (f.WaitsForEver, "test_devices_that_come_late_are_found", (), r"nothing was published .*the devices sent no frame"),
+    (f.LeaksDescriptors, "test_nothing_leaks", (), r"left behind after .*descriptor \d+ \(/\)"),
+    (f.LeaksThreads, "test_nothing_leaks", (), r"left behind after .*thread 'forgotten'"),
+    (f.LeaksTasks, VALUES, (), r"a task was left running at the end: .*sleep"),
+    (f.LeaksMemory, "test_memory_does_not_grow", (), r"memory grows with the data: \d+ pieces more.*fingertips.py"),
+    (f.TalksWhenItShouldListen, "test_a_listener_sends_nothing", (), r"listen only, and tried to send \d+ frames"),
+    (
+        f.NeverStops,
+        "test_devices_are_silent_again_after_stop",
+        (),
+        r"go on sending .* `stop` does not make them silent",
+    ),
+    (f.IgnoresRestarts, "test_restarted_devices_come_back", (), r"lost its power .*look at `probe` and `revive`"),
+    (f.RaisesOnStop, "test_handshakes_in_any_order", (), r"`stop` raised AttributeError: .*only BusError may be"),
+]
+
+
+class TestFingertips(DriverConformance):
+    """The right driver has no defect."""
+
+    driver = f.Fingertips
+    emulator = f.EmulatedFingertips
+
+
+@pytest.fixture
+def tidy() -> Iterator[None]:
+    """Ends what wrong drivers leave behind."""
+    f.Hangs.go_on.clear()
+    f.LeaksThreads.end.clear()
+    yield
+    f.Hangs.go_on.set()
+    f.LeaksThreads.end.set()
+    while f.LeaksDescriptors.leaked:
+        os.close(f.LeaksDescriptors.leaked.pop())
+    mine = ("forgotten", "driver under test")
+    wait_until(lambda: not any(thread.name in mine for thread in threading.enumerate()))
+
+
+@pytest.mark.usefixtures("tidy")
+@pytest.mark.parametrize(
+    ("driver", "test", "arguments", "words"),
+    [pytest.param(*defect, id=f"{defect[0].__name__}-{defect[1][5:]}") for defect in DEFECTS],
+)
+def test_it_is_found_and_named(driver: type[AnyAdapter], test: str, arguments: tuple[str, ...], words: str) -> None:
+    suite = TestFingertips()
+    suite.driver = driver  # type: ignore[misc, assignment]
+    with pytest.raises(pytest.fail.Exception, match=words):
+        getattr(suite, test)(*arguments)

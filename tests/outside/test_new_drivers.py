@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,13 +20,15 @@ def install(stranger: Stranger, package: Path) -> None:
     stranger.do("pip", "install", "--quiet", "--no-deps", "-e", ".", cwd=package)
 
 
-def check(stranger: Stranger, package: Path, *, tests: int) -> None:
+def check(stranger: Stranger, package: Path, *, at_least: int) -> None:
     """Lint, types and tests of a package."""
     stranger.do("ruff", "check", cwd=package)
     stranger.do("ruff", "format", "--check", cwd=package)
     stranger.do("mypy", cwd=package)
     told = stranger.do("pytest", "-q", "-p", "no:cacheprovider", cwd=package)
-    assert f"\n{tests} passed in " in told, told
+    passed = re.search(r"^(\d+) passed in ", told, re.MULTILINE)
+    assert passed, told
+    assert int(passed[1]) >= at_least
 
 
 def frame_of(stranger: Stranger, driver: str) -> dict[str, list[float]]:
@@ -37,16 +40,16 @@ def frame_of(stranger: Stranger, driver: str) -> dict[str, list[float]]:
     raise AssertionError("no fresh frame")
 
 
-@pytest.mark.parametrize(("transport", "sensors", "tests"), [("can", 16, 21), ("serial", 24, 22), ("virtual", 100, 21)])
+@pytest.mark.parametrize(("transport", "sensors"), [("can", 16), ("serial", 24), ("virtual", 100)])
 def test_a_new_driver_passes_its_tests_and_runs_at_once(
-    stranger: Stranger, transport: str, sensors: int, tests: int, tmp_path: Path
+    stranger: Stranger, transport: str, sensors: int, tmp_path: Path
 ) -> None:
     name = f"new_{transport}"
     told = stranger.do("skin-new", name, "--transport", transport, cwd=tmp_path)
     package = tmp_path / name
     assert f"skin-driver --driver {name} --bus" in told
     install(stranger, package)
-    check(stranger, package, tests=tests)
+    check(stranger, package, at_least=20)
     with stranger.running("skin-driver", "--driver", name, "--bus", "virtual"):
         assert len(frame_of(stranger, name)["values"]) == sensors
 
@@ -75,7 +78,7 @@ def test_the_example_is_a_driver_like_any_other(stranger: Stranger, tmp_path: Pa
     leave = shutil.ignore_patterns("*.egg-info", "__pycache__", ".*_cache")
     shutil.copytree(ROOT / "examples/optoforce", package, ignore=leave)
     install(stranger, package)
-    check(stranger, package, tests=50)
+    check(stranger, package, at_least=50)
     with stranger.running(
         "skin-driver", "--driver", "optoforce", "--bus", "virtual:optoforce?sensors=4", "--model", "four"
     ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from skinware.errors import ConfigurationError, SkinwareError
 from skinware_drivers import new_package
 from skinware_drivers.cli.new import command
 from skinware_drivers.new_package import check_name, make_package
+from tests.commands import BIN
 
 
 @pytest.mark.parametrize(
@@ -75,6 +77,15 @@ def test_nothing_is_left_of_a_package_that_could_not_be_made(tmp_path: Path, mon
         make_package("hand", "can", tmp_path)
     assert len(written) == 5
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("transport", ["can", "serial", "virtual"])
+@pytest.mark.parametrize("name", ["q", "the_longest_of_names"])
+def test_what_is_made_is_clean_whatever_its_name(transport: str, name: str, tmp_path: Path) -> None:
+    make_package(name, transport, tmp_path)
+    for arguments in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
+        done = subprocess.run([BIN / "ruff", *arguments], cwd=tmp_path / name, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
 
 
 def test_every_template_is_used() -> None:

@@ -9,4 +9,5 @@ from tests.outside.stranger import Stranger
 
 @pytest.fixture(scope="session")
 def stranger(tmp_path_factory: pytest.TempPathFactory) -> Stranger:
-    return Stranger(tmp_path_factory.mktemp("stranger"))
+    common = tmp_path_factory.getbasetemp().parent  # of all processes of pytest-xdist
+    return Stranger(tmp_path_factory.mktemp("stranger"), common / "mypy_cache")

@@ -17,7 +17,7 @@ from pathlib import Path
 from tests.commands import BIN
 
 ROOT = Path(__file__).parent.parent.parent
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 
 class Stranger:
@@ -28,12 +28,13 @@ class Stranger:
 
     Args:
         folder: new, for everything.
+        mypy_cache: may be shared with others.
 
     Attributes:
         home: an empty folder to work in.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, mypy_cache: Path) -> None:
         self.home = folder / "home"
         self._bin = folder / "env" / "bin"
         scratch = folder / "tmp"
@@ -55,7 +56,7 @@ class Stranger:
             "PIP_NO_INDEX": "1",
             "PIP_NO_BUILD_ISOLATION": "0",  # means: no isolation
             "PIP_DISABLE_PIP_VERSION_CHECK": "1",
-            "MYPY_CACHE_DIR": str(scratch / "mypy"),
+            "MYPY_CACHE_DIR": str(mypy_cache),
         }
         self._add_commands()
         self.do("pip", "install", "--quiet", "--no-deps", str(built_wheel(folder / "wheel")), cwd=folder)

@@ -65,14 +65,6 @@ def test_a_new_serial_driver_reads_a_port(stranger: Stranger, tmp_path: Path) ->
         assert len(frame_of(stranger, "on_a_port")["values"]) == 24
 
 
-@pytest.mark.parametrize("transport", ["can", "serial", "virtual"])
-@pytest.mark.parametrize("name", ["q", "the_longest_of_names"])
-def test_what_is_made_is_clean_whatever_its_name(stranger: Stranger, transport: str, name: str, tmp_path: Path) -> None:
-    stranger.do("skin-new", name, "--transport", transport, cwd=tmp_path)
-    stranger.do("ruff", "check", cwd=tmp_path / name)
-    stranger.do("ruff", "format", "--check", cwd=tmp_path / name)
-
-
 def test_the_example_is_a_driver_like_any_other(stranger: Stranger, tmp_path: Path) -> None:
     package = tmp_path / "optoforce"
     leave = shutil.ignore_patterns("*.egg-info", "__pycache__", ".*_cache")

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 from tests.conftest import wait_until
 
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 _CLOSE = "<!-- close terminals -->"
 _STEP = re.compile(
     r"^(?:<!-- (?P<how>terminal(?:, once there is \S+)?|fails|(?:edit|write|part of): \S+) -->\n)?"

@@ -60,7 +60,8 @@ class HumanReport:
         if name == "status":
             return
         if name == "ready":
-            text = f"emulating {facts['driver']} on {facts['bus']}; Ctrl-C stops"
+            note = f" ({facts['note']})" if facts.get("note") else ""
+            text = f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
         elif name == "stopped":
             text = "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
         else:
@@ -161,7 +162,8 @@ class Emulation:
         self._open = True
         start_ns = self._clock()
         self._hardware.skip(start_ns)
-        self._report.event("ready", driver=driver, bus=bus_name, options=msgspec.to_builtins(options))
+        facts = {"driver": driver, "bus": bus_name, "note": self._bus.note, "options": msgspec.to_builtins(options)}
+        self._report.event("ready", **facts)
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
         status_ns = start_ns + _STATUS_NS
         try:

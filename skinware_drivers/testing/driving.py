@@ -15,7 +15,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.runner import PublishMode, Runner
-from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.pty import emulated_on_a_pty
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
@@ -178,10 +178,11 @@ def emulated_skin(
     hardware: EmulatedHardware | None = None
     with ExitStack() as running:
         if not bus:
-            require(factory is not None, f"say which emulator {driver} is to run on")
+            if factory is None:
+                defect(f"say which emulator {driver} is to run on")
             if adapter.medium == "serial":
                 bus = running.enter_context(emulated_on_a_pty(factory, **emulator_options))
-        if bus:
+        if bus or factory is None:
             line = make_bus(bus, payload_size=adapter.payload_size)
         else:
             hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))

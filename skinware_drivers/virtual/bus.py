@@ -5,12 +5,13 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Self
 
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
-from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, load_emulator
 from skinware_drivers.virtual.timer import MonotonicTimer, Timer
@@ -66,7 +67,6 @@ class VirtualCanBus(Bus):
         self.hardware = hardware
         self._clock = clock
         self._make_timer = make_timer
-        self._row = struct.Struct(f"=IB3x{payload_size}s" if payload_size <= 64 else f"=II{payload_size}s")
         self._timer: Timer | None = None
         self._pending: list[WireFrame] = []
         self._due_ns: int | None = None
@@ -187,15 +187,13 @@ class VirtualCanBus(Bus):
         if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self.counters.lost += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         frames = self.hardware.emit(now_ns)
-        if self.payload_size < 64:
-            fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
-            self.counters.refused += len(frames) - len(fitting)
-            frames = fitting
-        self._pending += frames
+        fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
+        self.counters.refused += len(frames) - len(fitting)
+        self._pending += fitting
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
         """Write all frames as rows of :func:`skinware_drivers.bus.wire_dtype` at once."""
-        pack = self._row.pack
+        pack = _packer(batch.payload_size)
         rows = b"".join([pack(identifier, len(payload), payload) for _, identifier, payload in frames])
         stop = batch.stop + len(frames)
         batch.wire[batch.stop : stop] = np.frombuffer(rows, batch.wire.dtype)
@@ -223,6 +221,14 @@ class VirtualCanBus(Bus):
         if len(payload) > self.payload_size:
             return f"a payload of {len(payload)} bytes on a bus of {self.payload_size}-byte frames"
         return ""
+
+
+@cache
+def _packer(payload_size: int) -> Callable[[int, int, bytes], bytes]:
+    """Makes a row of a batch of (identifier, length, payload)."""
+    if wire_dtype(payload_size)["length"].itemsize > 1:
+        return struct.Struct(f"=II{payload_size}s").pack
+    return struct.Struct(f"=IB3x{payload_size}s").pack
 
 
 __all__ = ["DEFAULT_EMULATOR", "VirtualCanBus"]

@@ -107,6 +107,8 @@ class Emulator(Stage, Generic[OptionsT]):
         source: the values of every burst, instead of what is felt.
 
     Attributes:
+        medium: what the devices are connected by: ``can`` or ``serial``. On a serial line, what the payloads of frames
+            hold is all that there is: identifiers are 0, and a command is the bytes that the host wrote at once.
         Options: options; becomes those of ``skin-emulate`` and of ``--bus virtual?...``.
         full_scale: greatest value that a device can send.
         lowest: least value that it can send.
@@ -115,6 +117,7 @@ class Emulator(Stage, Generic[OptionsT]):
         devices: by number, once powered up.
     """
 
+    medium: ClassVar[str] = "can"
     Options: ClassVar[type[EmulatorOptions]]
     full_scale: ClassVar[int]
     lowest: ClassVar[int] = 0
@@ -168,6 +171,14 @@ class Emulator(Stage, Generic[OptionsT]):
         """What a device does once it has power; by default it streams, if the options want that."""
         if self.options.streaming:
             self.start(device, now_ns)
+
+    def feel(self, device: Device, time_s: float) -> Sequence[int]:
+        """What the sensors of a device say, at a time since it began to send; by default a finger wanders over them.
+
+        The options ``pattern=idle`` and ``pattern=cycle`` come before this.
+        """
+        felt = self.swing * self._press[device.number].strength(time_s)
+        return [self.rest + round(value) for value in felt.tolist()]
 
     def on_timer(self, device: Device, name: str, time_ns: int) -> None:  # noqa: ARG002
         """What a device does by itself; by default it has one timer, for its data."""
@@ -271,8 +282,8 @@ class Emulator(Stage, Generic[OptionsT]):
         if self.options.pattern == "idle":
             return [self.rest] * self._n_values
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
-        felt = self.swing * self._press[device.number].strength((time_ns - from_ns) * 1e-9)
-        return [min(max(self.rest + round(value), self.lowest), self.full_scale) for value in felt.tolist()]
+        felt = self.feel(device, (time_ns - from_ns) * 1e-9)
+        return [min(max(value, self.lowest), self.full_scale) for value in felt]
 
     def _delay(self, device: Device, time_ns: int) -> int:
         if not self.options.jitter_us:

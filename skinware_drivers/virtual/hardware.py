@@ -73,6 +73,12 @@ class HardwareFactory(Protocol):
         """Make the devices. ``options`` is an instance of ``Options``; ``log`` takes what they do."""
 
 
+def medium_of(emulator: HardwareFactory) -> str:
+    """What the devices are connected by: ``can``, unless the class says otherwise in its attribute ``medium``."""
+    medium: str = getattr(emulator, "medium", "can")
+    return medium
+
+
 def load_emulator(name: str) -> HardwareFactory:
     """The emulator that is registered under ``name``.
 
@@ -89,4 +95,4 @@ def load_emulator(name: str) -> HardwareFactory:
     return loaded
 
 
-__all__ = ["EMULATORS", "EmulatedHardware", "EventLog", "HardwareFactory", "WireFrame", "load_emulator"]
+__all__ = ["EMULATORS", "EmulatedHardware", "EventLog", "HardwareFactory", "WireFrame", "load_emulator", "medium_of"]

@@ -1,0 +1,1 @@
+"""A Skinware driver of OptoForce's optical force sensors."""

@@ -1,0 +1,55 @@
+"""``skin-new``: a package for a driver of one's own, ready to install, to test and to run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, run
+
+_HOW_TO_RUN = {
+    "can": ("skin-driver --driver {name} --bus virtual",),
+    "serial": (
+        "skin-emulate --driver {name} --bus pty:/tmp/{name}",
+        "skin-driver --driver {name} --bus /tmp/{name}       # in another terminal",
+    ),
+    "virtual": ("skin-driver --driver {name} --bus virtual",),
+}
+
+
+@click.command(
+    "skin-new",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-new fingertip --transport can     a driver of a device on a CAN bus",
+        "skin-new forearm --transport serial    of one on a serial line",
+        "skin-new dummy --transport virtual     of values that a program makes, such as a simulator",
+    ),
+)
+@click.argument("name")
+@click.option(
+    "--transport",
+    type=click.Choice(["can", "serial", "virtual"]),
+    required=True,
+    help="What carries the data: a CAN bus, a serial line, or the program itself.",
+)
+def command(name: str, transport: str) -> None:
+    """Make a driver package in the new folder NAME: driver, emulated hardware, tests, and how to install them.
+
+    It works as it is, for a small device that does not exist: put yours in its place, piece by piece.
+    """
+    from skinware_drivers.new_package import check_name, make_package
+
+    check_name(name)
+    made = make_package(name, transport, Path.cwd())
+    steps = [f"cd {name}", "pip install -e '.[test]'", "pytest", *_HOW_TO_RUN[transport]]
+    click.echo(f"{name}/: {len(made)} files; next:")
+    for step in steps:
+        click.echo(f"  {step.format(name=name)}")
+    click.echo(f"then make it the driver of your hardware: {name}/src/{name}/driver.py says where to begin")
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

@@ -1,0 +1,112 @@
+"""Makes driver packages from the templates that come with this package.
+
+A template is the file itself, with ``$name`` (of the driver and the package) and ``$Class`` (of the adapter) in it;
+``$$`` is a dollar sign.
+"""
+
+from __future__ import annotations
+
+import keyword
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint, entry_points
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+from string import Template
+
+from skinware.errors import ConfigurationError, SkinwareError
+from skinware_drivers.registry import DRIVERS
+from skinware_drivers.virtual.hardware import EMULATORS
+
+LONGEST_NAME = 20
+"""Lines of the templates stay short enough with it."""
+
+_COMMON = {
+    "gitignore": ".gitignore",
+    "init.py": "src/$name/__init__.py",
+    "py.typed": "src/$name/py.typed",
+    "pyproject.toml": "pyproject.toml",
+}
+_OF_TRANSPORT = {
+    "README.md": "README.md",
+    "ci.yml": ".github/workflows/ci.yml",
+    "driver.py": "src/$name/driver.py",
+    "emulator.py": "src/$name/emulator.py",
+    "test_driver.py": "tests/test_$name.py",
+}
+"""Template (without its ending) -> file of the package."""
+
+
+def check_name(name: str) -> None:
+    """Hold a name against everything that a driver, a Python package and their users need of it.
+
+    Raises:
+        ConfigurationError: it cannot be; the message says why, and where possible which one could.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        better = re.sub(r"\W+|_+", "_", re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name), flags=re.ASCII).strip("_").lower()
+        hint = f"; how about {better!r}?" if re.fullmatch(r"[a-z][a-z0-9_]*", better) else ""
+        raise ConfigurationError(
+            f"{name!r} cannot name a driver: use lower-case letters, digits and _, beginning with a letter{hint}"
+        )
+    if len(name) > LONGEST_NAME:
+        raise ConfigurationError(f"{name!r} has {len(name)} letters, a driver's name at most {LONGEST_NAME}")
+    if keyword.iskeyword(name):
+        raise ConfigurationError(f"{name!r} is a word of Python and cannot name a package")
+    for group, what in ((DRIVERS, "driver"), (EMULATORS, "emulator")):
+        for taken in _named(entry_points(group=group), name):
+            raise ConfigurationError(f"there is {what} {name!r} already ({taken.value}): choose another name")
+    if name in sys.stdlib_module_names or find_spec(name) is not None:
+        raise ConfigurationError(f"there is a Python package {name!r} already, which yours would hide: choose another")
+
+
+def make_package(name: str, transport: str, where: Path) -> list[Path]:
+    """Make the package in the folder ``where / name``, all of it or nothing.
+
+    Args:
+        name: of the driver, the package and the folder.
+        transport: ``can``, ``serial`` or ``virtual``.
+        where: folder that gets the new one.
+
+    Returns:
+        The files, relative to the new folder.
+
+    Raises:
+        ConfigurationError: the folder is there already.
+        SkinwareError: it cannot be written.
+    """
+    folder = where / name
+    if folder.exists() or folder.is_symlink():
+        raise ConfigurationError(f"{folder} is there already; nothing was changed")
+    words = {"name": name, "Class": "".join(part.capitalize() for part in name.split("_"))}
+    unfinished = where / f".{name}.{os.getpid()}"
+    made = []
+    try:
+        unfinished.mkdir()
+        for source, target in ((part, file) for part in ("common", transport) for file in _files(part).items()):
+            path = Path(Template(target[1]).substitute(words))
+            (unfinished / path).parent.mkdir(parents=True, exist_ok=True)
+            (unfinished / path).write_text(_template(source, target[0]).substitute(words))
+            made.append(path)
+        unfinished.rename(folder)
+    except OSError as error:
+        raise SkinwareError(f"cannot make {folder}: {error.strerror}") from None
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)  # there is none if all went well
+    return made
+
+
+def _files(part: str) -> dict[str, str]:
+    return _COMMON if part == "common" else _OF_TRANSPORT
+
+
+def _template(part: str, name: str) -> Template:
+    return Template((files("skinware_drivers") / "templates" / part / f"{name}.template").read_text())
+
+
+def _named(entries: Iterable[EntryPoint], name: str) -> list[EntryPoint]:
+    return [entry for entry in entries if entry.name == name]

@@ -1,0 +1,16 @@
+"""The adapter of skins whose values a program makes."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from skinware_drivers.adapter import Adapter, OptionsT
+
+
+class VirtualAdapter(Adapter[OptionsT]):
+    """One emulated bus of a driver, ``--bus virtual``; see :class:`skinware_drivers.adapter.Adapter`.
+
+    Nothing is sent over a wire: the payloads of frames can have any length that the layout says.
+    """
+
+    medium: ClassVar[str] = "virtual"

@@ -1,0 +1,104 @@
+"""The bus ``virtual`` of serial devices: an emulated line in the driver's own process, and the choice between the two.
+
+The payloads of the emulator's frames are the bytes on the line, framing and all; their identifier is 0.
+"""
+
+from __future__ import annotations
+
+import time
+
+from skinware_drivers.bus import Bus
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, VirtualCanBus
+from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator, medium_of
+from skinware_drivers.virtual.timer import MonotonicTimer
+
+_LONGEST_BACKLOG_NS = 1_000_000_000
+"""What nobody fetched for longer is lost, as in a kernel's buffer that is full."""
+
+
+class VirtualSerialBus(SerialBus):
+    """Emulated serial devices as a bus. Its name is ``virtual:NAME?key=value``, as that of ``VirtualCanBus``.
+
+    Args:
+        channel: name of the emulator.
+        options: of the emulator, as texts.
+        payload_size: longest body that fits into a batch.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        emulator = load_emulator(channel)
+        self.hardware = emulator(options_from_strings(emulator.Options, options or {}))
+
+    @property
+    def note(self) -> str:
+        """That this is no real hardware."""
+        return f"emulated {self.channel}"
+
+    def _open_port(self) -> Port:
+        return _EmulatedPort(self.hardware)
+
+
+class _EmulatedPort(Port):
+    """The host's end of a line with emulated devices at the other."""
+
+    def __init__(self, hardware: EmulatedHardware) -> None:
+        self._hardware = hardware
+        self._timer = MonotonicTimer()
+        self._bytes = b""
+        hardware.skip(time.monotonic_ns())
+        self._wake_when_due()
+
+    def fileno(self) -> int:
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:
+        now_ns = time.monotonic_ns()
+        due_ns = self._hardware.next_due_ns()
+        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        self._bytes += b"".join(frame.payload for frame in self._hardware.emit(now_ns))
+        data, self._bytes = self._bytes[:size], self._bytes[size:]
+        self._wake_when_due()
+        return data
+
+    def write(self, data: bytes) -> int:
+        self._hardware.receive(0, data, time.monotonic_ns())
+        self._wake_when_due()
+        return len(data)
+
+    def close(self) -> None:
+        self._timer.close()
+
+    def _wake_when_due(self) -> None:
+        self._timer.wake_at(0 if self._bytes else self._hardware.next_due_ns())
+
+
+def virtual_bus(
+    channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+) -> Bus:
+    """The bus ``virtual``: CAN or a serial line, as the devices need it.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+    is_serial = medium_of(load_emulator(channel or DEFAULT_EMULATOR)) == "serial"
+    bus = VirtualSerialBus if is_serial else VirtualCanBus
+    return bus(channel, options, payload_size=payload_size, listen_only=listen_only)
+
+
+__all__ = ["VirtualSerialBus", "virtual_bus"]

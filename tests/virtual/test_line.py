@@ -1,0 +1,96 @@
+"""The bus ``virtual`` of serial devices, and of programs that make values."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from skinware.errors import BusSendError, ConfigurationError
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.serial.packets import Packet
+from skinware_drivers.virtual import line
+from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from tests.conftest import wait_until
+
+
+class Strip(Emulator[EmulatorOptions]):
+    """Two bytes behind AA, as soon as it gets a question mark; its values are its own."""
+
+    medium = "serial"
+    Options: ClassVar[type[EmulatorOptions]] = EmulatorOptions
+    full_scale = 200
+    swing = 100
+    numbers = (0,)
+    identifiers = frozenset((0,))
+    period_s = 0.002
+
+    def places(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        return on_a_grid(2, columns=2)
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
+        if payload == b"?":
+            self.start(device, now_ns)
+        return payload == b"?"
+
+    def feel(self, device: Device, time_s: float) -> Sequence[int]:
+        return [7, 1000]
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        return [(0, bytes([0xAA, *values]))]
+
+
+class Long(Strip):
+    """A frame of 100 numbers on no wire at all."""
+
+    medium = "virtual"
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        return [(5, struct.pack("<100f", *range(100)))]
+
+
+def received(bus: line.VirtualSerialBus | VirtualCanBus, payload_size: int) -> list[tuple[int, bytes]]:
+    batch = FrameBatch(100, payload_size)
+    wait_until(lambda: bus.receive(batch, 0) > 0)
+    return [(int(row["identifier"]), row["payload"][: row["length"]].tobytes()) for row in batch.wire[: batch.stop]]
+
+
+def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
+    bus = line.virtual_bus("strip", {"seed": "1"}, payload_size=8)
+    assert isinstance(bus, line.VirtualSerialBus)
+    bus.use(Packet(sync=(0xAA,), length=3), Packet(length=1, sync=(ord("?"),)))
+    assert bus.note == "emulated strip"
+    bus.open()
+    try:
+        bus.send(0, b"")
+        assert set(received(bus, 8)) == {(0, bytes([7, 200]))}  # what is felt ends at the full scale
+    finally:
+        bus.close()
+    with pytest.raises(BusSendError, match="not open"):
+        bus.send(0, b"")
+
+
+def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
+    with pytest.raises(ConfigurationError, match="unknown option 'sed'; did you mean 'seed'"):
+        line.virtual_bus("strip", {"sed": "1"})
+
+
+def test_frames_of_a_program_have_any_length() -> None:
+    bus = VirtualCanBus.with_hardware(Long(EmulatorOptions(streaming=True)), payload_size=400)
+    bus.open()
+    try:
+        first = received(bus, 400)[0]
+    finally:
+        bus.close()
+    assert first == (5, np.arange(100, dtype="<f4").tobytes())
+
+
+def test_devices_of_can_are_on_can() -> None:
+    assert isinstance(line.virtual_bus("xela"), VirtualCanBus)
+    assert isinstance(line.virtual_bus(""), VirtualCanBus)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -12,12 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
+from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import Bus, Filter, FrameBatch
 from skinware_drivers.filters import fewest, filters_of
 from skinware_drivers.layout import Layout
 
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05
 _SEND_TIMEOUT_S = 0.5
+_LATE_NS = 5 * NS_PER_S
 DEFAULT_PACE_PER_MS = 4.0
 """Half of what a CAN bus of 1 Mbit/s can carry: the devices' own frames need the other half."""
 AT_ONCE = 8
@@ -69,6 +71,7 @@ class Link:
         self._free_at_s = 0.0
         self._wanted: Sequence[Filter] | None = None
         self._waiters: list[tuple[tuple[Match, ...], asyncio.Queue[Reply]]] = []
+        self._late: deque[tuple[int, tuple[Match, ...]]] = deque()  # until when their answers are no strangers
         self._heard: Counter[Heard] | None = None
 
     @property
@@ -125,7 +128,7 @@ class Link:
         self._bus.narrow(fewest([*self._wanted, *awaited]))
 
     @contextmanager
-    def _waiting(self, matches: tuple[Match, ...]) -> Iterator[asyncio.Queue[Reply]]:
+    def _waiting(self, matches: tuple[Match, ...], *, may_be_late: bool = False) -> Iterator[asyncio.Queue[Reply]]:
         queue: asyncio.Queue[Reply] = asyncio.Queue()
         entry = (matches, queue)
         self._waiters.append(entry)
@@ -134,6 +137,8 @@ class Link:
             yield queue
         finally:
             self._waiters.remove(entry)
+            if may_be_late:
+                self._late.append((now_ns() + _LATE_NS, matches))
             self._tell_bus()
 
     async def request(self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float) -> Reply:
@@ -143,7 +148,7 @@ class Link:
             HandshakeTimeout: no answer in time.
             BusSendError: as ``send``.
         """
-        with self._waiting((reply,)) as queue:
+        with self._waiting((reply,), may_be_late=True) as queue:
             await self.send(identifier, payload)
             try:
                 async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
@@ -158,7 +163,7 @@ class Link:
         Raises:
             BusSendError: as ``send``.
         """
-        with self._waiting((reply,)) as queue:
+        with self._waiting((reply,), may_be_late=True) as queue:
             await self.send(identifier, payload)
             await asyncio.sleep(duration_s)
         return [queue.get_nowait() for _ in range(queue.qsize())]
@@ -186,8 +191,13 @@ class Link:
         await asyncio.sleep(duration_s)
 
     def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for."""
-        if not len(rows) or (not self._waiters and self._heard is None):
+        """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for.
+
+        An answer that comes too late, after its question was given up, is still none of a stranger.
+        """
+        while self._late and self._late[0][0] < now_ns():
+            self._late.popleft()
+        if not len(rows) or not (self._waiters or self._late or self._heard is not None):
             return rows
         expected = np.zeros(len(rows), bool)
         identifier = batch.wire["identifier"][rows]
@@ -196,7 +206,9 @@ class Link:
             self._heard.update(
                 Heard(*row) for row in zip(identifier.tolist(), first.tolist(), length.tolist(), strict=True)
             )
-        for matches, queue in self._waiters:
+        waiting: list[tuple[tuple[Match, ...], asyncio.Queue[Reply] | None]] = [*self._waiters]
+        waiting += [(matches, None) for _, matches in self._late]
+        for matches, queue in waiting:
             for number in np.flatnonzero(_any_match(matches, identifier)).tolist():
                 row = rows[number]
                 wire = batch.wire[row]
@@ -204,7 +216,8 @@ class Link:
                 reply = Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload)
                 if any(match.fits(reply) for match in matches):
                     expected[number] = True
-                    queue.put_nowait(reply)
+                    if queue is not None:
+                        queue.put_nowait(reply)
         return rows[~expected]
 
 

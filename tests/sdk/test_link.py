@@ -7,7 +7,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from skinware.errors import BusSendError
+from skinware.errors import BusSendError, HandshakeTimeout
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.link import AT_ONCE, Link, Match, Reply
 
@@ -16,7 +16,7 @@ class Nowhere:
     """A bus that takes everything."""
 
     listen_only = False
-    channel = "nowhere"
+    name = "bus nowhere"
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Gone."""
@@ -61,6 +61,18 @@ def test_who_follows_hears_everything_that_matches_in_order_until_it_stops() -> 
             found = [heard.get_nowait() for _ in range(heard.qsize())]
             assert found == [Reply(7, *frames[0]), Reply(7, *frames[2]), Reply(7, *frames[4])]
         assert offer(link, (0x705, b"\x05")) == [0]
+
+    asyncio.run(scenario())
+
+
+def test_an_answer_that_comes_too_late_is_no_stranger() -> None:
+    async def scenario() -> None:
+        link = Link(Nowhere())  # type: ignore[arg-type]
+        with pytest.raises(HandshakeTimeout):
+            await link.request(0x207, b"\x1c", Match(0x270, prefix=b"\x1c"), timeout_s=0)
+        assert offer(link, (0x270, b"\x1c"), (0x270, b"\x1d"), (0x280, b"\x1c")) == [1, 2]
+        assert await link.collect(0x70F, b"\xff", Match(0x700, mask=0x70F), duration_s=0) == []
+        assert offer(link, (0x7E0, b"\xff")) == []
 
     asyncio.run(scenario())
 

@@ -102,6 +102,7 @@ class Publisher:
         self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
         self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
         self._due_ns = 0
+        self._not_before_ns = 0  # a burst that has begun holds up the frame until then
         self._last_published_ns = now_ns()
         self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
@@ -120,7 +121,7 @@ class Publisher:
         if not self._by_cycle:
             return self._last_published_ns + self._period_ns
         idle_ns = self._last_published_ns + max(_IDLE_NS, 2 * self._period_ns)
-        return min(self._due_ns, idle_ns) if self._due_ns else idle_ns
+        return max(self._not_before_ns, min(self._due_ns, idle_ns) if self._due_ns else idle_ns)
 
     def take(self, updates: Updates) -> None:
         """Show updates, publishing as often as needed for none to be overwritten unseen."""
@@ -147,7 +148,7 @@ class Publisher:
             living = self._living(time_ns)
             open_patches = self._bursts.in_the_middle(living, time_ns)
             if open_patches.any():
-                self._due_ns = self._bursts.pause_ends_ns(open_patches)
+                self._due_ns = self._not_before_ns = self._bursts.pause_ends_ns(open_patches)
                 return
             self.publish()
             self._bursts.take(None, living, self.publish)
@@ -161,7 +162,7 @@ class Publisher:
         if self._wanted(time_ns):
             self._write(time_ns)
         state.begin_frame()
-        self._due_ns = 0
+        self._due_ns = self._not_before_ns = 0
         self._last_published_ns = time_ns
 
     def _wanted(self, time_ns: int) -> bool:

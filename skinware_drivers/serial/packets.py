@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -68,7 +69,8 @@ class Packet(Framing):
         header: bytes before the body; default: up to the last of sync, length, identifier and checksum in front.
         confirmed: a frame that does not follow another one at once counts only if the next one begins right behind
             it (and, with a trailer, ends as it should). For devices without a checksum; costs one frame of delay
-            after every fault.
+            after every fault. ``"each"``: every frame is confirmed so, always; for devices whose frames have so little
+            that can be checked that a shortened one passes together with the beginning of the next.
 
     Raises:
         ConfigurationError: what it says cannot be.
@@ -84,7 +86,7 @@ class Packet(Framing):
     trailer: Pattern = ()
     identifier: Field | None = None
     header: int | None = None
-    confirmed: bool = False
+    confirmed: bool | Literal["each"] = False
     maximum_body: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -221,6 +223,7 @@ class PacketFramer(Framer):
         self._checksum_at = framing.checksum_place(0)  # from the end, if negative
         self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end
         self._padding = bytes(max(64, 2 * framing.longest))
+        self._confirms_each = framing.confirmed == "each"
         self._follows_at = -1  # place in the stream at which a frame would follow the last one at once
 
     # One by one
@@ -250,7 +253,7 @@ class PacketFramer(Framer):
             if size - place < self._known_from or place == size:
                 return place
             total, is_bare = self._total(stream, place)
-            follows = not self._look_ahead or self._before + place == self._follows_at
+            follows = not self._look_ahead or (not self._confirms_each and self._before + place == self._follows_at)
             if total:
                 if size - place < total:
                     self._wanted = total
@@ -372,7 +375,7 @@ class PacketFramer(Framer):
         follower = np.searchsorted(at, at + total).tolist()
         states, place_of = state.data, at.tolist()
         is_followed = self._are_followed(data, at, total, stop)
-        follows_at = self._follows_at - self._before + begin
+        follows_at = -1 if self._confirms_each else self._follows_at - self._before + begin
         taken: list[int] = []
         number, end = 0, begin
         while number < len(place_of):
@@ -393,7 +396,8 @@ class PacketFramer(Framer):
                     verdict = _REFUSED
             if verdict == _GOOD:
                 taken.append(number)
-                end = follows_at = place_of[number] + int(total[number])
+                end = place_of[number] + int(total[number])
+                follows_at = -1 if self._confirms_each else end
                 number = follower[number]
                 self._follows_at = self._before + end - begin
                 continue

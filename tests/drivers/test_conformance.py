@@ -15,8 +15,12 @@ from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
+from skinware_drivers.serial.skintalk import SkintalkDriver
+from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
@@ -24,6 +28,8 @@ from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.skintalk import EmulatedSkintalk
+from skinware_drivers.virtual.tactile_glove import EmulatedTactileGlove
 from skinware_drivers.virtual.xela import EmulatedXela
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 
@@ -127,6 +133,23 @@ class TestFdPatch(DriverConformance):
 
     driver = FdPatchDriver
     emulator = EmulatedFdPatch
+
+
+class TestAnySkin(DriverConformance):
+    driver = AnySkinDriver
+    emulator = EmulatedAnySkin
+
+
+class TestTactileGlove(DriverConformance):
+    driver = TactileGloveDriver
+    emulator = EmulatedTactileGlove
+
+
+class TestSkintalk(DriverConformance):
+    driver = SkintalkDriver
+    emulator = EmulatedSkintalk
+    driver_options: ClassVar[Mapping[str, Any]] = {"patches": (1, 4), "cells": 12}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"patches": (1, 4), "cells": 12}
 
 
 def test_every_driver_that_ships_is_here() -> None:

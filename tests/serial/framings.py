@@ -126,6 +126,13 @@ EXAMPLES: dict[str, Example] = {
         range(0x3C, 0x7C),
     ),
     "octocan": Example(Packet(sync=b"\x55", length=5, confirmed=True, identifier=Field(1)), range(0, 256, 3)),
+    "octocan_each": Example(Packet(sync=b"\x55", length=5, confirmed="each", identifier=Field(1)), range(0, 256, 3)),
+    "glove_each": Example(
+        Packet(
+            sync=(range(0x3C, 0x7C), 0x01), length=5, trailer=b"\0", identifier=Field(0), header=2, confirmed="each"
+        ),
+        range(0x3C, 0x7C),
+    ),
     "anyskin": Example(Packet(length=82, trailer=b"\r\n", confirmed=True)),
     "fixed_crc32": Example(Packet(sync=b"\xa5\x5a", length=40, checksum=CRC32)),
     "no_sync": Example(Packet(length=12, checksum=CRC16_MODBUS)),

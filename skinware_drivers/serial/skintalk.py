@@ -1,0 +1,112 @@
+"""Skin patches that are read with skintalk (Octocan): 24-bit cells, a record for each.
+
+Wire format: ``skintalk.c`` and ``serialcfg.sh`` of skinvis (github.com/t173/skinvis). 2,000,000 baud. The byte '1'
+starts all patches, '0' stops them; neither is answered. A record has five bytes: 55, patch << 4 | cell, and the value
+as a big-endian signed number of 24 bits. Patches are numbered from 1 on, cells from 0 on.
+
+There is no checksum and no counter. As in skintalk, a record counts only if the next one's 55 comes right behind it; so
+the last record before a pause waits for the next one. With two bytes that can be checked, noise can look like a record.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Bits, Expand, Frame, Layout, Packed, Values
+from skinware_drivers.link import Link
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.packets import Packet
+
+_START, _STOP = b"1", b"0"
+_Bytes = npt.NDArray[np.uint8]
+
+
+class SkintalkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    patches: Annotated[tuple[int, ...], msgspec.Meta(description="numbers of the patches, 0-15")] = (
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+        7,
+        8,
+    )
+    cells: Annotated[int, msgspec.Meta(description="cells of each patch", ge=1, le=16)] = 16
+    negative: Annotated[
+        Literal["twos_complement", "off_by_one"],
+        msgspec.Meta(description="negative values: two's complement, or one more, as older skintalk shows them"),
+    ] = "twos_complement"
+    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two records of a cell, ms", ge=1)] = 20
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if not self.patches or len(set(self.patches)) < len(self.patches) or not set(self.patches) <= set(range(16)):
+            raise ConfigurationError(f"patches {self.patches}: give different numbers of 0 to 15")
+
+
+class SkintalkDriver(SerialAdapter[SkintalkOptions]):
+    """All patches of a serial line. Each cell has records of its own and so is a module: it is stale for itself.
+
+    uid = patch << 4 | cell. Records of patches or cells that the options do not name are counted as unknown.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]] = SkintalkOptions
+    types = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
+    dtype = np.int32
+    baudrate = 2_000_000
+    framing = Packet(sync=b"\x55", length=5, identifier=Field(1), confirmed="each")
+    commands = Unframed()
+
+    def __init__(self, options: SkintalkOptions) -> None:
+        super().__init__(options)
+        exact = Values(0, Packed(24, signed=True), 1)
+        values = exact if options.negative == "twos_complement" else Expand(_off_by_one)
+        self.layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
+        self.patches = tuple(
+            Patch(
+                f"patch {number}",
+                [Module(taxels(1, first_uid=number << 4 | i), key=i, kind="cell") for i in range(options.cells)],
+                key=number,
+            )
+            for number in options.patches
+        )
+
+    @property
+    def period_s(self) -> float:
+        """As the options say."""
+        return self.options.period_ms / 1e3
+
+    async def start(self, link: Link) -> None:
+        """Start all patches."""
+        await link.send(0, _START)
+
+    async def stop(self, link: Link) -> None:
+        """Stop all patches."""
+        await link.send(0, _STOP)
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Start all patches again: there is no question that one would answer, but it may have lost its power."""
+        await link.send(0, _START)
+        return False
+
+
+def _off_by_one(
+    payload: _Bytes, length: _Bytes
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]:
+    """Values as they are if a negative one is taken for minus its inverted bits: FF FF FF is 0."""
+    row = np.arange(len(length))
+    high, middle, low = payload[:, :3].astype(np.int32).T
+    value = (high << 16 | middle << 8 | low) - ((high >> 7) << 24)
+    return row, np.zeros_like(row), value + (value < 0)

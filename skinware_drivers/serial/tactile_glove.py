@@ -1,0 +1,67 @@
+"""The tactile glove of Bielefeld University (TactileGlove, iObject), as its first firmware speaks on a serial line.
+
+Wire format: what the maker's host reads (tactile-filters, ``linux/libio/SerialInput.cpp``). 115200 baud. One packet of
+five bytes for each taxel: ``3C + taxel``, 01, high byte, low byte, 00. The value has twelve bits, the lower four bits
+of the high byte first; what the upper four say is not known. The maker's host shows 4095 - value: pressure lowers it.
+
+There is no checksum, no counter and no command. A packet counts if it has its first, second and last byte, and if
+what follows it is one, too: a packet that lost bytes could otherwise pass with the beginning of the next.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import msgspec
+import numpy as np
+
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Bits, Frame, Layout, Packed, Values
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.packets import Packet
+
+_FIRST = 0x3C
+_MOST = 64
+
+
+class TactileGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    taxels: Annotated[int, msgspec.Meta(description="taxels that there are, numbers 0 on", ge=1, le=_MOST)] = _MOST
+    period_ms: Annotated[int, msgspec.Meta(description="nominal time between two packets of a taxel, ms", ge=1)] = 30
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
+    """One glove on a serial line. Each taxel has packets of its own and so is a module: it is stale for itself.
+
+    Values are those of the wire (0 is the greatest pressure); ``physical`` is 4095 - value, as the maker shows it.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]] = TactileGloveOptions
+    types = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
+    dtype = np.uint16
+    framing = Packet(
+        sync=(range(_FIRST, _FIRST + _MOST), 0x01),
+        length=5,
+        trailer=b"\0",
+        identifier=Field(0),
+        header=2,
+        confirmed="each",
+    )
+    layout = Layout((Frame("taxel", (), (2,), Values(0, Packed(12, skip=4), 1), module=Bits(0, 8)),))
+
+    def __init__(self, options: TactileGloveOptions) -> None:
+        super().__init__(options)
+        modules = [Module(taxels(1, first_uid=i), key=_FIRST + i, kind="taxel") for i in range(options.taxels)]
+        self.patches = (Patch("glove", modules),)
+
+    @property
+    def period_s(self) -> float:
+        """As the options say."""
+        return self.options.period_ms / 1e3

@@ -16,6 +16,7 @@ from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
+from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
@@ -24,6 +25,7 @@ from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.xela import EmulatedXela
 
 
@@ -119,6 +121,11 @@ class TestRoboskinMtb3(DriverConformance):
 class TestOpenPatch(DriverConformance):
     driver = OpenPatchDriver
     emulator = EmulatedOpenPatch
+
+
+class TestWeissWts(DriverConformance):
+    driver = WeissWtsDriver
+    emulator = EmulatedWeissWts
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -17,6 +17,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
+from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
@@ -26,6 +27,7 @@ from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
+from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.xela import EmulatedXela
 
 
@@ -126,6 +128,14 @@ class TestOpenPatch(DriverConformance):
 class TestWeissWts(DriverConformance):
     driver = WeissWtsDriver
     emulator = EmulatedWeissWts
+
+
+class TestWujiGlove(DriverConformance):
+    driver = WujiGloveDriver
+    emulator = EmulatedWujiGlove
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        return [value / 4096 for value in felt]
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -25,6 +25,7 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
+from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
@@ -105,6 +106,11 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     )
     dtype = np.uint16
 
+    def __init__(self, options: WeissWtsOptions) -> None:
+        super().__init__(options)
+        self._matrix = b""
+        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
+
     @property
     def period_s(self) -> float:
         """As the sensor is told, s."""
@@ -133,7 +139,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
         log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
         self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
-        self.layout = self._layout(count)
+        self.layout, self._matrix = self._layout(count), answer
         return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{columns}x{rows}")])]
 
     async def start(self, link: Link) -> None:
@@ -147,11 +153,18 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         except Refused as error:
             log.debug("%s: %s", link.bus_name, error)
 
-    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Whether it answers: then it was reset, and does not send by itself any more."""
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:  # noqa: ARG002
+        """Only remembers whom to tell: the sensor says nothing of itself."""
+        self._tell = tell
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
         try:
-            await self._ask(link, _MATRIX, tries=1)
+            matrix = await self._ask(link, _MATRIX, tries=1)
         except HandshakeTimeout:
+            return False
+        if matrix != self._matrix:
+            self._tell(patch, Notice.CHANGED)
             return False
         return True
 

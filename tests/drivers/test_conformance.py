@@ -15,10 +15,12 @@ from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.agni import EmulatedAgni
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
@@ -136,6 +138,11 @@ class TestWujiGlove(DriverConformance):
 
     def shown(self, felt: Sequence[int]) -> Sequence[Any]:
         return [value / 4096 for value in felt]
+
+
+class TestAgni(DriverConformance):
+    driver = AgniDriver
+    emulator = EmulatedAgni
 
 
 def test_every_driver_that_ships_is_here() -> None:

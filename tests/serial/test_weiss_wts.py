@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverReader, PatchState
+from skinware import DriverFrame, DriverReader, PatchState
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
@@ -73,9 +73,15 @@ def test_a_sensor_that_streams_already_and_its_operations() -> None:
         assert len(set(frame.values.tolist())) == 1
         assert reader.call("temperature") == {"bus0": 25.3}
         assert reader.call("system") == {"bus0": "04 01 00 10 2a 00"}
-        before = int(frame.values[0])
+        frame = read_until(reader, lambda f: int(f.values[0]) > 20)
+
+        def behind_ns(later: DriverFrame) -> int:
+            """How much less the values have grown than they do without tare: by one in each 10 ms."""
+            grown = int(later.values[0]) - int(frame.values[0])
+            return int(later.module_time_ns[0] - frame.module_time_ns[0]) - 10 * MS * grown
+
         reader.call("tare")
-        read_until(reader, lambda f: int(f.values[0]) < before)
+        read_until(reader, lambda f: behind_ns(f) > 100 * MS)
 
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:

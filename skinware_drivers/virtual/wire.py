@@ -84,9 +84,11 @@ class Wire:
     Attributes:
         transmitters: all devices.
         heard: frames that went over the wire and were not taken away yet, oldest first.
+        speed: in Mbit/s.
     """
 
     def __init__(self) -> None:
+        self.speed = 1
         self.transmitters: list[Transmitter] = []
         self.heard: list[WireFrame] = []
         self._free_ns = 0
@@ -133,7 +135,7 @@ class Wire:
             while (not starts or end_ns < until_ns) and len(starts) < len(transmission):
                 at = first + len(starts)
                 starts.append(end_ns)
-                end_ns += frame_time_ns(identifiers[at], len(payloads[at]))
+                end_ns += frame_time_ns(identifiers[at], len(payloads[at])) // self.speed
         self._free_ns = end_ns
         transmission.sent = last = first + len(starts)
         frames = list(map(_wire_frame, zip(starts, identifiers[first:last], payloads[first:last], strict=True)))

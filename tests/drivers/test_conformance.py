@@ -15,11 +15,15 @@ from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
+from skinware_drivers.serial.weiss_wts import WeissWtsDriver
+from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.agni import EmulatedAgni
 from skinware_drivers.virtual.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.barrett import EmulatedBarrett
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
@@ -30,6 +34,8 @@ from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions
 from skinware_drivers.virtual.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.tactile_glove import EmulatedTactileGlove
+from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
+from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.xela import EmulatedXela
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 
@@ -150,6 +156,24 @@ class TestSkintalk(DriverConformance):
     emulator = EmulatedSkintalk
     driver_options: ClassVar[Mapping[str, Any]] = {"patches": (1, 4), "cells": 12}
     emulator_options: ClassVar[Mapping[str, Any]] = {"patches": (1, 4), "cells": 12}
+
+
+class TestWeissWts(DriverConformance):
+    driver = WeissWtsDriver
+    emulator = EmulatedWeissWts
+
+
+class TestWujiGlove(DriverConformance):
+    driver = WujiGloveDriver
+    emulator = EmulatedWujiGlove
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        return [value / 4096 for value in felt]
+
+
+class TestAgni(DriverConformance):
+    driver = AgniDriver
+    emulator = EmulatedAgni
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -1,0 +1,226 @@
+"""Devices that speak the AGNI serial protocol (Bielefeld University): they say themselves which sensors they have.
+
+Wire format: agni_serial_protocol, ``serial_protocol_defines.h`` and ``serial_protocol.cpp`` (BSD). All messages:
+``F0 C4 | id | ... | exclusive or of all bytes before``.
+
+* Commands to the device (id 0): number, and for C0 (configuration), F1 (start), 00 (stop), F0 (alive?) nothing more;
+  for D0 (period): count u16 LE, then sensor u8 and period u16 LE for each. Only C0 and F0 are answered.
+* Configuration (id 0): version 01, device u8, count n, n descriptors: type u16, payload length u16. Little-endian in
+  the newer program, big-endian in an older one: option ``descriptors``. Sensor k of them (from 1) sends under id k.
+* Data (id 1 to C9): time u32, payload. Their length is known only from the configuration.
+* Alive (id F0): nothing more. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; other lengths of
+  errors are not public [INF], those are skipped as noise.
+
+What the values of a sensor type are stands in files of that program, not on the wire: the option ``values`` says it for
+all sensors of a line. The unit of the time [INF: option ``time_unit_us``] and of the period [INF: ms] are not public.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from skinware.errors import BusError, HandshakeTimeout
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.adapter import Notice
+from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import XOR
+from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.packets import LengthTable, Packet
+
+log = logging.getLogger("skinware.driver")
+
+_BEGIN = b"\xf0\xc4"
+_CONFIGURATION, _START, _STOP, _PERIOD, _ALIVE, _ERROR = 0xC0, 0xF1, 0x00, 0xD0, 0xF0, 0xFE
+_MOST_SENSORS = 0xC9
+_MOST_BYTES = 4096  # of a sensor's payload
+_TIME = 4
+_TIMEOUT_S, _TRIES = 0.5, 3
+_ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unknown sensor"}
+
+
+class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    period_ms: Annotated[
+        int, Meta(ge=0, le=0xFFFF, description="time between two messages; 0: as the device has it")
+    ] = 0
+    usual_period_ms: Annotated[int, Meta(ge=1, description="what that is, if period_ms is 0")] = 10
+    descriptors: Annotated[Literal["little", "big"], Meta(description="byte order of the sensor descriptors")] = (
+        "little"
+    )
+    values: Annotated[
+        Literal["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<f4"], Meta(description="numpy dtype of the values")
+    ] = "<u2"
+    time_unit_us: Annotated[float, Meta(ge=0, description="of the devices' time; 0: use the time of receipt")] = 0.0
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+def command(number: int, arguments: bytes = b"") -> bytes:
+    """A command to the device as it is sent."""
+    sent = _BEGIN + bytes((0, number)) + arguments
+    return sent + XOR.to_bytes(sent)
+
+
+def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEGIN), header: int = 3) -> Packet:
+    table = LengthTable(at, totals)
+    return Packet(sync=sync, length=table, checksum=XOR, identifier=Field(2), header=header)
+
+
+class AgniDriver(SerialAdapter[AgniOptions]):
+    """One device on a serial line."""
+
+    Options = AgniOptions
+    framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
+    commands = Unframed(1024)
+
+    def __init__(self, options: AgniOptions) -> None:
+        super().__init__(options)
+        self._period_ms = options.period_ms
+        self._configuration = b""
+        self._patch: Patch | None = None
+        self._n_sensors = 0
+        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
+        self.types = [PRESSURE.measured(unit="counts")]
+        self.dtype = np.dtype(options.values).newbyteorder("=")
+
+    @property
+    def period_s(self) -> float:
+        """Time between two messages of a sensor, s."""
+        return (self._period_ms or self.options.usual_period_ms) / 1e3
+
+    @property
+    def payload_size(self) -> int:
+        """Of the longest message that any device may describe."""
+        return _MOST_BYTES + 8
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the device what it has; it may still be sending for somebody before us.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a device says how long its messages are only when it is asked: listening cannot find out")
+        if self._patch is not None:
+            self.change_framing(type(self).framing)
+        await self.stop(link)
+        configuration = await self._ask(link)
+        version, device, n_sensors = configuration[:3]
+        if version != 1 or len(configuration) != 3 + 4 * n_sensors:
+            raise BusError(f"the device speaks version {version} of the protocol, this driver version 1")
+        order = "<" if self.options.descriptors == "little" else ">"
+        sensors = list(struct.iter_unpack(f"{order}HH", configuration[3:]))
+        size = np.dtype(self.options.values).itemsize
+        for number, (kind, length) in enumerate(sensors, 1):
+            if not 0 < length <= _MOST_BYTES or length % size:
+                raise BusError(
+                    f"sensor {number} of type {kind} has {length} bytes: no whole number of values"
+                    f" {self.options.values!r} up to {_MOST_BYTES} bytes; look at the options values and descriptors"
+                )
+        modules, frames, first_uid = [], [], 0
+        time = DeviceTime(0, "<u4", self.options.time_unit_us / 1e6) if self.options.time_unit_us else None
+        for number, (kind, length) in enumerate(sensors, 1):
+            count = length // size
+            modules.append(Module([Sensor("pressure", first_uid + n) for n in range(count)], number, f"type {kind}"))
+            values = Values(_TIME, self.options.values, count)
+            frames.append(
+                Frame(f"sensor {number}", [Identifier(number)], [_TIME + length], values, module=number, time=time)
+            )
+            first_uid += count
+        log.info("%s: device %d with %d sensors", link.bus_name, device, n_sensors)
+        self.layout = Layout(frames)
+        totals = {number: 3 + _TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
+        self.change_framing(_framing({**totals, 0: 7 + 4 * n_sensors, _ALIVE: 4, _ERROR: 5}, 2))
+        self._configuration, self._n_sensors = configuration, n_sensors
+        self._patch = Patch(f"device {device}", modules)
+        return [self._patch]
+
+    async def configure(self, link: Link) -> None:
+        """Set the period of all sensors, if the options want one."""
+        if self._period_ms:
+            each = b"".join(struct.pack("<BH", sensor, self._period_ms) for sensor in range(1, self._n_sensors + 1))
+            await link.send(0, command(_PERIOD, struct.pack("<H", self._n_sensors) + each))
+
+    async def start(self, link: Link) -> None:
+        """Have all sensors send; no answer tells whether they will."""
+        await link.send(0, command(_START))
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent."""
+        await link.send(0, command(_STOP))
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
+        described = self.framing
+        self.change_framing(type(self).framing)
+        try:
+            configuration = await self._ask(link, tries=1)
+        except HandshakeTimeout:
+            return False
+        finally:
+            self.change_framing(described)
+        if configuration != self._configuration:
+            self._tell(patch, Notice.CHANGED)
+            return False
+        return True
+
+    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
+        """Set it up and start it again."""
+        await self.configure(link)
+        await self.start(link)
+
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        """Say which errors it reports."""
+        self._tell = tell
+        with link.follow(Match(_ERROR)) as heard:
+            while True:
+                error = (await heard.get()).payload[0]
+                log.warning("%s: the device received %s", link.bus_name, _ERRORS.get(error, f"error {error:#04x}"))
+
+    @operation()
+    async def period(self, link: Link, patches: Sequence[Patch], ms: int) -> None:  # noqa: ARG002
+        """Set the time between two messages of every sensor; the device does not say whether it can."""
+        if not 1 <= ms <= 0xFFFF:
+            raise ValueError(f"{ms} ms: give 1 to 65535")
+        self._period_ms = ms
+        await self.configure(link)
+
+    @operation(looks=True)
+    async def alive(self, link: Link, patches: Sequence[Patch]) -> bool:  # noqa: ARG002
+        """Whether the device answers."""
+        try:
+            await link.request(0, command(_ALIVE), Match(_ALIVE), timeout_s=_TIMEOUT_S)
+        except HandshakeTimeout:
+            return False
+        return True
+
+    async def _ask(self, link: Link, tries: int = _TRIES) -> bytes:
+        """The configuration.
+
+        Raises:
+            HandshakeTimeout: no answer.
+        """
+        for _ in range(tries - 1):
+            try:
+                return await self._ask(link, 1)
+            except HandshakeTimeout:
+                continue
+        return (await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S)).payload

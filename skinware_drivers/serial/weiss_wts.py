@@ -1,0 +1,233 @@
+"""Weiss Robotics' WTS tactile sensors, which say themselves how many cells they have.
+
+Wire format: the programs wts_driver (github.com/ksatyaki/wts_driver) and wts_ft; where they contradict each other (byte
+order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | payload |
+CRC u16 LE`` over everything before it, with a CRC that is in no catalogue. A response has the number of its command and
+begins with a status, u16 LE. Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
+
+What is not known, and what is done about it: the payload of tare is not published; it is sent empty [INF], and the
+option ``tare_payload`` changes it. System information is not taken apart, the operation ``system`` shows its bytes.
+Data that are run-length coded are documented for another device only, by two programs that disagree on where they
+begin.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.sensor_types import SensorType
+from skinware_drivers.adapter import Notice
+from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import CRC16_WEISS
+from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.packets import Length, Packet
+
+log = logging.getLogger("skinware.driver")
+
+_DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
+_HEADER = 5
+_MOST_CELLS = 1024
+_MOST_PAYLOAD = _HEADER + 2 * _MOST_CELLS
+_TIMEOUT_S, _TRIES = 0.5, 3
+_RLE = 1
+_STATUS = {
+    7: "a timeout",
+    11: "the command's checksum was wrong on its side",
+    14: "it does not know this command",
+    16: "access is denied",
+    27: "overrun: its line is too slow for its data",
+}
+
+
+class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits, or run lengths are wanted and nobody says where they begin.
+    """
+
+    period_ms: Annotated[int, Meta(ge=1, le=0xFFFF, description="time between two frames, ms")] = 10
+    rle: Annotated[bool, Meta(description="have data run-length coded; needs rle_offset")] = False
+    rle_offset: Annotated[
+        Literal[5, 11] | None, Meta(description="byte of the payload at which run-length coded data begin: not known")
+    ] = None
+    tare_payload: Annotated[str, Meta(description="bytes that the command tare carries, in hexadecimal")] = ""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.rle and self.rle_offset is None:
+            raise ConfigurationError(
+                "option rle: the two public programs that decode run lengths disagree on where they begin (byte 5 in"
+                " SDHLibrary, byte 11 in RobWork), for another device: find out, and say rle_offset"
+            )
+        try:
+            bytes.fromhex(self.tare_payload)
+        except ValueError:
+            raise ConfigurationError(f"option tare_payload: {self.tare_payload!r} is not hexadecimal") from None
+
+
+class Refused(BusError):
+    """A sensor does not do what it was told.
+
+    Attributes:
+        status: the number with which it answered.
+    """
+
+    def __init__(self, command: int, status: int) -> None:
+        why = _STATUS.get(status, "see the maker's manual")
+        super().__init__(f"the sensor refuses command {command:#04x} with status {status}: {why}")
+        self.status = status
+
+
+class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
+    """One WTS on a serial line."""
+
+    Options = WeissWtsOptions
+    framing = Packet(
+        sync=(0xAA, 0xAA, 0xAA),
+        length=Length(Field(4, 2), more=8),
+        maximum=8 + _MOST_PAYLOAD,
+        checksum=CRC16_WEISS,
+        identifier=Field(3),
+    )
+    dtype = np.uint16
+
+    def __init__(self, options: WeissWtsOptions) -> None:
+        super().__init__(options)
+        self._matrix = b""
+        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
+
+    @property
+    def period_s(self) -> float:
+        """As the sensor is told, s."""
+        return self.options.period_ms / 1e3
+
+    @property
+    def payload_size(self) -> int:
+        """Of the largest matrix: which one it is, is known only when it was asked."""
+        return -(-_MOST_PAYLOAD // 8) * 8
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the sensor for its matrix; it may still be sending for somebody before us.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a sensor says how many cells it has only when it is asked: listening alone cannot find out")
+        await self.stop(link)
+        answer = await self._ask(link, _MATRIX)
+        if len(answer) < 10:
+            raise BusError(f"the sensor's matrix information has {len(answer)} bytes instead of 10")
+        columns, rows, width, height, full_scale = struct.unpack_from("<5H", answer)
+        count = columns * rows
+        if not 1 <= count <= _MOST_CELLS or not full_scale:
+            raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
+        log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
+        self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
+        self.layout, self._matrix = self._layout(count), answer
+        return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{columns}x{rows}")])]
+
+    async def start(self, link: Link) -> None:
+        """Have it send by itself."""
+        await self._ask(link, _START, struct.pack("<BH", _RLE if self.options.rle else 0, self.options.period_ms))
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent; one that was silent already may say so."""
+        try:
+            await self._ask(link, _STOP)
+        except Refused as error:
+            log.debug("%s: %s", link.bus_name, error)
+
+    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:  # noqa: ARG002
+        """Only remembers whom to tell: the sensor says nothing of itself."""
+        self._tell = tell
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
+        try:
+            matrix = await self._ask(link, _MATRIX, tries=1)
+        except HandshakeTimeout:
+            return False
+        if matrix != self._matrix:
+            self._tell(patch, Notice.CHANGED)
+            return False
+        return True
+
+    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
+        """Start it again."""
+        await self.start(link)
+
+    @operation(sets_up=True)
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
+        """Take the present values as zero."""
+        await self._ask(link, _TARE, bytes.fromhex(self.options.tare_payload))
+
+    @operation(looks=True)
+    async def temperature(self, link: Link, patches: Sequence[Patch]) -> float:  # noqa: ARG002
+        """Temperature of the sensor in degrees Celsius."""
+        answer = await self._ask(link, _TEMPERATURE)
+        if len(answer) < 2:
+            raise BusError(f"the sensor's temperature has {len(answer)} bytes instead of 2")
+        return int.from_bytes(answer[:2], "little", signed=True) / 10
+
+    @operation(looks=True)
+    async def system(self, link: Link, patches: Sequence[Patch]) -> str:  # noqa: ARG002
+        """What the sensor says of its hardware and firmware: bytes in hexadecimal, their meaning is not public."""
+        return (await self._ask(link, _SYSTEM)).hex(" ")
+
+    def _layout(self, count: int) -> Layout:
+        time = DeviceTime(0, "<u4", 1e-3)
+        size = _HEADER + 2 * count
+        plain = Frame("frame", [Identifier(_DATA), Byte(4, 0, _RLE)], [size], Values(_HEADER, "<u2", count), time=time)
+        offset = self.options.rle_offset
+        if not self.options.rle or offset is None:
+            return Layout([plain])
+        lengths = range(offset + 2, offset + 2 * count + 1, 2)
+        runs = Expand(lambda payload, length: _runs(payload, length, offset, count))
+        return Layout([plain, Frame("runs", [Identifier(_DATA), Byte(4, _RLE, _RLE)], lengths, runs, time=time)])
+
+    async def _ask(self, link: Link, command: int, arguments: bytes = b"", *, tries: int = _TRIES) -> bytes:
+        for attempt in range(tries):
+            try:
+                reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S)
+                break
+            except HandshakeTimeout:
+                if attempt == tries - 1:
+                    raise
+        if len(reply.payload) < 2:
+            raise BusError(f"the sensor's answer to command {command:#04x} has no status")
+        status = int.from_bytes(reply.payload[:2], "little")
+        if status:
+            raise Refused(command, status)
+        return reply.payload[2:]
+
+
+Numbers = npt.NDArray[np.int64]
+
+
+def _runs(
+    payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8], offset: int, count: int
+) -> tuple[Numbers, Numbers, npt.NDArray[np.uint16]]:
+    """Units of 16 bits: how often in the upper four, what in the lower twelve."""
+    n_units = (payload.shape[1] - offset) // 2
+    units = np.ascontiguousarray(payload[:, offset : offset + 2 * n_units]).view("<u2").astype(np.int64)
+    times = np.where(np.arange(n_units) < ((length.astype(np.int64) - offset) // 2)[:, None], units >> 12, 0)
+    whole = np.flatnonzero(times.sum(axis=1) == count)
+    row = np.repeat(whole, count)
+    value = np.repeat((units[whole] & 0xFFF).ravel(), times[whole].ravel())
+    return row, np.tile(np.arange(count), len(whole)), value.astype(np.uint16)

@@ -1,0 +1,128 @@
+"""An emulated WTS tactile sensor of Weiss Robotics: its bytes on the line.
+
+Source: the programs wts_driver and wts_ft; the vectors in tests/serial/test_weiss_wts.py.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Sequence
+from typing import Annotated, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.commands import cut
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+
+_BEGIN = b"\xaa\xaa\xaa"
+_NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
+_OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
+
+
+def crc(data: bytes) -> int:
+    """As the sensor computes it, bit by bit."""
+    state = 0xFFFF
+    for byte in data:
+        entry = ((state ^ byte) & 0xFF) << 8
+        for _ in range(8):
+            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
+        state = entry ^ state >> 8
+    return state
+
+
+def message(command: int, payload: bytes) -> bytes:
+    """A message as it goes over the line."""
+    head = _BEGIN + struct.pack("<BH", command, len(payload)) + payload
+    return head + struct.pack("<H", crc(head))
+
+
+class EmulatedWeissWtsOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the sensor is."""
+
+    columns: Annotated[int, Meta(ge=1, le=32, description="cells in a row")] = 4
+    rows: Annotated[int, Meta(ge=1, le=32, description="rows of cells")] = 8
+    period_ms: Annotated[int, Meta(ge=1, le=65_535, description="between two frames if it streams from power-up")] = 10
+
+
+class EmulatedWeissWts(Emulator[EmulatedWeissWtsOptions]):
+    """One sensor, device number 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+
+    Attributes:
+        payload_size: longest message.
+    """
+
+    Options: ClassVar[type[EmulatorOptions]] = EmulatedWeissWtsOptions
+    full_scale = 4095
+    swing = 3500
+    payload_size = 2064
+
+    @property
+    def numbers(self) -> Sequence[int]:
+        """The sensor."""
+        return (1,)
+
+    @property
+    def period_s(self) -> float:
+        """Unless it is told another."""
+        return self.options.period_ms / 1e3
+
+    @property
+    def identifiers(self) -> Collection[int]:
+        """None: bytes."""
+        return (0,)
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All cells."""
+        return on_a_grid(self.options.columns * self.options.rows, self.options.columns)
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
+        """Answer every command that the bytes complete."""
+        heard = device.memory.get("heard", b"") + payload
+        commands, device.memory["heard"] = cut(
+            heard, _BEGIN, lambda part: 8 + int.from_bytes(part[4:6], "little") if len(part) >= 6 else 0
+        )
+        for command in commands:
+            status, answer = self._do(device, command, now_ns)
+            self.reply(device, (0, message(command[3], struct.pack("<H", status) + answer)), now_ns)
+        return bool(commands)
+
+    def burst(self, device: Device, time_ns: int) -> None:
+        """Frames tell the time since power-up."""
+        device.memory["ms"] = (time_ns - device.ready_ns) // 1_000_000
+        super().burst(device, time_ns)
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        """One message with all cells, without run lengths."""
+        header = struct.pack("<IB", device.memory["ms"] & 0xFFFF_FFFF, 0)
+        return [(0, message(0x00, header + struct.pack(f"<{len(values)}H", *self._tared(device, values))))]
+
+    def _tared(self, device: Device, values: Sequence[int]) -> Sequence[int]:
+        if device.memory.pop("tare", False):
+            device.memory["zero"] = list(values)
+        zero = device.memory.get("zero")
+        return values if zero is None else [max(0, value - z) for value, z in zip(values, zero, strict=True)]
+
+    def _do(self, device: Device, command: bytes, now_ns: int) -> tuple[int, bytes]:
+        number, arguments = command[3], command[6:-2]
+        if crc(command[:-2]) != int.from_bytes(command[-2:], "little"):
+            return _BAD_CHECKSUM, b""
+        if number not in _NEEDED:
+            return _UNKNOWN, b""
+        if len(arguments) < _NEEDED[number]:
+            return _TOO_SHORT, b""
+        if number == 0x30:
+            return _OK, struct.pack("<5H", self.options.columns, self.options.rows, 340, 340, self.full_scale)
+        if number == 0x46:
+            return _OK, struct.pack("<h", 253)
+        if number == 0x50:
+            return _OK, bytes.fromhex("04 01 00 10 2a 00")
+        if number == 0x23:
+            device.memory["tare"] = True
+        elif number == 0x22:
+            self.stop(device)
+        else:
+            self.stop(device)
+            self.start(device, now_ns, max(1, struct.unpack_from("<H", arguments, 1)[0]) / 1e3)
+        return _OK, b""

@@ -1,0 +1,87 @@
+"""The driver of the AGNI protocol: vectors of the wire, and the driver on a pseudo terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from skinware import DriverReader, PatchState
+from skinware.errors import RequestFailed
+from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
+from tests.sdk.driving import driving_lines, read_until
+
+CONFIGURATION = bytes.fromhex("F0 C4 00 C0 F4")
+STOP = bytes.fromhex("F0 C4 00 00 34")
+START = bytes.fromhex("F0 C4 00 F1 C5")
+MS = 1_000_000
+
+
+@contextmanager
+def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
+    with emulated_on_a_pty(EmulatedAgni, **emulated) as path:
+        driver = AgniDriver(AgniOptions(**options))
+        bus = SerialBus(path, payload_size=driver.payload_size)
+        with driving_lines([(driver, bus)], "agni"), DriverReader("agni", timeout_s=30) as reader:
+            yield reader
+
+
+def test_bytes_of_commands_are_those_of_the_vectors() -> None:
+    assert (command(0xC0), command(0x00), command(0xF1)) == (CONFIGURATION, STOP, START)
+    period = command(0xD0, bytes.fromhex("0200 01 0A00 02 0A00"))
+    assert period == message(0, bytes.fromhex("D0 0200 01 0A00 02 0A00"))
+
+
+def test_the_emulated_device_byte_for_byte() -> None:
+    device = EmulatedAgni(EmulatedAgniOptions(sensors=(1, 2), pattern="cycle"))
+    now_ns = 10**12
+    device.skip(now_ns)
+
+    def said(sent: bytes, later_ms: int = 1) -> list[bytes]:
+        nonlocal now_ns
+        for at in range(len(sent)):  # byte by byte
+            device.receive(0, sent[at : at + 1], now_ns)
+        now_ns += later_ms * MS
+        return [frame.payload for frame in device.emit(now_ns)]
+
+    assert said(b"noise" + CONFIGURATION) == [message(0, bytes.fromhex("01 07 02 0302 0200 0302 0400"))]
+    assert said(CONFIGURATION[:-1] + b"\0") == [bytes.fromhex("F0 C4 FE F0 3A")]
+    assert said(command(0x99)) == [bytes.fromhex("F0 C4 FE F1 3B")]
+    assert said(command(0xF0)) == [bytes.fromhex("F0 C4 F0 C4")]
+    assert said(command(0xD0, bytes.fromhex("0200 01 1400 02 1400"))) == []
+    frames = said(START, 65)
+    assert len(frames) in (6, 8)
+    for at, frame in enumerate(frames):
+        assert frame == message(at % 2 + 1, frame[3:7] + (at // 2).to_bytes(2, "little") * (at % 2 + 1))
+    assert said(STOP, 100) == []
+
+
+def test_a_device_that_streams_already_and_describes_itself() -> None:
+    emulated = {"pattern": "cycle", "streaming": True, "sensors": (5, 300)}
+    with driven(emulated, time_unit_us=1.0, period_ms=20) as reader:
+        frame = read_until(reader, lambda f: not f.status.any())
+        structure = frame.structure
+        assert structure.patch_name.tolist() == [b"device 7"]
+        assert structure.module_kind.tolist() == [b"type 515"] * 2
+        assert structure.sensor_module.tolist() == [0] * 5 + [1] * 300
+        frame = read_until(reader, lambda f: len(set(f.values.tolist())) == 1)
+        assert frame.module_time_ns[0] == frame.module_time_ns[1]
+        assert reader.call("alive") == {"bus0": True}
+        with pytest.raises(RequestFailed, match="give 1 to 65535"):
+            reader.call("period", ms=0)
+        reader.call("period", ms=10)
+        read_until(reader, lambda f: int(f.values[0]) > int(frame.values[0]) + 3)
+
+
+def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
+    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+        for live in (True, False, True):
+            frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
+            for module in (0, 1):
+                assert len(set(frame.values[frame.structure.module_index(module)].tolist())) == 1

@@ -1,0 +1,108 @@
+"""The WTS driver: vectors of the wire, and the driver on a pseudo terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import DriverFrame, DriverReader, PatchState
+from skinware.errors import ConfigurationError
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
+from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
+from tests.sdk.driving import driving_lines, read_until
+
+START_10_MS = bytes.fromhex("AA AA AA 21 03 00 00 0A 00 DA B5")
+MATRIX = bytes.fromhex("AA AA AA 30 00 00 CA CF")
+MS = 1_000_000
+
+
+@contextmanager
+def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
+    with emulated_on_a_pty(EmulatedWeissWts, **emulated) as path:
+        driver = WeissWtsDriver(WeissWtsOptions(**options))
+        bus = SerialBus(path, payload_size=driver.payload_size)
+        with driving_lines([(driver, bus)], "wts"), DriverReader("wts", timeout_s=30) as reader:
+            yield reader
+
+
+def test_bytes_of_commands_are_those_of_the_vectors() -> None:
+    assert crc(b"123456789") == 0x6EB4
+    framing = WeissWtsDriver.framing
+    for wire, command, payload in ((START_10_MS, 0x21, b"\0\x0a\0"), (MATRIX, 0x30, b"")):
+        assert framing.encode(command, payload) == wire == message(command, payload)
+    assert framing.framer().feed(START_10_MS).bodies() == [b"\0\x0a\0"]
+
+
+def test_the_emulated_sensor_byte_for_byte() -> None:
+    sensor = EmulatedWeissWts(EmulatedWeissWtsOptions(columns=2, rows=1, pattern="cycle"))
+    now_ns = 10**12
+    sensor.skip(now_ns)
+
+    def said(command: bytes, later_ms: int = 1) -> list[bytes]:
+        nonlocal now_ns
+        for at in range(len(command)):  # byte by byte
+            sensor.receive(0, command[at : at + 1], now_ns)
+        now_ns += later_ms * MS
+        return [frame.payload for frame in sensor.emit(now_ns)]
+
+    assert said(MATRIX) == [message(0x30, bytes.fromhex("0000 0200 0100 5401 5401 FF0F"))]
+    assert said(MATRIX[:-1] + b"\0") == [message(0x30, b"\x0b\0")]
+    assert said(message(0x77, b"")) == [message(0x77, b"\x0e\0")]
+    assert said(message(0x21, b"\0")) == [message(0x21, b"\x0d\0")]
+    first, *frames = said(START_10_MS, 55)
+    assert first == message(0x21, b"\0\0")
+    assert len(frames) in (5, 6)
+    for cycle, frame in enumerate(frames):
+        stamp = frame[6:10]
+        assert frame == message(0x00, stamp + b"\0" + cycle.to_bytes(2, "little") * 2)
+    assert said(message(0x22, b""))[-1] == message(0x22, b"\0\0")
+    assert said(b"", 100) == []
+
+
+def test_a_sensor_that_streams_already_and_its_operations() -> None:
+    with driven({"pattern": "cycle", "streaming": True, "columns": 3, "rows": 5}) as reader:
+        frame = read_until(reader, lambda f: not f.status.any())
+        assert frame.structure.n_sensors == 15
+        assert frame.structure.types[0].maximum == 4095
+        assert len(set(frame.values.tolist())) == 1
+        assert reader.call("temperature") == {"bus0": 25.3}
+        assert reader.call("system") == {"bus0": "04 01 00 10 2a 00"}
+        frame = read_until(reader, lambda f: int(f.values[0]) > 20)
+
+        def behind_ns(later: DriverFrame) -> int:
+            """How much less the values have grown than they do without tare: by one in each 10 ms."""
+            grown = int(later.values[0]) - int(frame.values[0])
+            return int(later.module_time_ns[0] - frame.module_time_ns[0]) - 10 * MS * grown
+
+        reader.call("tare")
+        read_until(reader, lambda f: behind_ns(f) > 100 * MS)
+
+
+def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
+    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+
+        def whole(live: bool) -> None:
+            frame = read_until(reader, lambda f: (f.patch_state[0] == PatchState.LIVE) == live)
+            assert len(set(frame.values.tolist())) == 1
+
+        for live in (True, False, True):
+            whole(live)
+
+
+def test_refusals_and_run_lengths() -> None:
+    assert "14: it does not know this command" in str(Refused(0x77, 14))
+    with pytest.raises(ConfigurationError, match=r"SDHLibrary.*RobWork.*rle_offset"):
+        WeissWtsOptions(rle=True)
+    with pytest.raises(ConfigurationError, match="not hexadecimal"):
+        WeissWtsOptions(tare_payload="x")
+    units = np.array([[3 << 12 | 7, 1 << 12 | 0xFFF, 0], [1 << 12, 1 << 12, 1 << 12]], "<u2")
+    payload = np.concatenate([np.zeros((2, 5), np.uint8), units.view(np.uint8)], axis=1)
+    row, channel, value = _runs(payload, np.array([9, 11], np.uint16), 5, 4)
+    assert (row.tolist(), channel.tolist(), value.tolist()) == ([0] * 4, [0, 1, 2, 3], [7, 7, 7, 0xFFF])

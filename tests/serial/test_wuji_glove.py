@@ -1,0 +1,95 @@
+"""The glove driver: vectors of the wire, and the driver on a pseudo terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader, PatchState, Status
+from skinware.errors import RequestFailed
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.wuji_glove import Refused, WujiGloveDriver, WujiGloveOptions
+from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
+from tests.sdk.driving import driving_lines, read_until
+
+DEVICE_INFO = bytes.fromhex("AA 56 0A 00 01 01 01 00 A7 FA")
+MS = 1_000_000
+
+
+@contextmanager
+def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
+    with emulated_on_a_pty(EmulatedWujiGlove, **emulated) as path:
+        driver = WujiGloveDriver(WujiGloveOptions(**options))
+        bus = SerialBus(path, payload_size=driver.payload_size)
+        with driving_lines([(driver, bus)], "glove"), DriverReader("glove", timeout_s=30) as reader:
+            yield reader
+
+
+def test_bytes_of_commands_are_those_of_the_vector() -> None:
+    assert WujiGloveDriver.commands is not None
+    assert WujiGloveDriver.commands.encode(0, b"\1\1\1\0") == DEVICE_INFO == message(0x56, b"\1\1\1\0")
+    assert WujiGloveDriver.framing.framer().feed(DEVICE_INFO).bodies() == []
+
+
+def test_the_emulated_board_byte_for_byte() -> None:
+    board = EmulatedWujiGlove(EmulatedWujiGloveOptions(pattern="cycle", hand="right", invalid=(767,)))
+    now_ns = 10**12
+    board.skip(now_ns)
+
+    def said(command: bytes, later_ms: int = 1) -> list[bytes]:
+        nonlocal now_ns
+        for at in range(len(command)):  # byte by byte
+            board.receive(0, command[at : at + 1], now_ns)
+        now_ns += later_ms * MS
+        return [frame.payload for frame in board.emit(now_ns)]
+
+    info = b"EMULATED-1" + bytes(14) + bytes((1, 0, 0, 0, 1, 2, 3, 0))
+    assert said(DEVICE_INFO) == [message(0x57, b"\1\1\1\0\0" + info)]
+    assert said(DEVICE_INFO[:-1] + b"\0") == [message(0x57, b"\1\1\1\0\x11")]
+    assert said(message(0x56, b"\x99\1\2\0")) == [message(0x57, b"\x99\1\2\0\x12")]
+    assert said(message(0x56, b"\1\4\3\0")) == [message(0x57, b"\1\4\3\0\x13")]
+    assert said(message(0x56, b"\2\5\4\0\2\0\0\x64\0")) == [message(0x57, b"\2\5\4\0\0")]
+    answer, *frames = said(message(0x56, b"\1\4\5\0\1"), 45)
+    assert answer == message(0x57, b"\1\4\5\0\0")
+    assert len(frames) in (4, 5)
+    for cycle, frame in enumerate(frames):
+        assert len(frame) == 3088
+        assert frame[:8] == bytes.fromhex("AA 55 10 0C 01 00 00 00")
+        cells = np.frombuffer(frame, "<f4", 768, 8)
+        assert cells[:767].tolist() == [cycle / 4096] * 767
+        assert np.isnan(cells[767])
+        assert frame[3080:3082] == cycle.to_bytes(2, "little")
+        assert frame == message(0x55, frame[4:-2])
+
+
+def test_values_invalid_cells_and_operations() -> None:
+    with driven({"pattern": "cycle", "invalid": (5,), "hand": "right"}, rate_hz=50) as reader:
+        frame = read_until(reader, lambda f: not (f.status & Status.STALE).any())
+        assert frame.structure.patch_name.tolist() == [b"right glove"]
+        assert np.flatnonzero(frame.status).tolist() == [5]
+        assert frame.status[5] == Status.NOT_CONNECTED
+        assert len(set(np.delete(frame.values, 5).tolist())) == 1
+        assert reader.call("rate", hz=100) == {"bus0": 100.0}
+        with pytest.raises(RequestFailed, match="give 1 to 1000"):
+            reader.call("rate", hz=0)
+        counts = reader.call("counts")["bus0"]
+        assert counts["frames"] > 0
+        assert counts["checksum_errors"] == 0
+        reader.call("enable", on=False)
+        read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
+        reader.call("enable")
+        read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE)
+    assert "0x13: bad arguments" in str(Refused(0x502, 0x13))
+
+
+def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
+    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+        for live in (True, False, True):
+            frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
+            assert len(set(frame.values.tolist())) == 1

@@ -7,6 +7,7 @@ import math
 import multiprocessing
 import os
 import random
+import select
 import shutil
 import signal
 import subprocess
@@ -146,6 +147,13 @@ class Talk:
             except subprocess.TimeoutExpired:
                 self.process.send_signal(signal.SIGUSR1)
         raise AssertionError("it did not leave within a minute")
+
+    def interrupt(self) -> Event:
+        """Signals until it says something: one that comes before it waits interrupts nothing."""
+        assert self.process.stdout is not None
+        while not select.select([self.process.stdout], [], [], 0.05)[0]:
+            self.process.send_signal(signal.SIGUSR1)
+        return self.next()
 
     def stop(self) -> None:
         self.process.send_signal(signal.SIGSTOP)
@@ -452,10 +460,11 @@ def test_pause_resume_restructure_and_close_are_told_at_once(any_program: Path) 
         assert talk.next()["event"] == "restarted"
         publish(4)
         assert talk.next()["value"] == 4
-        talk.process.send_signal(signal.SIGUSR1)
-        assert talk.next()["event"] == "interrupted"
+        assert talk.interrupt()["event"] == "interrupted"
         writer.close()
         seen = talk.next()
+        while seen["event"] == "interrupted":
+            seen = talk.next()
         assert (seen["event"], seen["state"], seen["stale"], seen["value"]) == ("gone", _layout.STATE_CLOSED, 1, 4)
         talk.end_input()
 

@@ -103,6 +103,8 @@ def _stream(example: Example, script: Script) -> tuple[bytes, dict[int, tuple[in
 
 def _frame(example: Example, script: Script) -> tuple[int, bytes, bytes] | None:
     sizes = example.body_sizes()
+    if not sizes or not example.identifiers:  # a device that describes itself has no frames before it has
+        return None
     size = sizes[script.number(len(sizes))] if script.number(16) == 0 else sizes[min(len(sizes) - 1, script.number(32))]
     pattern = script.bytes(min(size, 1 + script.number(16)))
     body = (pattern * (size // max(1, len(pattern)) + 1))[:size]

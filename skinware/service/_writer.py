@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -162,15 +163,16 @@ class ServiceWriter:
             from_last: as for ``begin``.
         """
         timer = Periodic(rate_hz)
-        while timer.wait(self._must_end):
-            if timer.missed > self.missed_periods:
-                self._ring.count_missed_periods(timer.missed - self.missed_periods)
-                self.missed_periods = timer.missed
-            waiting = self._carry_out(self.requests())
-            if self._paused:
-                continue
-            self._ring.count_lateness(now_ns() - (timer.deadline_ns - timer.period_ns))
-            yield from self._one_frame(waiting, from_last)
+        with self._closing_ends_the_loop():
+            while timer.wait(self._must_end):
+                if timer.missed > self.missed_periods:
+                    self._ring.count_missed_periods(timer.missed - self.missed_periods)
+                    self.missed_periods = timer.missed
+                waiting = self._carry_out(self.requests())
+                if self._paused:
+                    continue
+                self._ring.count_lateness(now_ns() - (timer.deadline_ns - timer.period_ns))
+                yield from self._one_frame(waiting, from_last)
 
     def on_request(self, *, from_last: bool = False) -> Iterator[dict[str, npt.NDArray[Any]]]:
         """Yield the arrays of one frame whenever a program asks for one; publish when the loop comes back.
@@ -180,10 +182,11 @@ class ServiceWriter:
         Args:
             from_last: as for ``begin``.
         """
-        while not self._must_end():
-            waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
-            if waiting and not self._paused:
-                yield from self._one_frame(waiting, from_last)
+        with self._closing_ends_the_loop():
+            while not self._must_end():
+                waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
+                if waiting and not self._paused:
+                    yield from self._one_frame(waiting, from_last)
 
     def requests(self, timeout_s: float = 0.0) -> list[Request]:
         """What programs ask for, for writers with a loop of their own; each wants its ``reply`` or ``fail``.
@@ -253,6 +256,15 @@ class ServiceWriter:
 
     def _must_end(self) -> bool:
         return self._stopping or self.closed
+
+    @contextlib.contextmanager
+    def _closing_ends_the_loop(self) -> Iterator[None]:
+        """Another thread may close this writer between any two steps of a loop."""
+        try:
+            yield
+        except Closed:
+            if not self.closed:
+                raise
 
     @property
     def closed(self) -> bool:

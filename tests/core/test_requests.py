@@ -73,8 +73,9 @@ def on_request(**options: Any) -> Iterator[ServiceWriter]:
     try:
         yield writer
     finally:
-        writer.close()
+        writer.stop()
         thread.join()
+        writer.close()
 
 
 def test_a_frame_on_request() -> None:
@@ -122,8 +123,27 @@ def test_periodic_writers_answer_too() -> None:
         asked_ns = now_ns()
         assert reader.request().acquired_ns >= asked_ns
         assert reader.call("add", a=1, b=2) == 3
-    writer.close()
+    writer.stop()
     thread.join()
+    writer.close()
+
+
+def test_closing_between_two_steps_ends_the_loop_without_an_error() -> None:
+    with ServiceWriter("x", SMALL, operations={"close": lambda: writer.close()}) as writer:
+        writer.request_server()
+        ended = threading.Event()
+
+        def work() -> None:
+            for _ in writer.periodic(200):
+                pass
+            ended.set()
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        with ServiceReader[Frame]("x") as reader, pytest.raises(PeerGone):
+            reader.call("close")
+        thread.join()
+        assert ended.is_set()
 
 
 def test_a_service_tells_what_it_can_do() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from abc import ABC
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,6 +18,7 @@ from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
+from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
@@ -67,8 +68,11 @@ class Watch:
         self.module_status[self.tables.structure.module_patch == patch] = 0
 
 
-class Adapter(ABC, Generic[OptionsT]):
+class Adapter(HasOptions[OptionsT], ABC):
     """One bus of a driver: what hangs on it, what its frames mean, and how to get it going.
+
+    In the brackets of the base is named which options it takes: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
+    ``CanAdapter[NoOptions]``.
 
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
     ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
@@ -79,18 +83,18 @@ class Adapter(ABC, Generic[OptionsT]):
 
     What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
 
-    ``types``, ``dtype`` and ``layout`` can be set anew for an object of the class, in ``__init__`` or, for hardware
-    that describes itself, in ``describe``. The types of all buses are put together, and the values of all have the
-    smallest dtype that holds each bus' own.
+    ``types``, ``dtype``, ``layout`` and ``period_s`` can be set anew for an object of the class, in ``__init__`` or,
+    for hardware that describes itself, in ``describe``. The types of all buses are put together, and the values of all
+    have the smallest dtype that holds each bus' own.
 
     Attributes:
         medium: kind of bus: ``can`` or ``serial``.
-        Options: struct of the options; becomes command-line options and TOML keys.
+        Options: struct of the options, as named in the brackets; becomes command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
         layout: what frames mean.
         patches: what hangs on each bus, unless ``describe`` finds out.
-        period_s: nominal time between two updates of a module.
+        period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
     """
@@ -103,14 +107,6 @@ class Adapter(ABC, Generic[OptionsT]):
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
     pace_per_ms: float = DEFAULT_PACE_PER_MS
-
-    def __init__(self, options: OptionsT) -> None:
-        self.options = options
-
-    @property
-    def period_s(self) -> float:
-        """Nominal time between two updates of a module, s."""
-        return 0.02
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -155,16 +151,24 @@ class Adapter(ABC, Generic[OptionsT]):
     async def stop(self, link: Link) -> None:
         """Make them silent."""
 
-    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+    async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask a patch that sends no data whether it is there; it is asked again as long as it is silent.
+
+        By default no question is asked, since many devices answer none: it may have lost its power, and is revived.
 
         Returns:
             True if it answered: it has restarted, and ``revive`` is called next.
         """
+        await self.revive(link, patch)
         return False
 
-    async def revive(self, link: Link, patch: Patch) -> None:
-        """Set one patch up anew and start it, without disturbing the others."""
+    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
+        """Set one patch up anew and start it; by default, whatever is on the bus.
+
+        To be overridden where patches can be set up one by one, or where the others would be disturbed.
+        """
+        await self.configure(link)
+        await self.start(link)
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
         """Runs beside the data from ``describe`` to the end: for devices that speak of their own state.

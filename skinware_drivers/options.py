@@ -14,7 +14,19 @@ import difflib
 import re
 import types
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 import msgspec.structs
@@ -39,6 +51,64 @@ class Option(NamedTuple):
     default: str
     """The default as a person would write it; empty where nothing stands for it."""
     description: str
+
+
+class HasOptions(Generic[OptionsT]):
+    """What is made from options, whose class the base has in brackets: ``class Thumb(CanAdapter[ThumbOptions])``.
+
+    Args:
+        options: an object of that class.
+
+    Attributes:
+        Options: that class.
+        options: as given.
+        period_s: nominal time between two sets of data, s; options with a field ``period_ms`` set it.
+
+    Raises:
+        ConfigurationError: when a subclass is made: what stands in its brackets is no class of options.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]]
+    least_options: ClassVar[type[msgspec.Struct]] = msgspec.Struct
+    """What the class of the options must be derived from."""
+    period_s: float = 0.02
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        named = _in_brackets(cls)
+        if isinstance(named, TypeVar):  # a subclass will say
+            return
+        if not (isinstance(named, type) and issubclass(named, cls.least_options)):
+            least = f"{cls.least_options.__module__.partition('.')[0]}.{cls.least_options.__name__}"
+            raise ConfigurationError(
+                f"class {cls.__name__}: its base has {getattr(named, '__name__', named)} in brackets, where"
+                f" the class of its options belongs, derived from {least}"
+            )
+        if not issubclass(cls.Options, named):
+            if "Options" in vars(cls):
+                raise ConfigurationError(
+                    f"class {cls.__name__}: Options = {cls.Options.__name__} contradicts the {named.__name__} that"
+                    " its base has in brackets: leave out the line"
+                )
+            cls.Options = named
+
+    def __init__(self, options: OptionsT) -> None:
+        self.options = options
+        period_ms = getattr(options, "period_ms", 0)
+        if period_ms:
+            self.period_s = period_ms / 1000
+
+
+def _in_brackets(cls: Any) -> Any:
+    """The options' class that a subclass of HasOptions names, or has from its base; a TypeVar if neither does yet."""
+    for base in vars(cls).get("__orig_bases__", cls.__bases__):
+        origin: Any = get_origin(base) or base
+        if origin is HasOptions:
+            return get_args(base)[0]
+        if issubclass(origin, HasOptions):
+            inherited = _in_brackets(origin)
+            return dict(zip(origin.__parameters__, get_args(base), strict=False)).get(inherited, inherited)
+    return None
 
 
 def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
@@ -195,6 +265,7 @@ def _reason(error: Exception) -> str:
 
 
 __all__ = [
+    "HasOptions",
     "Option",
     "check_options",
     "describe_options",

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -99,7 +99,6 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
     Values are raw: 1/256 N/cm2 in full format, N/cm2 in the other; the type's scale makes pascals of them.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = BarrettOptions
     dtype = np.uint16
 
     def __init__(self, options: BarrettOptions) -> None:
@@ -120,11 +119,6 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
             self.layout = Layout((_TOP_10,))
             greatest, scale = 15, _PA_PER_N_CM2
         self.types = (PRESSURE.measured(scale=scale, minimum=0, maximum=greatest * scale),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
 
     @property
     def polls(self) -> Sequence[Poll]:

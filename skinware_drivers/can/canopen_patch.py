@@ -13,7 +13,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import canopen
 import msgspec
@@ -80,7 +80,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         expects_heartbeat_of: nodes that took the heartbeat period of the options; others are not missed.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = CanopenOptions
     payload_size = 8
 
     def __init__(self, options: CanopenOptions) -> None:
@@ -89,11 +88,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         self._clients: dict[int, SdoClient] = {}
         self._tpdos: dict[int, list[Tpdo]] = {}
         self.expects_heartbeat_of: set[int] = set()
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
 
     @property
     def polls(self) -> Sequence[Poll]:

@@ -11,7 +11,7 @@ no command: the finger sends by itself. [INF]
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -42,7 +42,6 @@ class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
     """One finger on each bus. Sensor uid = taxel; raw counts, of which hosts take a baseline themselves."""
 
-    Options: ClassVar[type[msgspec.Struct]] = CyskinCpmOptions
     types = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
     dtype = np.uint16
     patches = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
@@ -51,8 +50,3 @@ class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
         super().__init__(options)
         names = tuple(frame.name for frame in QUARTERS)
         self.layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3

@@ -18,7 +18,7 @@ answer to any command.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -77,7 +77,6 @@ class XelaDriver(CanAdapter[XelaOptions]):
     raw (idle about 32 to 37 thousand); forces are computed by the maker's closed server only.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = XelaOptions
     types = tuple(t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE))
     dtype = np.uint16
 
@@ -92,11 +91,6 @@ class XelaDriver(CanAdapter[XelaOptions]):
                 for board, identifiers in ids.items()
             )
         )
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
 
     async def start(self, link: Link) -> None:
         """Command 07 00 to every board."""

@@ -87,24 +87,19 @@ def _framing(totals: dict[int, int], at: int, sync: tuple[int, ...] = tuple(_BEG
 class AgniDriver(SerialAdapter[AgniOptions]):
     """One device on a serial line."""
 
-    Options = AgniOptions
     framing = _framing({n: 7 + 4 * n for n in range(1, _MOST_SENSORS + 1)}, 5, (*_BEGIN, 0))
     commands = Unframed(1024)
 
     def __init__(self, options: AgniOptions) -> None:
         super().__init__(options)
         self._period_ms = options.period_ms
+        self.period_s = (options.period_ms or options.usual_period_ms) / 1e3
         self._configuration = b""
         self._patch: Patch | None = None
         self._n_sensors = 0
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
         self.types = [PRESSURE.measured(unit="counts")]
         self.dtype = np.dtype(options.values).newbyteorder("=")
-
-    @property
-    def period_s(self) -> float:
-        """Time between two messages of a sensor, s."""
-        return (self._period_ms or self.options.usual_period_ms) / 1e3
 
     @property
     def payload_size(self) -> int:
@@ -201,6 +196,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         if not 1 <= ms <= 0xFFFF:
             raise ValueError(f"{ms} ms: give 1 to 65535")
         self._period_ms = ms
+        self.period_s = ms / 1e3
         await self.configure(link)
 
     @operation(looks=True)

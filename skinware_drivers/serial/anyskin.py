@@ -11,7 +11,7 @@ message counts after any doubt only if it ends with 0D 0A and the 82 bytes behin
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -42,7 +42,6 @@ class AnySkinDriver(SerialAdapter[AnySkinOptions]):
     number is shown with ``SUSPECT``.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = AnySkinOptions
     types = (
         TEMPERATURE,
         *(t.measured(scale=1e-6) for t in (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)),
@@ -58,8 +57,3 @@ class AnySkinDriver(SerialAdapter[AnySkinOptions]):
         self.layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
         channels = taxels(options.mags, *(t.name for t in self.types))
         self.patches = (Patch("anyskin", (Module(channels, kind="board"),)),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3

@@ -92,7 +92,6 @@ class Refused(BusError):
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     """One open patch on a serial line."""
 
-    Options = OpenPatchOptions
     framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
 
     def __init__(self, options: OpenPatchOptions) -> None:
@@ -101,7 +100,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._crc = 0
         self._patch: Patch | None = None
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
-        self._period_us = 0
         self._disabled: set[int] = set()
         self._clock = DeviceClock(1e-6)
         self._clock_fails = False
@@ -109,11 +107,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
-
-    @property
-    def period_s(self) -> float:
-        """Time between two updates of every module, s."""
-        return self._period_us / 1e6 or 0.02
 
     @property
     def payload_size(self) -> int:
@@ -144,7 +137,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
-        self._period_us = self._wanted_us or found.period_us
+        self.period_s = (self._wanted_us or found.period_us) / 1e6
         self._disabled.clear()
         return [self._patch]
 
@@ -272,7 +265,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if not 0 < hz <= 1e6:
             raise ValueError(f"{hz:g} Hz: give more than 0, up to 1000000")
         await self._set_period(link, round(1e6 / hz))
-        return 1e6 / self._period_us
+        return 1 / self.period_s
 
     @operation()
     async def enable(
@@ -321,7 +314,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         became_us = int.from_bytes(answer[:4], "little")
         if len(answer) < 4 or not became_us:
             raise BadDescription("the patch does not say which period it has now")
-        self._period_us = self._wanted_us = became_us
+        self._wanted_us = became_us
+        self.period_s = became_us / 1e6
 
     # -- asking ---------------------------------------------------------------------------------------------------
 

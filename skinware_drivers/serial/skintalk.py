@@ -10,7 +10,7 @@ the last record before a pause waits for the next one. With two bytes that can b
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -62,7 +62,6 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
     uid = patch << 4 | cell. Records of patches or cells that the options do not name are counted as unknown.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = SkintalkOptions
     types = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
     dtype = np.int32
     baudrate = 2_000_000
@@ -83,11 +82,6 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
             for number in options.patches
         )
 
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
-
     async def start(self, link: Link) -> None:
         """Start all patches."""
         await link.send(0, _START)
@@ -95,11 +89,6 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
     async def stop(self, link: Link) -> None:
         """Stop all patches."""
         await link.send(0, _STOP)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Start all patches again: there is no question that one would answer, but it may have lost its power."""
-        await link.send(0, _START)
-        return False
 
 
 def _off_by_one(

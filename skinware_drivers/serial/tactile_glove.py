@@ -10,7 +10,7 @@ what follows it is one, too: a packet that lost bytes could otherwise pass with 
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -43,7 +43,6 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
     Values are those of the wire (0 is the greatest pressure); ``physical`` is 4095 - value, as the maker shows it.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = TactileGloveOptions
     types = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
     dtype = np.uint16
     framing = Packet(
@@ -60,8 +59,3 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
         super().__init__(options)
         modules = [Module(taxels(1, first_uid=i), key=_FIRST + i, kind="taxel") for i in range(options.taxels)]
         self.patches = (Patch("glove", modules),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3

@@ -96,7 +96,6 @@ class Refused(BusError):
 class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     """One WTS on a serial line."""
 
-    Options = WeissWtsOptions
     framing = Packet(
         sync=(0xAA, 0xAA, 0xAA),
         length=Length(Field(4, 2), more=8),
@@ -110,11 +109,6 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         super().__init__(options)
         self._matrix = b""
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
-
-    @property
-    def period_s(self) -> float:
-        """As the sensor is told, s."""
-        return self.options.period_ms / 1e3
 
     @property
     def payload_size(self) -> int:

@@ -75,7 +75,6 @@ class Refused(BusError):
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     """One board on a serial line."""
 
-    Options = WujiGloveOptions
     framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),
@@ -111,13 +110,8 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         super().__init__(options)
         self._number = 0
         self._wanted_hz = options.rate_hz
-        self._rate_hz = float(options.rate_hz or _USUAL_HZ)
+        self.period_s = 1 / (options.rate_hz or _USUAL_HZ)
         self._on = True
-
-    @property
-    def period_s(self) -> float:
-        """Time between two frames, s."""
-        return 1 / self._rate_hz
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the board who it is; who only listens need not know."""
@@ -128,7 +122,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             log.info("%s: glove board %s, firmware %s", link.bus_name, serial_number, info[28:32].hex("."))
             name = {0: "left glove", 1: "right glove"}.get(hand[0], name)
             if not self._wanted_hz:
-                self._rate_hz = await self._get_rate(link)
+                self.period_s = 1 / await self._get_rate(link)
         module = Module([Sensor("pressure", cell) for cell in range(_N)], kind=f"{_ROWS}x{_COLUMNS}")
         return [Patch(name, [module])]
 
@@ -167,7 +161,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             raise ValueError(f"{hz} Hz: give 1 to 1000")
         await self._set_rate(link, hz)
         self._wanted_hz = hz
-        return self._rate_hz
+        return 1 / self.period_s
 
     @operation()
     async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:  # noqa: ARG002
@@ -184,7 +178,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     async def _set_rate(self, link: Link, hz: int) -> None:
         await self._ask(link, _SET, struct.pack("<HBH", _RATE, _U16, hz))
-        self._rate_hz = await self._get_rate(link)
+        self.period_s = 1 / await self._get_rate(link)
 
     async def _get_rate(self, link: Link) -> float:
         answer = await self._ask(link, _GET, struct.pack("<H", _RATE), size=3)

@@ -42,7 +42,6 @@ class TapeDriver(SerialAdapter[NoOptions]):
 class EmulatedTape(Emulator[EmulatorOptions]):
     """It sends zero-free bodies, so that its stuffing is only a number in front."""
 
-    Options = EmulatorOptions
     full_scale = 0x7FFF
     swing = 1000
     numbers = (0,)

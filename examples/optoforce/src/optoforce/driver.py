@@ -13,7 +13,7 @@ in x, y and z.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -59,7 +59,6 @@ class OptoforceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OptoforceDriver(SerialAdapter[OptoforceOptions]):
     """One converter on each line. A sensor is a taxel of three axes; its uid is its number. Values are raw counts."""
 
-    Options: ClassVar[type[msgspec.Struct]] = OptoforceOptions
     framing = DATA
     commands = SETTINGS
     baudrate = 1_000_000
@@ -81,11 +80,6 @@ class OptoforceDriver(SerialAdapter[OptoforceOptions]):
             [Frame("sample", [Identifier(identifier)], [4 + 6 * sensors], axes, flags=flags, stamp=counter)]
         )
 
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1000
-
     async def start(self, link: Link) -> None:
         """Set it up; it then sends."""
         await self._set_up(link, self.options.period_ms)
@@ -93,11 +87,6 @@ class OptoforceDriver(SerialAdapter[OptoforceOptions]):
     async def stop(self, link: Link) -> None:
         """Make it silent."""
         await self._set_up(link, SILENCE_MS)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:
-        """It is silent, and answers no questions: it may have been unplugged. Set it up again."""
-        await self._set_up(link, self.options.period_ms)
-        return False
 
     @operation()
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +26,6 @@ class EmulatedOptoforce(Emulator[EmulatedOptoforceOptions]):
     """One converter, device 0."""
 
     medium = "serial"
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedOptoforceOptions
     lowest = -32768
     full_scale = 32767
     swing = 9_000

@@ -311,7 +311,9 @@ class Decoder:
         status = np.zeros((len(rows), self._width), np.uint8)
         if whole is None:
             whole = np.ones(len(rows), bool)
-        sensors = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
+        sensors, unreadable = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
+        if len(unreadable):
+            whole = self._count_unreadable(batch, rows, module, unreadable, whole)
         self._count_patches(0, module[whole])
         oldest_ns = newest_ns = time_ns[rows[:, 0]]
         last_row = rows[:, 0]
@@ -321,6 +323,18 @@ class Decoder:
             last_row = np.maximum(last_row, rows[:, member])
         flagged = bool(status.any())
         return Updates(module, whole, sensors, values, status, oldest_ns, newest_ns, flagged), last_row
+
+    def _count_unreadable(
+        self, batch: FrameBatch, rows: Indices, module: Indices, unreadable: Indices, whole: Flags
+    ) -> Flags:
+        """(n,) which updates are still whole, without those frames; their partners are orphans now."""
+        spoilt, n_frames = np.unique(unreadable, return_counts=True)
+        bus = batch.bus[batch.start + rows[unreadable, 0]]
+        self.state.bus_counters[:, 2] += np.bincount(bus, minlength=len(self.state.bus_counters))
+        self._count_patches(1, np.repeat(module[spoilt], rows.shape[1] - n_frames))
+        whole = whole.copy()
+        whole[spoilt] = False
+        return whole
 
     def _count_patches(self, counter: int, module: Indices) -> None:
         patch = self._module_patch[module]

@@ -205,6 +205,8 @@ class Expand:
 
     ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
     the row of ``payload``, the channel, and the value.
+
+    It gets what comes over the wire, garbage too. A frame for which it raises is counted as bad content and not shown.
     """
 
     function: Callable[
@@ -219,7 +221,7 @@ class Frame:
 
     Attributes:
         name: for the cycle and for messages.
-        when: all of these hold.
+        when: all of these hold; none: every frame of the bus is of this kind (but not those of 29-bit identifiers).
         length: payload lengths that are right; others are counted as bad and not shown.
         values: where the values are, in one run or in several.
         patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
@@ -232,9 +234,9 @@ class Frame:
     """
 
     name: str
-    when: Sequence[Condition]
-    length: Sequence[int]
-    values: Values | Sequence[Values] | Expand
+    when: Sequence[Condition] = ()
+    length: Sequence[int] = ()
+    values: Values | Sequence[Values] | Expand = ()
     patch: Bits | int | None = None
     module: Bits | int | None = None
     flags: Sequence[Flag | Sentinel | StatusBytes] = ()

@@ -77,7 +77,7 @@ class FrameKind:
         """
         try:
             values, found = self._expand(expand, payload, length)
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - whatever it stumbles over
             if not self._told:
                 self._told = True
                 log.error(
@@ -85,7 +85,7 @@ class FrameKind:
                     " counted as bad content; told once",
                     self.frame.name,
                     type(error).__name__,
-                    error,
+                    str(error),  # whoever keeps the record does not keep what the traceback refers to
                     *traceback.extract_tb(error.__traceback__)[-1][:2],
                 )
         else:

@@ -22,6 +22,13 @@ from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
+_KINDS = {
+    "can": "a CAN bus (vcan0, can0, slcan:/dev/ttyACM0 ...)",
+    "serial": "a serial line (/dev/ttyUSB0; a path has a slash in it, as ./port)",
+    "virtual": "a bus of this process (virtual)",
+}
+"""Kinds of bus, and how they are written."""
+
 
 class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a driver that has none."""
@@ -125,7 +132,10 @@ class Adapter(HasOptions[OptionsT], ABC):
             ConfigurationError: it is another kind of bus.
         """
         if bus.medium not in (None, self.medium):
-            raise ConfigurationError(f"{bus!r} is a {bus.medium} bus, {type(self).__name__} speaks {self.medium}")
+            raise ConfigurationError(
+                f"{bus.name} is {_KINDS.get(bus.medium, bus.medium)}; {type(self).__name__} needs"
+                f" {_KINDS.get(self.medium, self.medium)}"
+            )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""

@@ -326,7 +326,7 @@ def _check_frame(frame: Frame) -> None:
         raise refuse("it has no values")
     for values in frame.runs:
         if len(values.channels) != values.count:
-            raise refuse(f"{values.count} values, but `to` names {len(values.channels)} channels")
+            raise refuse(f"`count` is {values.count}, but the length of `to` is {len(values.channels)}")
         if values.end > min(frame.length):
             raise refuse(f"values end at byte {values.end}, the shortest right payload has {min(frame.length)}")
         if isinstance(values.dtype, Packed) and not 0 <= values.dtype.skip < 8:

@@ -79,7 +79,7 @@ class HasOptions(Generic[OptionsT]):
         if isinstance(named, TypeVar):  # a subclass will say
             return
         if not (isinstance(named, type) and issubclass(named, cls.least_options)):
-            least = f"{cls.least_options.__module__.partition('.')[0]}.{cls.least_options.__name__}"
+            least = f"{cls.least_options.__module__}.{cls.least_options.__name__}"
             raise ConfigurationError(
                 f"class {cls.__name__}: its base has {getattr(named, '__name__', named)} in brackets, where"
                 f" the class of its options belongs, derived from {least}"

@@ -27,9 +27,9 @@ class BusName(NamedTuple):
 def parse_bus_name(name: str) -> BusName:
     """Take a bus' name apart.
 
-    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process, ``/dev/ttyUSB0`` is
-    ``serial:/dev/ttyUSB0``, as are pyserial's URLs (``socket://host:port``), and python-can's interfaces of names
-    that are ours are ``can+virtual:`` and ``can+serial:``.
+    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
+    (``/dev/ttyUSB0``, ``./port``), is a serial port; pyserial's URLs (``socket://host:port``) are serial, too.
+    python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:
         ConfigurationError: empty, or options that are not ``key=value``.
@@ -42,7 +42,7 @@ def parse_bus_name(name: str) -> BusName:
     except ValueError:
         raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
     interface, colon, channel = address.partition(":")
-    if address.startswith("/") or channel.startswith("//"):  # a device, or one of pyserial's URLs
+    if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
         interface, channel = "serial", address
     elif not colon:
         interface, channel = (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)

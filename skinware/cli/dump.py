@@ -205,7 +205,8 @@ def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None
         except StructureChanged:
             _reattach(reader, timeout_s)
             generation = reader.generation
-            warn(f"driver {reader.name!r} came back with another structure: {reader.structure.n_sensors} sensors now")
+            n_sensors = reader.structure.n_sensors
+            warn(f"driver {reader.name!r} came back with another structure; number of sensors: {n_sensors}")
 
 
 def _reattach(reader: DriverReader, timeout_s: float | None) -> None:

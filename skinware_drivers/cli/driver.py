@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
+from skinware.cli._format import plural
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options
 
@@ -208,17 +209,16 @@ def _tell_ready(runner: Runner, as_json: bool) -> None:
     if runner.generation is None:
         return
     structure = runner.generation.tables.structure
-    counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
     buses = [line.name for line in runner.lines]
     if as_json:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
+        counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
         print_json({**ready, "types": types, "buses": buses})
     else:
-        click.echo(
-            f"{runner.name}: {counts['patches']} patches, {counts['modules']} modules, {counts['sensors']} sensors"
-            f" on {', '.join(buses)}; publishing (skin-top shows them, Ctrl-C ends)"
-        )
+        patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
+        what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
+        click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
 
 
 def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:

@@ -346,7 +346,7 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: Layout([Frame("f")]), "'f': say which payload lengths"),
         (lambda: Layout([Frame("f", length=[8])]), "'f': it has no values"),
         (lambda: one(Values(6, "<u2", 2)), "values end at byte 10"),
-        (lambda: one(Values(0, "u1", 2, to=(0,))), "`to` names 1 channels"),
+        (lambda: one(Values(0, "u1", 2, to=(0,))), "`count` is 2, but the length of `to` is 1"),
         (lambda: one(()), "it has no values"),
         (lambda: one((Values(0, "u1", 1), Values(7, "<u2", 1))), "values end at byte 9"),
         (lambda: one(Values(0, Packed(12, skip=8), 1)), "8 bits before the first value"),

@@ -73,7 +73,7 @@ def test_what_is_no_class_of_options_is_refused(wrong: Any) -> None:
 
 
 def test_an_emulator_needs_the_options_that_all_emulators_have() -> None:
-    with pytest.raises(ConfigurationError, match=r"has Options in brackets.* skinware_drivers\.EmulatorOptions"):
+    with pytest.raises(ConfigurationError, match=r"has Options in brackets.* .*EmulatorOptions"):
 
         class Emulated(Emulator[Options]):  # type: ignore[type-var]
             pass

@@ -125,5 +125,7 @@ def test_a_device_may_tell_how_its_frames_lie_in_the_stream() -> None:
 
 
 def test_another_kind_of_bus_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="is a can bus, FingertipDriver speaks serial"):
-        FingertipDriver(NoOptions()).fit(SocketCanBus("vcan0"))
+    with pytest.raises(
+        ConfigurationError, match=r"bus port is a CAN bus .*FingertipDriver needs a serial line .* as \./port"
+    ):
+        FingertipDriver(NoOptions()).fit(SocketCanBus("port"))

@@ -19,15 +19,21 @@ import msgspec
 import numpy as np
 from skinware import Status
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Flag, Frame, Identifier, Layout, Stamp, Values
-from skinware_drivers.link import Link
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import Sum
-from skinware_drivers.serial.framing import Field
-from skinware_drivers.serial.packets import LengthTable, Packet
+from skinware_drivers import (
+    Flag,
+    Frame,
+    Identifier,
+    Layout,
+    Link,
+    Module,
+    Patch,
+    Stamp,
+    Values,
+    check_options,
+    operation,
+    taxels,
+)
+from skinware_drivers.serial import Field, LengthTable, Packet, SerialAdapter, Sum
 
 SUM = Sum(width=16, order="big")
 DATA = Packet(
@@ -81,7 +87,7 @@ class OptoforceDriver(SerialAdapter[OptoforceOptions]):
         )
 
     async def start(self, link: Link) -> None:
-        """Set it up; it then sends."""
+        """Set it up; it then sends. Also called when it has fallen silent: it may have been unplugged."""
         await self._set_up(link, self.options.period_ms)
 
     async def stop(self, link: Link) -> None:

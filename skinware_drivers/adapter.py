@@ -11,23 +11,23 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.bus import Bus
-from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
 
-_KINDS = {
-    "can": "a CAN bus (vcan0, can0, slcan:/dev/ttyACM0 ...)",
-    "serial": "a serial line (/dev/ttyUSB0; a path has a slash in it, as ./port)",
-    "virtual": "a bus of this process (virtual)",
+_SUCH_AS = {
+    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
+    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
+    "virtual": ": virtual",
 }
-"""Kinds of bus, and how they are written."""
+"""How the buses of a medium are written."""
 
 
 class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -125,16 +125,34 @@ class Adapter(HasOptions[OptionsT], ABC):
         """Longest payload that a bus must be able to receive. To be overridden where ``describe`` makes the layout."""
         return self.layout.payload_size
 
+    def check(self) -> None:
+        """Find out early what a driver forgot to say, unless its devices say it in ``describe``.
+
+        Raises:
+            ConfigurationError: something is missing, or contradicts something else; the message says what.
+        """
+        if type(self).describe is not Adapter.describe:
+            return
+        name = type(self).__name__
+        for needed in ("types", "layout", "patches"):
+            if not getattr(self, needed, None):
+                raise ConfigurationError(f"{name} has no `{needed}`")
+        try:
+            assemble([("bus", self.patches)], self.types, self.dtype)
+        except (StructureError, TypeError, AttributeError) as error:  # the last two: one where a list belongs, or so
+            raise ConfigurationError(f"{name}: `patches`, `types` and `dtype` make no skin: {error}") from None
+
     def fit(self, bus: Bus) -> None:
         """Prepare a bus that is not open yet for what this driver expects of it.
 
         Raises:
             ConfigurationError: it is another kind of bus.
         """
-        if bus.medium not in (None, self.medium):
+        if bus.medium is not None and bus.medium != self.medium:
+            names = {"can": "a CAN bus", "serial": "a serial line", "virtual": "a bus of this process"}
             raise ConfigurationError(
-                f"{bus.name} is {_KINDS.get(bus.medium, bus.medium)}; {type(self).__name__} needs"
-                f" {_KINDS.get(self.medium, self.medium)}"
+                f"{bus.name} is {names.get(bus.medium, bus.medium)}; {type(self).__name__} needs"
+                f" {names.get(self.medium, self.medium)}{_SUCH_AS.get(self.medium, '')}"
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002

@@ -11,9 +11,12 @@ Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9`
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import traceback
 import types
 from collections.abc import Iterable, Mapping
+from importlib.metadata import EntryPoint
 from typing import (
     Annotated,
     Any,
@@ -38,6 +41,7 @@ OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
 _HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 _LONGEST_RANGE = 1 << 16
+_ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "str": "a text"}
 _KINDS = {bool: "yes/no", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 
@@ -190,6 +194,33 @@ def nearest_name(wrong: str, right: Iterable[str]) -> str:
     return f"{hint} Known: {', '.join(names) or 'none'}"
 
 
+def load_entry_point(entry: EntryPoint, what: str) -> Any:
+    """What somebody's package has registered.
+
+    Args:
+        entry: as it is registered.
+        what: for messages.
+
+    Raises:
+        ConfigurationError: it cannot be loaded; the message says why, and where in the package.
+    """
+    try:
+        return entry.load()
+    except Exception as error:
+        raise ConfigurationError(
+            f"{what} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}{_place_of(error)}"
+        ) from error
+
+
+def _place_of(error: Exception) -> str:
+    """The last file and line of the traceback that are somebody else's than Python's or ours, in brackets."""
+    if isinstance(error, SyntaxError):
+        return ""  # it says so itself
+    ours = (os.path.dirname(__file__), os.path.dirname(os.__file__), "<")
+    theirs = [place for place in traceback.extract_tb(error.__traceback__) if not place.filename.startswith(ours)]
+    return f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
+
+
 def _split(text: str, plain: Any) -> Any:
     """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
     if plain is bool:
@@ -260,8 +291,10 @@ def _default(field: msgspec.structs.FieldInfo) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """What msgspec says, without its path to a value that the message already names."""
-    return re.sub(r" - at `\$\[(\d+)\]`", r" (item \1, counted from 0)", str(error)).replace("`", "")
+    """What msgspec says, in words for people, without its path to a value that the message already names."""
+    text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
+    asked = re.compile(r"Expected `(\w+)(.*?)`(?:, got `\w+`)?")
+    return asked.sub(lambda match: f"give {_ASKED.get(match[1], match[1])}{match[2]}", text).replace("`", "")
 
 
 __all__ = [
@@ -269,6 +302,7 @@ __all__ = [
     "Option",
     "check_options",
     "describe_options",
+    "load_entry_point",
     "nearest_name",
     "option_text",
     "options_from_strings",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import parse_qsl
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import nearest_name
+from skinware_drivers.options import load_entry_point, nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
@@ -35,6 +35,8 @@ def parse_bus_name(name: str) -> BusName:
         ConfigurationError: empty, or options that are not ``key=value``.
     """
     address, _, query = name.partition("?")
+    if "=" in address and "/" not in address:
+        raise ConfigurationError(f"bus {name!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
     if not address:
         raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
     try:
@@ -88,10 +90,9 @@ def load_driver(name: str) -> type[AnyAdapter]:
     """
     known = {entry.name: entry for entry in entry_points(group=DRIVERS)}
     if name not in known:
-        raise ConfigurationError(f"unknown driver {name!r}{nearest_name(name, known)}")
-    try:
-        loaded: Any = known[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"driver {name!r} ({known[name].value}) cannot be loaded: {error}") from error
-    driver: type[AnyAdapter] = loaded
-    return driver
+        names = nearest_name(name, known)
+        raise ConfigurationError(f"unknown driver {name!r}{names}. One of yours has to be installed: pip install -e .")
+    loaded = load_entry_point(known[name], f"driver {name!r}")
+    if not (isinstance(loaded, type) and issubclass(loaded, Adapter)):
+        raise ConfigurationError(f"driver {name!r}: {known[name].value} is no subclass of CanAdapter or its like")
+    return loaded

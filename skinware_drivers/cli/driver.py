@@ -47,7 +47,11 @@ class DriverCommand(click.Command):
                 text = option.description + (f"  [default: {option.default}]" if option.default else "")
                 flag = "--" + option.name.replace("_", "-")
                 self.params.append(click.Option([flag, option.name], metavar=option.kind, help=text))
-        return super().parse_args(ctx, args)
+        ctx.allow_extra_args = True
+        left = super().parse_args(ctx, args)
+        if left:
+            raise click.UsageError(f"{left[0]!r} is no option: name the driver with --driver, a bus with --bus", ctx)
+        return left
 
 
 @click.command(
@@ -118,11 +122,13 @@ def command(
     bus_names = list(buses) or [bus.name for bus in settings.bus]
     if not bus_names:
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
+    _check_names(bus_names)
     _check_own_options(buses, settings)
     given = {key: text for key, text in driver_options.items() if text is not None}
 
     def line_of(bus_name: str, settings: DriverConfig) -> tuple[str, AnyAdapter, Bus]:
         adapter = driver(options_of_bus(driver.Options, settings, bus_name, given))
+        adapter.check()
         bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
         return bus_name, adapter, bus
 
@@ -229,6 +235,14 @@ def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[i
     if realtime is None and not chosen:
         return None
     return Profile.from_text("normal" if realtime is None else realtime, cpus=chosen)
+
+
+def _check_names(bus_names: Sequence[str]) -> None:
+    """Refuse a bus that is named twice: who asks for one of them could not say which."""
+    twice = next((name for name in bus_names if bus_names.count(name) > 1), None)
+    if twice is not None:
+        more = "; several emulated ones differ in an option, as virtual?seed=1" if twice.startswith("virtual") else ""
+        raise ConfigurationError(f"bus {twice} is named twice{more}")
 
 
 def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:

@@ -76,9 +76,7 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
 
     def run() -> None:
         try:
-            Emulation(bus, hardware, control).run(
-                control, bus_name=bus.name, driver=str(emulator), options=given
-            )
+            Emulation(bus, hardware, control).run(control, bus_name=bus.name, driver=str(emulator), options=given)
         except BaseException as error:  # noqa: BLE001  (raised in the test)
             control.failure = error
             control.ready.set()

@@ -62,9 +62,9 @@ class Decoder:
     """
 
     def __init__(self, layouts: Sequence[Layout | None], tables: SkinTables) -> None:
-        self.layouts = list(layouts)
+        self.layouts: list[Layout | None] = list(layouts)
         self.tables = tables
-        self.state = SkinState(tables)
+        self.state: SkinState = SkinState(tables)
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
@@ -98,8 +98,10 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
-        self.device_stamps = DeviceStamps(self._frames, self._module_patch)
-        self.unknown_identifiers = np.zeros((len(structure.buses), STANDARD_IDENTIFIERS), np.int64)
+        self.device_stamps: DeviceStamps = DeviceStamps(self._frames, self._module_patch)
+        self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
+            (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
+        )
 
     @property
     def headroom(self) -> int:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, StatusBytes, Values
 
-log = logging.getLogger("skinware.driver.expand")
+log: logging.Logger = logging.getLogger("skinware.driver.expand")
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
@@ -39,6 +39,7 @@ class FrameKind:
             for (patch, key), module in tables.module_key.items():
                 if key < self.module_by_byte.shape[1]:
                     self.module_by_byte[patch, key] = module
+        self.channels: Indices
         if isinstance(frame.values, Expand):
             self.channels = np.arange(n_channels)
         else:

@@ -17,22 +17,24 @@ from typing import Annotated
 
 import canopen
 import msgspec
+import numpy.typing as npt
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import CATALOGUE
+from skinware.sensor_types import CATALOGUE, SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.pdo_map import PdoMap, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.can.sdo import SdoAborted, SdoClient
 from skinware_drivers.description import Patch
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match, Reply
 from skinware_drivers.options import check_options, nearest_name
 from skinware_drivers.polling import Poll
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 FIRST_NODE, LAST_NODE = 1, 127
 _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
@@ -81,6 +83,10 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
     """
 
     payload_size = 8
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike
+    layout: Layout
+    patches: Sequence[Patch]
 
     def __init__(self, options: CanopenOptions) -> None:
         super().__init__(options)

@@ -50,11 +50,12 @@ from skinware_drivers.can.roboskin_options import (
 )
 from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp
 from skinware_drivers.description import Module, Patch, SkinTables
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.skin_state import Updates
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DISCOVERY_S = 0.3
 _REPLY_S = 0.2
@@ -106,6 +107,9 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     Triangles that the configuration leaves switched off are not part of the structure.
     """
 
+    options: RoboskinOptions
+    layout: Layout
+    period_s: float
     types: Sequence[SensorType] = SKIN_TYPES
     dtype: npt.DTypeLike = np.uint8
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from skinware_drivers.runner import PublishMode, Runner
 
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 
 class DriverCommand(click.Command):

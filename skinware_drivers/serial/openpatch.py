@@ -17,15 +17,17 @@ from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
 from skinware_drivers.device_time import DeviceClock
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.delimited import Delimited
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     DATA,
@@ -42,7 +44,7 @@ from skinware_drivers.serial.openpatch_description import (
 )
 from skinware_drivers.serial.stuffing import COBS
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 HELLO, DESCRIBE, START, STOP, PERIOD, ENABLE, TARE, STATUS = range(1, 9)
 BOOT, REPORT, NOTE = 0x60, 0x61, 0x62
@@ -92,7 +94,10 @@ class Refused(BusError):
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     """One open patch on a serial line."""
 
-    framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    framing: Framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike
+    layout: Layout
 
     def __init__(self, options: OpenPatchOptions) -> None:
         super().__init__(options)
@@ -137,7 +142,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
-        self.period_s = (self._wanted_us or found.period_us) / 1e6
+        self.period_s: float = (self._wanted_us or found.period_us) / 1e6
         self._disabled.clear()
         return [self._patch]
 

@@ -18,10 +18,11 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Stamp, Values
@@ -30,10 +31,10 @@ from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _INFO, _HAND, _DIAGNOSTICS, _STREAM, _GET, _SET = 0x0101, 0x0103, 0x0301, 0x0401, 0x0501, 0x0502
 _RATE, _U16 = 2, 0  # key and type of the configuration value
@@ -75,7 +76,7 @@ class Refused(BusError):
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     """One board on a serial line."""
 
-    framing = Packet(
+    framing: Framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),
         maximum=3088,
@@ -83,16 +84,16 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         covers=(2, -2),
         identifier=Field(1),
     )
-    commands = Packet(
+    commands: Encoding | None = Packet(
         sync=(0xAA, 0x56),
         length=Length(Field(2, 2), more=0),
         maximum=512,
         checksum=CRC16_CCITT_FALSE,
         covers=(2, -2),
     )
-    types = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
-    dtype = np.float32
-    layout = Layout(
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
+    dtype: npt.DTypeLike = np.float32
+    layout: Layout = Layout(
         [
             Frame(
                 "frame",
@@ -110,7 +111,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         super().__init__(options)
         self._number = 0
         self._wanted_hz = options.rate_hz
-        self.period_s = 1 / (options.rate_hz or _USUAL_HZ)
+        self.period_s: float = 1 / (options.rate_hz or _USUAL_HZ)
         self._on = True
 
     async def describe(self, link: Link) -> Sequence[Patch]:

@@ -48,7 +48,7 @@ class HandClock:
     """
 
     def __init__(self) -> None:
-        self.now_ns = _BEGINNING_NS
+        self.now_ns: int = _BEGINNING_NS
         self.before_passing: list[Callable[[], object]] = []
         self.turns = 0
         self._timers: set[HandTimer] = set()

@@ -39,7 +39,7 @@ class Driving:
         listen_only: bool,
         publish: PublishMode | None = None,
     ) -> None:
-        self.ready = threading.Event()
+        self.ready: threading.Event = threading.Event()
         self.failure: BaseException | None = None
         self.runner: Runner | None = None
         self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]

@@ -46,7 +46,7 @@ class EmulatedAgni(Emulator[EmulatedAgniOptions]):
 
     full_scale = 4095
     swing = 3500
-    numbers = (1,)
+    numbers: Sequence[int] = (1,)
     payload_size = 4104
 
     def places(self) -> npt.NDArray[np.float64]:

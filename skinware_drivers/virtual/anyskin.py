@@ -34,9 +34,9 @@ class EmulatedAnySkin(Emulator[EmulatedAnySkinOptions]):
     lowest = -50_000
     rest = 25
     swing = 400
-    numbers = (1,)
+    numbers: Sequence[int] = (1,)
     payload_size = 1032
-    framing = Unframed(payload_size)
+    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """Four values at each magnetometer."""

@@ -6,7 +6,7 @@ that the answer about a property other than TACT goes to group 6.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -30,12 +30,12 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
 
     full_scale = 0xFFF
     swing = 3_000
-    identifiers = frozenset(range(0x800)) - {
+    identifiers: Collection[int] = frozenset(range(0x800)) - {
         i for i in range(0x800) if i >> 5 & 31 not in range(11, 15) and i & 0x41F not in (0x405, 11, 12, 13, 14)
     }
 
     def __init__(self, options: EmulatedBarrettOptions, **more: Any) -> None:
-        self.numbers = options.nodes
+        self.numbers: Sequence[int] = options.nodes
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:

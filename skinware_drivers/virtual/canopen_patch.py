@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from importlib import resources
 from typing import Annotated, Any
@@ -53,10 +53,11 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
     swing = 3500
 
     def __init__(self, options: EmulatedCanopenOptions, **more: Any) -> None:
-        self.numbers = nodes = options.nodes
+        self.numbers: Sequence[int] = options.nodes
         super().__init__(options, **more)
-        # of the predefined connection set
-        self.identifiers = {0x000} | {function + node for function in range(0x080, 0x780, 0x80) for node in (0, *nodes)}
+        functions = range(0x080, 0x780, 0x80)  # of the predefined connection set
+        own = {function + node for function in functions for node in (0, *options.nodes)}
+        self.identifiers: Collection[int] = {0x000} | own
 
     def places(self) -> npt.NDArray[np.float64]:
         """A grid, as nothing says where they are."""

@@ -6,7 +6,7 @@ Source: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino``.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -31,8 +31,8 @@ class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
     full_scale = 0xFFFF
     rest = 800
     swing = 6_000
-    numbers = (0,)
-    identifiers = frozenset((0x405, 0x407, 0x409, 0x40B))
+    numbers: Sequence[int] = (0,)
+    identifiers: Collection[int] = frozenset((0x405, 0x407, 0x409, 0x40B))
 
     def places(self) -> npt.NDArray[np.float64]:
         """Sixteen taxels."""

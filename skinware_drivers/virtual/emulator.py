@@ -53,7 +53,7 @@ class Device:
         self.number = number
         self.transmitter = transmitter
         self.memory: dict[str, Any] = {}
-        self.cycle = 0
+        self.cycle: int = 0
         self.alive = True
         self.ready_ns = now_ns
         self.streams_from_ns: int | None = None

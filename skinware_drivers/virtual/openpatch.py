@@ -53,8 +53,8 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
     full_scale = 0xFFFF
     rest = 1000
     swing = 40_000
-    framing = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
-    numbers = (1,)
+    framing: Delimited = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
+    numbers: Sequence[int] = (1,)
     payload_size = 1024
 
     def __init__(self, options: EmulatedOpenPatchOptions, **more: Any) -> None:

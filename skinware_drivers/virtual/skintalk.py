@@ -33,10 +33,10 @@ class EmulatedSkintalk(Emulator[EmulatedSkintalkOptions]):
     rest = 50_000
     swing = 2_000_000
     payload_size = 64
-    framing = Unframed(payload_size)
+    framing: Unframed = Unframed(payload_size)
 
     def __init__(self, options: EmulatedSkintalkOptions, **more: Any) -> None:
-        self.numbers = options.patches
+        self.numbers: Sequence[int] = options.patches
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:

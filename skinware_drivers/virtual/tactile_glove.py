@@ -32,9 +32,9 @@ class EmulatedTactileGlove(Emulator[EmulatedTactileGloveOptions]):
     full_scale = 0xFFF
     rest = 4000
     swing = -3000
-    numbers = (1,)
+    numbers: Sequence[int] = (1,)
     payload_size = 64
-    framing = Unframed(payload_size)
+    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All taxels on one square."""

@@ -55,7 +55,7 @@ class EmulatedWeissWts(Emulator[EmulatedWeissWtsOptions]):
 
     full_scale = 4095
     swing = 3500
-    numbers = (1,)
+    numbers: Sequence[int] = (1,)
     payload_size = 2064
 
     def places(self) -> npt.NDArray[np.float64]:

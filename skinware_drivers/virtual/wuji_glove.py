@@ -47,8 +47,8 @@ class EmulatedWujiGlove(Emulator[EmulatedWujiGloveOptions]):
 
     full_scale = 4096
     swing = 3500
-    numbers = (1,)
-    period_s = 1 / _USUAL_HZ  # unless it is told another
+    numbers: Sequence[int] = (1,)
+    period_s: float = 1 / _USUAL_HZ  # unless it is told another
     payload_size = 3088
 
     def __init__(self, options: EmulatedWujiGloveOptions, **more: Any) -> None:

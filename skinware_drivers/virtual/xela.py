@@ -6,7 +6,7 @@ Source: ur-o2as ``o2as_xela_sensor.py``, uskin_can_drivers ``src/can_communicati
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -38,10 +38,10 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
     swing = 9_000
 
     def __init__(self, options: EmulatedXelaOptions, **more: Any) -> None:
-        self.numbers = options.boards
+        self.numbers: Sequence[int] = options.boards
         super().__init__(options, **more)
-        commands = range(0x200, 0x210)
-        self.identifiers = {taxel for board in options.boards for taxel in self._taxels(board)}.union(commands)
+        taxels = {taxel for board in options.boards for taxel in self._taxels(board)}
+        self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
     def places(self) -> npt.NDArray[np.float64]:
         """Three axes a taxel."""

@@ -235,13 +235,13 @@ class Assembly:
             all, the update that it belongs to.
         """
         sensors = self._destination[module]
-        complete = np.delete(np.arange(len(rows)), orphans)
         unreadable = orphans[:0]
         for member, (kind, columns) in enumerate(zip(self._kinds, self._columns, strict=True)):
             taken = wire[rows[:, member]]
             payload, length = taken["payload"], taken["length"]
             payload[orphans] = 0
             if isinstance(kind.frame.values, Expand):
+                complete = np.delete(np.arange(len(rows)), orphans)
                 expanded, found, failed = kind.expand(kind.frame.values, payload[complete], length[complete])
                 raw = np.zeros((len(rows), len(kind.channels)), expanded.dtype)
                 raw[complete] = expanded
@@ -253,7 +253,7 @@ class Assembly:
                 raw = kind.read(payload)
             values[:, columns] = raw
             kind.flag(payload, length, raw, status, columns, self._channels)
-        for nowhere in (orphans, unreadable):
-            sensors[nowhere] = self._sink
-            status[nowhere] = 0
+        nowhere = np.append(orphans, unreadable) if len(unreadable) else orphans
+        sensors[nowhere] = self._sink
+        status[nowhere] = 0
         return sensors, unreadable

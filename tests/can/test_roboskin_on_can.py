@@ -56,8 +56,8 @@ def test_768_sensors_at_20_hz_over_a_minute(vcan: Callable[[], str]) -> None:
     # two halves that an emulation without processor time sent too far apart are orphans, and told as late
     orphans = sum(patch["orphans"] - 2 * patch["late"] for patch in stopped["patches"])
     assert orphans <= cuts, stopped["patches"]
-    assert shown["frames"] > MINUTE_FRAMES * 128 * 0.9
     assert totals["send_failures"] == 0
+    assert 0 <= totals["frames"] - shown["frames"] <= 4 * 32  # of each board a burst, while the driver stops
 
 
 def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], str], tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tests.openpatch.microcontroller import HERE, program
 
 PAGE = Path(__file__).parents[2] / "docs/protocols/patch-serial.md"
 LANGUAGES = ("c99", "c++11", "sanitized")
-SAID = wire.Said()
+SAID = wire.Said(modules=[(0, 1), (0, 1)])  # as the header says it: each by itself
 
 
 def vectors() -> list[tuple[str, str]]:
@@ -80,7 +80,7 @@ def test_the_vectors_are_what_the_text_says() -> None:
     assert wire.frame(3, struct.pack("<BI", 15, crc)) in host
     assert wire.frame(0x80, struct.pack("<BHIB4H", 0, 0, 500_000, 0, 1, 0, 0xFFFF, 300)) in patch
     assert wire.frame(0x80, struct.pack("<BHIB4H4B", 0, 1, 500_000, 0, 1, 0, 0xFFFF, 300, 0, 0, 8, 0)) in patch
-    assert wire.frame(0x80, struct.pack("<BHIB4H", 1, 0, 500_000, 32, 0, 0, 0, 0)) in patch
+    assert wire.frame(0x80, struct.pack("<BHIB4H", 1, 0, 500_000, 32, 0x101, 0, 0xFFFF, 300)) in patch
     assert wire.frame(0x61, struct.pack("<IIII", 1500, 4, 0, 0)) in patch
 
 

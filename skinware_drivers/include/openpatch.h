@@ -87,8 +87,8 @@ typedef struct {
 
 typedef struct {
     uint32_t period_us; /* yours to read: sample every module once in this time */
-    struct { /* as they are sent: */
-        uint8_t major, minor, reset_reason, streaming;
+    struct { /* as they are sent */
+        uint8_t major, minor, reset_reason, streaming; /* streaming: yours to read, too */
         uint32_t uptime_ms, crc;
         uint16_t n_items;
     } greeting;

@@ -140,6 +140,18 @@ def test_a_message_without_room_is_dropped_whole_and_counted(firmware: Path) -> 
     assert said[6] == wire.frame(0x48, struct.pack("<BBIIII", 2, 0, 0, 1, 1, 0))
 
 
+def test_a_module_that_is_off_says_so_once_in_every_stream(firmware: Path) -> None:
+    off, on, stop = request(6, 2, 1, 0), request(6, 3, 0xFF, 1), request(4, 4)
+    said = run(
+        firmware, ["poll", off, start(), *["send 1 8"] * 2, stop, "send 1 0", start(), "send 1 0", on, "send 1 8"]
+    )
+
+    def sample(sequence: int, status: int) -> bytes:
+        return wire.frame(0x80, struct.pack("<BHIB4H", 1, sequence, 0, status, 0x101, 0, 0xFFFF, 300))
+
+    assert [said[n] for n in (3, 4, 6, 8, 10)] == [sample(0, 32), b"", b"", sample(1, 32), sample(2, 8)]
+
+
 def test_the_clock_may_wrap(firmware: Path) -> None:
     said = run(firmware, ["poll", start(), *(f"time {n * 2**31 % 2**32}" for n in range(1, 5)), request(8, 2)])
     assert said[-1] == wire.frame(0x48, struct.pack("<BBIIII", 2, 0, 4 * 2**31 // 1000, 0, 0, 0))

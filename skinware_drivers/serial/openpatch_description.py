@@ -134,7 +134,7 @@ class Kind:
     @property
     def has_sensors(self) -> bool:
         """Whether any value means something."""
-        return any(map(any, self.taxels))
+        return any(name is not None for taxel in self.taxels for name in taxel)
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,8 @@ class Description:
         for number, kind in enumerate(self.kinds[k] for k in self.modules):
             channels: list[Sensor | None] = []
             for taxel in kind.taxels:
-                channels += [Sensor(name, uid) if name else None for name in taxel]
-                uid += any(taxel)
+                channels += [None if name is None else Sensor(name, uid) for name in taxel]
+                uid += any(name is not None for name in taxel)
             modules.append(Module(channels, number, kind.name))
         return Patch(self.name, modules)
 

@@ -50,14 +50,9 @@ static const openpatch_kind wide_kinds[] = {{OPENPATCH_U8, OPENPATCH_TABLE(wide_
                                             {OPENPATCH_I32, OPENPATCH_TABLE(deep_runs), "deep"}};
 static openpatch_module wide_modules[] = {OPENPATCH_MODULE(0), OPENPATCH_MODULE(1), OPENPATCH_MODULE(1)};
 
-static const openpatch_description models[] = {
-    {20000, 1000, 1000000, "test patch", "", "1.0",
-     OPENPATCH_TABLE(types), OPENPATCH_TABLE(finger_kinds), OPENPATCH_TABLE(finger_modules)},
-    {20000, 1000, 1000000, "test patch", "", "1.0",
-     OPENPATCH_TABLE(types), OPENPATCH_TABLE(hand_kinds), OPENPATCH_TABLE(hand_modules)},
-    {20000, 1000, 1000000, "test patch", "", "1.0",
-     OPENPATCH_TABLE(types), OPENPATCH_TABLE(wide_kinds), OPENPATCH_TABLE(wide_modules)},
-};
+#define MODEL(name) {20000, 1000, 1000000, "test patch", "", "1.0", OPENPATCH_TABLE(types), \
+                     OPENPATCH_TABLE(name##_kinds), OPENPATCH_TABLE(name##_modules)}
+static const openpatch_description models[] = {MODEL(finger), MODEL(hand), MODEL(wide)};
 
 static volatile sig_atomic_t hangs, speaks;
 static uint32_t first_us;

@@ -230,8 +230,8 @@ class Structure:
     def __repr__(self) -> str:
         names = ", ".join(t.name for t in self.types)
         return (
-            f"<Structure {self.n_patches} patches, {self.n_modules} modules, {self.n_sensors} sensors"
-            f" ({names}), {self.dtype.name}>"
+            f"<Structure patches: {self.n_patches}, modules: {self.n_modules},"
+            f" sensors: {self.n_sensors} ({names}), {self.dtype.name}>"
         )
 
     def _check(self) -> None:

@@ -1,8 +1,77 @@
-"""The driver SDK: transport adapters, frame layouts, the runner, and the drivers that ship with it."""
+"""The driver SDK: what somebody needs who writes a driver; see also ``.can``, ``.serial`` and ``.virtual``."""
 
+from __future__ import annotations
+
+import importlib
 import os
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skinware_drivers.adapter import NoOptions, Notice, Watch
+    from skinware_drivers.description import Module, Patch, Sensor, taxels
+    from skinware_drivers.layout import (
+        Bits,
+        Byte,
+        Cycle,
+        DeviceTime,
+        Expand,
+        Flag,
+        Frame,
+        Identifier,
+        Layout,
+        Packed,
+        Sentinel,
+        Stamp,
+        StatusBytes,
+        Values,
+    )
+    from skinware_drivers.link import Link, Match
+    from skinware_drivers.operations import operation
+    from skinware_drivers.options import check_options
+    from skinware_drivers.polling import Poll
+
+__all__ = [
+    "Bits",
+    "Byte",
+    "Cycle",
+    "DeviceTime",
+    "Expand",
+    "Flag",
+    "Frame",
+    "Identifier",
+    "Layout",
+    "Link",
+    "Match",
+    "Module",
+    "NoOptions",
+    "Notice",
+    "Packed",
+    "Patch",
+    "Poll",
+    "Sensor",
+    "Sentinel",
+    "Stamp",
+    "StatusBytes",
+    "Values",
+    "Watch",
+    "check_options",
+    "get_include",
+    "operation",
+    "taxels",
+]
+
+_MODULES = ("layout", "description", "link", "adapter", "operations", "options", "polling")
 
 
 def get_include() -> str:
     """The folder of ``openpatch.h``, the microcontroller's side of the open patch protocol."""
     return os.path.join(os.path.dirname(__file__), "include")
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and no more: commands and the pytest plug-in, which are here too, start fast."""
+    if name in __all__:
+        for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
+            if name in vars(module):
+                return vars(module)[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,21 +5,29 @@ from __future__ import annotations
 import enum
 from abc import ABC
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.bus import Bus
-from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
+from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
 from skinware_drivers.skin_state import Updates
+
+_SUCH_AS = {
+    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
+    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
+    "virtual": ": virtual",
+}
+"""How the buses of a medium are written."""
 
 
 class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,8 +75,11 @@ class Watch:
         self.module_status[self.tables.structure.module_patch == patch] = 0
 
 
-class Adapter(ABC, Generic[OptionsT]):
+class Adapter(HasOptions[OptionsT], ABC):
     """One bus of a driver: what hangs on it, what its frames mean, and how to get it going.
+
+    In the brackets of the base is named which options it takes: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
+    ``CanAdapter[NoOptions]``.
 
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
     ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
@@ -79,18 +90,18 @@ class Adapter(ABC, Generic[OptionsT]):
 
     What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
 
-    ``types``, ``dtype`` and ``layout`` can be set anew for an object of the class, in ``__init__`` or, for hardware
-    that describes itself, in ``describe``. The types of all buses are put together, and the values of all have the
-    smallest dtype that holds each bus' own.
+    ``types``, ``dtype``, ``layout`` and ``period_s`` can be set anew for an object of the class, in ``__init__`` or,
+    for hardware that describes itself, in ``describe``. The types of all buses are put together, and the values of all
+    have the smallest dtype that holds each bus' own.
 
     Attributes:
         medium: kind of bus: ``can`` or ``serial``.
-        Options: struct of the options; becomes command-line options and TOML keys.
+        Options: struct of the options, as named in the brackets; becomes command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
         layout: what frames mean.
         patches: what hangs on each bus, unless ``describe`` finds out.
-        period_s: nominal time between two updates of a module.
+        period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
     """
@@ -104,14 +115,6 @@ class Adapter(ABC, Generic[OptionsT]):
     by_cycle: bool = True
     pace_per_ms: float = DEFAULT_PACE_PER_MS
 
-    def __init__(self, options: OptionsT) -> None:
-        self.options = options
-
-    @property
-    def period_s(self) -> float:
-        """Nominal time between two updates of a module, s."""
-        return 0.02
-
     @property
     def polls(self) -> Sequence[Poll]:
         """What devices that only answer are asked, again and again, from ``start`` to ``stop``; asked for anew."""
@@ -122,14 +125,35 @@ class Adapter(ABC, Generic[OptionsT]):
         """Longest payload that a bus must be able to receive. To be overridden where ``describe`` makes the layout."""
         return self.layout.payload_size
 
+    def check(self) -> None:
+        """Find out early what a driver forgot to say, unless its devices say it in ``describe``.
+
+        Raises:
+            ConfigurationError: something is missing, or contradicts something else; the message says what.
+        """
+        if type(self).describe is not Adapter.describe:
+            return
+        name = type(self).__name__
+        for needed in ("types", "layout", "patches"):
+            if not getattr(self, needed, None):
+                raise ConfigurationError(f"{name} has no `{needed}`")
+        try:
+            assemble([("bus", self.patches)], self.types, self.dtype)
+        except (StructureError, TypeError, AttributeError) as error:  # the last two: one where a list belongs, or so
+            raise ConfigurationError(f"{name}: `patches`, `types` and `dtype` make no skin: {error}") from None
+
     def fit(self, bus: Bus) -> None:
         """Prepare a bus that is not open yet for what this driver expects of it.
 
         Raises:
             ConfigurationError: it is another kind of bus.
         """
-        if bus.medium not in (None, self.medium):
-            raise ConfigurationError(f"{bus!r} is a {bus.medium} bus, {type(self).__name__} speaks {self.medium}")
+        if bus.medium is not None and bus.medium != self.medium:
+            names = {"can": "a CAN bus", "serial": "a serial line", "virtual": "a bus of this process"}
+            raise ConfigurationError(
+                f"{bus.name} is {names.get(bus.medium, bus.medium)}; {type(self).__name__} needs"
+                f" {names.get(self.medium, self.medium)}{_SUCH_AS.get(self.medium, '')}"
+            )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
@@ -155,16 +179,24 @@ class Adapter(ABC, Generic[OptionsT]):
     async def stop(self, link: Link) -> None:
         """Make them silent."""
 
-    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+    async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask a patch that sends no data whether it is there; it is asked again as long as it is silent.
+
+        By default no question is asked, since many devices answer none: it may have lost its power, and is revived.
 
         Returns:
             True if it answered: it has restarted, and ``revive`` is called next.
         """
+        await self.revive(link, patch)
         return False
 
-    async def revive(self, link: Link, patch: Patch) -> None:
-        """Set one patch up anew and start it, without disturbing the others."""
+    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
+        """Set one patch up anew and start it; by default, whatever is on the bus.
+
+        To be overridden where patches can be set up one by one, or where the others would be disturbed.
+        """
+        await self.configure(link)
+        await self.start(link)
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
         """Runs beside the data from ``describe`` to the end: for devices that speak of their own state.

@@ -42,7 +42,7 @@ class Addresses:
     def __init__(self, frames: Sequence[Frame], kinds_of_bus: Sequence[Sequence[int]], tables: SkinTables) -> None:
         self._tables = tables
         self._n_modules = tables.structure.n_modules
-        self.nobody = len(kinds_of_bus) * STANDARD_IDENTIFIERS
+        self.nobody: int = len(kinds_of_bus) * STANDARD_IDENTIFIERS
         entries = [self._n_modules + tables.structure.n_patches] * (self.nobody + 1)
         possible: list[tuple[int, ...]] = [()] * (self.nobody + 1)
         self._forms: list[_Form] = []
@@ -61,10 +61,10 @@ class Addresses:
                 self._forms.append(_Form(bus, frames[same[0]], tables, len(entries)))
                 entries += self._forms[-1].entries
                 possible += [same] * len(self._forms[-1].entries)
-        self.entry = np.array(entries, np.int64)
+        self.entry: npt.NDArray[np.int64] = np.array(entries, np.int64)
         sets = {kinds: row for row, kinds in enumerate(dict.fromkeys(possible))}
-        self.candidates = np.array([sets[kinds] for kinds in possible], np.uint16)
-        self.sets = np.zeros((len(sets), len(frames)), bool)
+        self.candidates: npt.NDArray[np.uint16] = np.array([sets[kinds] for kinds in possible], np.uint16)
+        self.sets: npt.NDArray[np.bool_] = np.zeros((len(sets), len(frames)), bool)
         for kinds, row in sets.items():
             self.sets[row, list(kinds)] = True
 

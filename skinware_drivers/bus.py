@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.status import BusReason
 
@@ -69,14 +70,15 @@ class FrameBatch:
     """
 
     def __init__(self, capacity: int, payload_size: int = 8, headroom: int = 0) -> None:
-        self.capacity = capacity + headroom
+        self.capacity: int = capacity + headroom
         self.payload_size = payload_size
         self.headroom = headroom
-        self.wire = np.zeros(self.capacity, wire_dtype(payload_size))
-        self.time_ns = np.zeros(self.capacity, np.int64)
-        self.bus = np.zeros(self.capacity, np.uint16)
-        self.start = self.stop = headroom
-        self.limit = self.capacity
+        self.wire: npt.NDArray[np.void] = np.zeros(self.capacity, wire_dtype(payload_size))
+        self.time_ns: npt.NDArray[np.int64] = np.zeros(self.capacity, np.int64)
+        self.bus: npt.NDArray[np.uint16] = np.zeros(self.capacity, np.uint16)
+        self.start: int = headroom
+        self.stop: int = headroom
+        self.limit: int = self.capacity
 
     def __len__(self) -> int:
         return self.stop - self.start
@@ -171,14 +173,14 @@ class Bus(ABC):
         listen_only: bool = False,
     ) -> None:
         self.channel = channel
-        self.options = dict(options or {})
+        self.options: dict[str, str] = dict(options or {})
         self.payload_size = payload_size
         self.listen_only = listen_only
-        self.counters = BusCounters()
+        self.counters: BusCounters = BusCounters()
         self.narrows = False
         self.bit_rate = 0
         self.wire_bits = 0
-        self.fullest = 0.0
+        self.fullest: float = 0.0
 
     @abstractmethod
     def open(self) -> None:

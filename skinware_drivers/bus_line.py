@@ -18,7 +18,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.limits import BusLimits
 from skinware_drivers.link import Link
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _STOP_TIMEOUT_S = 2.0
@@ -57,20 +57,20 @@ class BusLine:
         self.adapter = adapter
         self.bus = bus
         adapter.fit(bus)
-        self.link = Link(bus, adapter.pace_per_ms)
+        self.link: Link = Link(bus, adapter.pace_per_ms)
         self.patches: Sequence[Patch] | None = None
-        self.state = BusState.CONNECTING
-        self.reason = BusReason.NONE
-        self.since_ns = now_ns()
+        self.state: BusState = BusState.CONNECTING
+        self.reason: BusReason = BusReason.NONE
+        self.since_ns: int = now_ns()
         self.heard_ns = 0
-        self.opened_ns = 0
-        self.started = False
-        self.lost = asyncio.Event()
-        self.busy = asyncio.Lock()
+        self.opened_ns: int = 0
+        self.started: bool = False
+        self.lost: asyncio.Event = asyncio.Event()
+        self.busy: asyncio.Lock = asyncio.Lock()
         self.suspects: set[int] = set()
         self.revived_ns = 0
         self._epoll = epoll
-        self.limits = BusLimits(name, bus)
+        self.limits: BusLimits = BusLimits(name, bus)
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 LINES_AT_ONCE = 5
 """Lines about one bus before it has to be brief."""

@@ -62,9 +62,9 @@ class Decoder:
     """
 
     def __init__(self, layouts: Sequence[Layout | None], tables: SkinTables) -> None:
-        self.layouts = list(layouts)
+        self.layouts: list[Layout | None] = list(layouts)
         self.tables = tables
-        self.state = SkinState(tables)
+        self.state: SkinState = SkinState(tables)
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
@@ -98,8 +98,10 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
-        self.device_stamps = DeviceStamps(self._frames, self._module_patch)
-        self.unknown_identifiers = np.zeros((len(structure.buses), STANDARD_IDENTIFIERS), np.int64)
+        self.device_stamps: DeviceStamps = DeviceStamps(self._frames, self._module_patch)
+        self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
+            (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
+        )
 
     @property
     def headroom(self) -> int:
@@ -311,7 +313,9 @@ class Decoder:
         status = np.zeros((len(rows), self._width), np.uint8)
         if whole is None:
             whole = np.ones(len(rows), bool)
-        sensors = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
+        sensors, unreadable = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
+        if len(unreadable):
+            whole = self._count_unreadable(batch, rows, module, unreadable, whole)
         self._count_patches(0, module[whole])
         oldest_ns = newest_ns = time_ns[rows[:, 0]]
         last_row = rows[:, 0]
@@ -321,6 +325,18 @@ class Decoder:
             last_row = np.maximum(last_row, rows[:, member])
         flagged = bool(status.any())
         return Updates(module, whole, sensors, values, status, oldest_ns, newest_ns, flagged), last_row
+
+    def _count_unreadable(
+        self, batch: FrameBatch, rows: Indices, module: Indices, unreadable: Indices, whole: Flags
+    ) -> Flags:
+        """(n,) which updates are still whole, without those frames; their partners are orphans now."""
+        spoilt, n_frames = np.unique(unreadable, return_counts=True)
+        bus = batch.bus[batch.start + rows[unreadable, 0]]
+        self.state.bus_counters[:, 2] += np.bincount(bus, minlength=len(self.state.bus_counters))
+        self._count_patches(1, np.repeat(module[spoilt], rows.shape[1] - n_frames))
+        whole = whole.copy()
+        whole[spoilt] = False
+        return whole
 
     def _count_patches(self, counter: int, module: Indices) -> None:
         patch = self._module_patch[module]

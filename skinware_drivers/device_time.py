@@ -65,8 +65,8 @@ class DeviceClock:
         self._told_ns = -(1 << 63)
         self._slope = 0.0
         self._offset_ns = 0.0
-        self.restarts = 0
-        self.repeated = 0
+        self.restarts: int = 0
+        self.repeated: int = 0
 
     @property
     def drift(self) -> float:

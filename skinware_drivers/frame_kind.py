@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import traceback
 from typing import Any
 
 import numpy as np
@@ -10,8 +12,11 @@ import numpy.typing as npt
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, StatusBytes, Values
 
+log: logging.Logger = logging.getLogger("skinware.driver.expand")
+
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 
 class FrameKind:
@@ -25,6 +30,7 @@ class FrameKind:
 
     def __init__(self, frame: Frame, tables: SkinTables) -> None:
         self.frame = frame
+        self._told = False
         n_channels = tables.channel_to_sensor.shape[1]
         self._n_modules = tables.structure.n_modules
         self.module_by_byte: Indices | None = None
@@ -33,6 +39,7 @@ class FrameKind:
             for (patch, key), module in tables.module_key.items():
                 if key < self.module_by_byte.shape[1]:
                     self.module_by_byte[patch, key] = module
+        self.channels: Indices
         if isinstance(frame.values, Expand):
             self.channels = np.arange(n_channels)
         else:
@@ -49,29 +56,62 @@ class FrameKind:
         found = self.module_by_byte[entry - self._n_modules, key]
         return np.where(found >= 0, found, entry)
 
-    def read(self, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_] | None]:
-        """The values of n frames.
+    def read(self, payload: Bytes) -> npt.NDArray[Any]:
+        """(n, width) values of n frames, in the frame's own dtype, if it says where they are.
 
         Args:
+            payload: (n, size) uint8.
+        """
+        runs = [_read_run(run, payload) for run in self.frame.runs]
+        return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1)
+
+    def expand(self, expand: Expand, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], Flags, Indices]:
+        """The values of n frames, if a function of the driver's author tells them.
+
+        Args:
+            expand: the frame's.
             payload: (n, size) uint8.
             length: (n,) uint8.
 
         Returns:
-            (n, width) values in the frame's own dtype; and (n, width) bool, which of them the frame does not have
-            (None: it has all).
+            (n, width) values; (n, width) bool, which of them the frames have; and the frames for which it raised.
         """
-        layout = self.frame.values
-        if isinstance(layout, Expand):
-            row, channel, value = layout.function(payload, length)
-            inside = (channel >= 0) & (channel < len(self.channels))
-            row, channel = row[inside], channel[inside]
-            raw = np.zeros((len(payload), len(self.channels)), value.dtype)
-            raw[row, channel] = value[inside]
-            missing = np.ones(raw.shape, bool)
-            missing[row, channel] = False
-            return raw, missing
-        runs = [_read_run(run, payload) for run in self.frame.runs]
-        return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1), None
+        try:
+            values, found = self._expand(expand, payload, length)
+        except Exception as error:  # noqa: BLE001 - whatever it stumbles over
+            if not self._told:
+                self._told = True
+                log.error(
+                    "frame %r: its Expand function raised %s: %s (%s:%d); frames for which it does are not shown, and"
+                    " counted as bad content; told once",
+                    self.frame.name,
+                    type(error).__name__,
+                    str(error),  # whoever keeps the record does not keep what the traceback refers to
+                    *traceback.extract_tb(error.__traceback__)[-1][:2],
+                )
+        else:
+            return values, found, np.zeros(0, np.int64)
+        # the others need not suffer from it
+        nothing = np.zeros((1, len(self.channels)), np.uint8), np.zeros((1, len(self.channels)), bool)
+        each, failed = [nothing] * len(payload), []
+        for row in range(len(payload)):
+            try:
+                each[row] = self._expand(expand, payload[row : row + 1], length[row : row + 1])
+            except Exception:  # noqa: BLE001
+                failed.append(row)
+        return np.concatenate([v for v, _ in each]), np.concatenate([f for _, f in each]), np.array(failed, np.int64)
+
+    def _expand(self, expand: Expand, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], Flags]:
+        row, channel, value = expand.function(payload, length)
+        if not len(row) == len(channel) == len(value) or value.dtype.kind not in "biuf":
+            raise ValueError(f"it returned {len(row)} rows, {len(channel)} channels, {len(value)} {value.dtype} values")
+        inside = (channel >= 0) & (channel < len(self.channels))
+        row, channel = row[inside], channel[inside]
+        values = np.zeros((len(payload), len(self.channels)), value.dtype)
+        values[row, channel] = value[inside]
+        found = np.zeros(values.shape, bool)
+        found[row, channel] = True
+        return values, found
 
     def flag(
         self, payload: Bytes, length: Bytes, raw: npt.NDArray[Any], status: Bytes, columns: slice, channels: Indices
@@ -179,7 +219,7 @@ class Assembly:
         orphans: Indices,
         values: npt.NDArray[Any],
         status: Bytes,
-    ) -> Indices:
+    ) -> tuple[Indices, Indices]:
         """Read n updates.
 
         Args:
@@ -191,18 +231,29 @@ class Assembly:
             status: (n, width) uint8, all zero; flags are set in it.
 
         Returns:
-            (n, width) int64: the sensor that each value belongs to.
+            (n, width) int64: the sensor that each value belongs to; and for each frame that cannot be read after
+            all, the update that it belongs to.
         """
         sensors = self._destination[module]
+        unreadable = orphans[:0]
         for member, (kind, columns) in enumerate(zip(self._kinds, self._columns, strict=True)):
             taken = wire[rows[:, member]]
             payload, length = taken["payload"], taken["length"]
             payload[orphans] = 0
-            raw, missing = kind.read(payload, length)
+            if isinstance(kind.frame.values, Expand):
+                complete = np.delete(np.arange(len(rows)), orphans)
+                expanded, found, failed = kind.expand(kind.frame.values, payload[complete], length[complete])
+                raw = np.zeros((len(rows), len(kind.channels)), expanded.dtype)
+                raw[complete] = expanded
+                missing = np.ones(raw.shape, bool)
+                missing[complete] = ~found
+                sensors[:, columns][missing] = self._sink
+                unreadable = np.append(unreadable, complete[failed])
+            else:
+                raw = kind.read(payload)
             values[:, columns] = raw
             kind.flag(payload, length, raw, status, columns, self._channels)
-            if missing is not None:
-                sensors[:, columns][missing] = self._sink
-        sensors[orphans] = self._sink
-        status[orphans] = 0
-        return sensors
+        nowhere = np.append(orphans, unreadable) if len(unreadable) else orphans
+        sensors[nowhere] = self._sink
+        status[nowhere] = 0
+        return sensors, unreadable

@@ -19,7 +19,7 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.publisher import Publisher
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 BATCH_FRAMES, _FRAMES_OF_A_BUS, _BATCH_BYTES = 2048, 256, 1 << 20
 _LOOK_PAUSE_NS = NS_PER_S // 20

@@ -205,6 +205,8 @@ class Expand:
 
     ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
     the row of ``payload``, the channel, and the value.
+
+    It gets what comes over the wire, garbage too. A frame for which it raises is counted as bad content and not shown.
     """
 
     function: Callable[
@@ -219,7 +221,7 @@ class Frame:
 
     Attributes:
         name: for the cycle and for messages.
-        when: all of these hold.
+        when: all of these hold; none: every frame of the bus is of this kind (but not those of 29-bit identifiers).
         length: payload lengths that are right; others are counted as bad and not shown.
         values: where the values are, in one run or in several.
         patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
@@ -232,9 +234,9 @@ class Frame:
     """
 
     name: str
-    when: Sequence[Condition]
-    length: Sequence[int]
-    values: Values | Sequence[Values] | Expand
+    when: Sequence[Condition] = ()
+    length: Sequence[int] = ()
+    values: Values | Sequence[Values] | Expand = ()
     patch: Bits | int | None = None
     module: Bits | int | None = None
     flags: Sequence[Flag | Sentinel | StatusBytes] = ()
@@ -324,7 +326,7 @@ def _check_frame(frame: Frame) -> None:
         raise refuse("it has no values")
     for values in frame.runs:
         if len(values.channels) != values.count:
-            raise refuse(f"{values.count} values, but `to` names {len(values.channels)} channels")
+            raise refuse(f"`count` is {values.count}, but the length of `to` is {len(values.channels)}")
         if values.end > min(frame.length):
             raise refuse(f"values end at byte {values.end}, the shortest right payload has {min(frame.length)}")
         if isinstance(values.dtype, Packed) and not 0 <= values.dtype.skip < 8:

@@ -9,7 +9,7 @@ from pathlib import Path
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import Bus
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 HIGH_LOAD = 0.8
 """Of what the wire can carry. Beyond it, frames of low priority wait for long."""
@@ -84,7 +84,7 @@ class MachineLimits:
         self._clock = clock
         self._looked_ns = clock()
         self._before = self._read()
-        self.softnet_dropped = 0
+        self.softnet_dropped: int = 0
 
     def look(self) -> None:
         """Read the file, if the last look was a second ago."""

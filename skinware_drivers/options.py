@@ -11,10 +11,25 @@ Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9`
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import traceback
 import types
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+from importlib.metadata import EntryPoint
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 import msgspec.structs
@@ -26,6 +41,7 @@ OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
 _HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
 _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 _LONGEST_RANGE = 1 << 16
+_ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "str": "a text"}
 _KINDS = {bool: "yes/no", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 
@@ -39,6 +55,64 @@ class Option(NamedTuple):
     default: str
     """The default as a person would write it; empty where nothing stands for it."""
     description: str
+
+
+class HasOptions(Generic[OptionsT]):
+    """What is made from options, whose class the base has in brackets: ``class Thumb(CanAdapter[ThumbOptions])``.
+
+    Args:
+        options: an object of that class.
+
+    Attributes:
+        Options: that class.
+        options: as given.
+        period_s: nominal time between two sets of data, s; options with a field ``period_ms`` set it.
+
+    Raises:
+        ConfigurationError: when a subclass is made: what stands in its brackets is no class of options.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]]
+    least_options: ClassVar[type[msgspec.Struct]] = msgspec.Struct
+    """What the class of the options must be derived from."""
+    period_s: float = 0.02
+
+    def __init_subclass__(cls, **more: Any) -> None:
+        super().__init_subclass__(**more)
+        named = _in_brackets(cls)
+        if isinstance(named, TypeVar):  # a subclass will say
+            return
+        if not (isinstance(named, type) and issubclass(named, cls.least_options)):
+            least = f"{cls.least_options.__module__}.{cls.least_options.__name__}"
+            raise ConfigurationError(
+                f"class {cls.__name__}: its base has {getattr(named, '__name__', named)} in brackets, where"
+                f" the class of its options belongs, derived from {least}"
+            )
+        if not issubclass(cls.Options, named):
+            if "Options" in vars(cls):
+                raise ConfigurationError(
+                    f"class {cls.__name__}: Options = {cls.Options.__name__} contradicts the {named.__name__} that"
+                    " its base has in brackets: leave out the line"
+                )
+            cls.Options = named
+
+    def __init__(self, options: OptionsT) -> None:
+        self.options = options
+        period_ms = getattr(options, "period_ms", 0)
+        if period_ms:
+            self.period_s = period_ms / 1000
+
+
+def _in_brackets(cls: Any) -> Any:
+    """The options' class that a subclass of HasOptions names, or has from its base; a TypeVar if neither does yet."""
+    for base in vars(cls).get("__orig_bases__", cls.__bases__):
+        origin: Any = get_origin(base) or base
+        if origin is HasOptions:
+            return get_args(base)[0]
+        if issubclass(origin, HasOptions):
+            inherited = _in_brackets(origin)
+            return dict(zip(origin.__parameters__, get_args(base), strict=False)).get(inherited, inherited)
+    return None
 
 
 def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:
@@ -120,6 +194,33 @@ def nearest_name(wrong: str, right: Iterable[str]) -> str:
     return f"{hint} Known: {', '.join(names) or 'none'}"
 
 
+def load_entry_point(entry: EntryPoint, what: str) -> Any:
+    """What somebody's package has registered.
+
+    Args:
+        entry: as it is registered.
+        what: for messages.
+
+    Raises:
+        ConfigurationError: it cannot be loaded; the message says why, and where in the package.
+    """
+    try:
+        return entry.load()
+    except Exception as error:
+        raise ConfigurationError(
+            f"{what} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}{_place_of(error)}"
+        ) from error
+
+
+def _place_of(error: Exception) -> str:
+    """The last file and line of the traceback that are somebody else's than Python's or ours, in brackets."""
+    if isinstance(error, SyntaxError):
+        return ""  # it says so itself
+    ours = (os.path.dirname(__file__), os.path.dirname(os.__file__), "<")
+    theirs = [place for place in traceback.extract_tb(error.__traceback__) if not place.filename.startswith(ours)]
+    return f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
+
+
 def _split(text: str, plain: Any) -> Any:
     """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
     if plain is bool:
@@ -190,14 +291,18 @@ def _default(field: msgspec.structs.FieldInfo) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """What msgspec says, without its path to a value that the message already names."""
-    return re.sub(r" - at `\$\[(\d+)\]`", r" (item \1, counted from 0)", str(error)).replace("`", "")
+    """What msgspec says, in words for people, without its path to a value that the message already names."""
+    text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
+    asked = re.compile(r"Expected `(\w+)(.*?)`(?:, got `\w+`)?")
+    return asked.sub(lambda match: f"give {_ASKED.get(match[1], match[1])}{match[2]}", text).replace("`", "")
 
 
 __all__ = [
+    "HasOptions",
     "Option",
     "check_options",
     "describe_options",
+    "load_entry_point",
     "nearest_name",
     "option_text",
     "options_from_strings",

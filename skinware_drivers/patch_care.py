@@ -16,7 +16,7 @@ from skinware_drivers.bus_line import BusLine
 from skinware_drivers.description import Patch
 from skinware_drivers.generation import Generation
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100

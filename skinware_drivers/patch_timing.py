@@ -19,7 +19,8 @@ class PatchTiming:
 
     def __init__(self, structure: Structure) -> None:
         both = np.zeros((2, structure.n_patches, BUCKETS), np.int64)
-        self.intervals, self.ages = both
+        self.intervals: npt.NDArray[np.int64] = both[0]
+        self.ages: npt.NDArray[np.int64] = both[1]
         self._counts = both.reshape(-1)
         self._first_bucket = structure.module_patch.astype(np.intp) * BUCKETS
         self._before_ns = np.zeros(structure.n_modules, np.int64)

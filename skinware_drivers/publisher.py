@@ -90,14 +90,14 @@ class Publisher:
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
         self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show)
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
-        self.timing = PatchTiming(structure)
+        self.timing: PatchTiming = PatchTiming(structure)
         self._behind = np.zeros(structure.n_modules, bool)
         self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
         self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
         self._due_ns = 0
         self._not_before_ns = 0  # a burst that has begun holds up the frame until then
         self._last_published_ns = now_ns()
-        self.patch_state = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
+        self.patch_state: npt.NDArray[np.uint8] = np.full(structure.n_patches, int(PatchState.EXPECTED), np.uint8)
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
         self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
         self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)

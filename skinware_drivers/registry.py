@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import parse_qsl
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import nearest_name
+from skinware_drivers.options import load_entry_point, nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
@@ -27,14 +27,16 @@ class BusName(NamedTuple):
 def parse_bus_name(name: str) -> BusName:
     """Take a bus' name apart.
 
-    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process, ``/dev/ttyUSB0`` is
-    ``serial:/dev/ttyUSB0``, as are pyserial's URLs (``socket://host:port``), and python-can's interfaces of names
-    that are ours are ``can+virtual:`` and ``can+serial:``.
+    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
+    (``/dev/ttyUSB0``, ``./port``), is a serial port; pyserial's URLs (``socket://host:port``) are serial, too.
+    python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:
         ConfigurationError: empty, or options that are not ``key=value``.
     """
     address, _, query = name.partition("?")
+    if "=" in address and "/" not in address:
+        raise ConfigurationError(f"bus {name!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
     if not address:
         raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
     try:
@@ -42,7 +44,7 @@ def parse_bus_name(name: str) -> BusName:
     except ValueError:
         raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
     interface, colon, channel = address.partition(":")
-    if address.startswith("/") or channel.startswith("//"):  # a device, or one of pyserial's URLs
+    if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
         interface, channel = "serial", address
     elif not colon:
         interface, channel = (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)
@@ -88,10 +90,9 @@ def load_driver(name: str) -> type[AnyAdapter]:
     """
     known = {entry.name: entry for entry in entry_points(group=DRIVERS)}
     if name not in known:
-        raise ConfigurationError(f"unknown driver {name!r}{nearest_name(name, known)}")
-    try:
-        loaded: Any = known[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"driver {name!r} ({known[name].value}) cannot be loaded: {error}") from error
-    driver: type[AnyAdapter] = loaded
-    return driver
+        names = nearest_name(name, known)
+        raise ConfigurationError(f"unknown driver {name!r}{names}. One of yours has to be installed: pip install -e .")
+    loaded = load_entry_point(known[name], f"driver {name!r}")
+    if not (isinstance(loaded, type) and issubclass(loaded, Adapter)):
+        raise ConfigurationError(f"driver {name!r}: {known[name].value} is no subclass of CanAdapter or its like")
+    return loaded

@@ -34,7 +34,7 @@ from skinware_drivers.patch_care import PatchCare
 from skinware_drivers.polling import Poller
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 PublishMode = Literal["cycle", "rate", "request"]
 
@@ -69,12 +69,12 @@ class Runner:
         self.name = name
         self.driver_type = driver_type
         self._epoll = select.epoll()
-        self.lines = [
+        self.lines: list[BusLine] = [
             BusLine(bus_name, i, adapter, bus, self._epoll) for i, (bus_name, adapter, bus) in enumerate(lines)
         ]
         self.writer: DriverWriter | None = None
         self.generation: Generation | None = None
-        self.ready = False
+        self.ready: bool = False
         self._listen_only = listen_only
         self._publish = publish
         self._desk: RequestDesk | None = None

@@ -191,6 +191,7 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverFrame]:
     """Frames for ever, over restarts of the driver; says on stderr when it came back."""
+    from skinware.cli._format import plural
     from skinware.errors import StructureChanged
 
     generation = reader.generation
@@ -205,7 +206,8 @@ def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None
         except StructureChanged:
             _reattach(reader, timeout_s)
             generation = reader.generation
-            warn(f"driver {reader.name!r} came back with another structure: {reader.structure.n_sensors} sensors now")
+            sensors = plural(reader.structure.n_sensors, "sensor")
+            warn(f"driver {reader.name!r} came back with another structure: {sensors} now")
 
 
 def _reattach(reader: DriverReader, timeout_s: float | None) -> None:

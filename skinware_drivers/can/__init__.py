@@ -1,1 +1,5 @@
-"""CAN: buses, and the drivers of skins that hang on them."""
+"""CAN: buses, the adapter that drivers of CAN devices subclass, and the drivers of skins that hang on CAN."""
+
+from skinware_drivers.can.adapter import CanAdapter
+
+__all__ = ["CanAdapter"]

@@ -21,14 +21,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
@@ -99,12 +99,11 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
     Values are raw: 1/256 N/cm2 in full format, N/cm2 in the other; the type's scale makes pascals of them.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = BarrettOptions
-    dtype = np.uint16
+    dtype: npt.DTypeLike = np.uint16
 
     def __init__(self, options: BarrettOptions) -> None:
         super().__init__(options)
-        self.patches = tuple(
+        self.patches: Sequence[Patch] = tuple(
             Patch(
                 "palm" if node == LAST_NODE else f"finger {node - FIRST_NODE + 1}",
                 [Module(taxels(CELLS, first_uid=node << 8), kind="pad")],
@@ -114,17 +113,12 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         )
         if options.format == "full":
             names = tuple(frame.name for frame in _FULL)
-            self.layout = Layout(_FULL, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
+            self.layout: Layout = Layout(_FULL, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
             greatest, scale = 4095, _PA_PER_N_CM2 / 256
         else:
             self.layout = Layout((_TOP_10,))
             greatest, scale = 15, _PA_PER_N_CM2
-        self.types = (PRESSURE.measured(scale=scale, minimum=0, maximum=greatest * scale),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
+        self.types: Sequence[SensorType] = (PRESSURE.measured(scale=scale, minimum=0, maximum=greatest * scale),)
 
     @property
     def polls(self) -> Sequence[Poll]:

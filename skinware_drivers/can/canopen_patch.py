@@ -13,26 +13,28 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import canopen
 import msgspec
+import numpy.typing as npt
 from canopen.emcy import EmcyError
 from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
-from skinware.sensor_types import CATALOGUE
+from skinware.sensor_types import CATALOGUE, SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.pdo_map import PdoMap, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.can.sdo import SdoAborted, SdoClient
 from skinware_drivers.description import Patch
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match, Reply
 from skinware_drivers.options import check_options, nearest_name
 from skinware_drivers.polling import Poll
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 FIRST_NODE, LAST_NODE = 1, 127
 _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
@@ -80,8 +82,11 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         expects_heartbeat_of: nodes that took the heartbeat period of the options; others are not missed.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = CanopenOptions
     payload_size = 8
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike
+    layout: Layout
+    patches: Sequence[Patch]
 
     def __init__(self, options: CanopenOptions) -> None:
         super().__init__(options)
@@ -89,11 +94,6 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         self._clients: dict[int, SdoClient] = {}
         self._tpdos: dict[int, list[Tpdo]] = {}
         self.expects_heartbeat_of: set[int] = set()
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
 
     @property
     def polls(self) -> Sequence[Poll]:

@@ -11,12 +11,14 @@ no command: the finger sends by itself. [INF]
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Cycle, Frame, Identifier, Layout, Values
@@ -42,17 +44,11 @@ class CyskinCpmOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
     """One finger on each bus. Sensor uid = taxel; raw counts, of which hosts take a baseline themselves."""
 
-    Options: ClassVar[type[msgspec.Struct]] = CyskinCpmOptions
-    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
-    dtype = np.uint16
-    patches = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
+    dtype: npt.DTypeLike = np.uint16
+    patches: Sequence[Patch] = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
 
     def __init__(self, options: CyskinCpmOptions) -> None:
         super().__init__(options)
         names = tuple(frame.name for frame in QUARTERS)
-        self.layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
+        self.layout: Layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))

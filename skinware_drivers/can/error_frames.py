@@ -51,8 +51,8 @@ class ControllerHealth:
     """
 
     def __init__(self) -> None:
-        self.overflows = 0
-        self.bus_offs = 0
+        self.overflows: int = 0
+        self.bus_offs: int = 0
         self._state = BusReason.NONE
         self._trouble_until_ns = dict.fromkeys(_TROUBLES, 0)
 

@@ -17,7 +17,7 @@ from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Packed, Values
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _NOT_IN_USE, _IS_EXTENDED = 1 << 31, 1 << 29
 
@@ -111,10 +111,10 @@ class PdoMap:
         known = [variable for variable in self._sensors.values() if variable is not None]
         if not known:
             raise ConfigurationError("none of the objects that are mapped into TPDOs is a number that the EDS knows")
-        self.dtype = _common_dtype(known)
-        self.types = self._types(known)
-        self.layout = Layout(tuple(self._frames(nodes)))
-        self.patches = tuple(
+        self.dtype: np.dtype[Any] = _common_dtype(known)
+        self.types: list[SensorType] = self._types(known)
+        self.layout: Layout = Layout(tuple(self._frames(nodes)))
+        self.patches: tuple[Patch, ...] = tuple(
             Patch(f"node {node}", [self._module(node, tpdo) for tpdo in tpdos], key=node)
             for node, tpdos in nodes.items()
         )

@@ -16,7 +16,7 @@ from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2

@@ -43,7 +43,7 @@ class Rows:
 
     def __init__(self, batch: FrameBatch) -> None:
         capacity, rows = batch.capacity, np.arange(batch.capacity)
-        self.control = np.zeros((capacity, CONTROL_WORDS), np.int64)
+        self.control: npt.NDArray[np.int64] = np.zeros((capacity, CONTROL_WORDS), np.int64)
         self._iov = np.zeros(capacity, _IOVEC)
         self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
         self._iov["length"] = batch.wire.strides[0]

@@ -11,7 +11,6 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
 
 import msgspec
 import numpy as np
@@ -56,7 +55,7 @@ from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.skin_state import Updates
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DISCOVERY_S = 0.3
 _REPLY_S = 0.2
@@ -108,7 +107,9 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     Triangles that the configuration leaves switched off are not part of the structure.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = RoboskinOptions
+    options: RoboskinOptions
+    layout: Layout
+    period_s: float
     types: Sequence[SensorType] = SKIN_TYPES
     dtype: npt.DTypeLike = np.uint8
 
@@ -121,17 +122,11 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         self.types = make_types(options)
         if options.all_inertial:
             self.dtype = np.int16
-        self.layout = self._layout()
+        self._fit_boards()
         if options.boards and not any(self.patches_set_up(options.boards)):
             raise ConfigurationError(
                 f"boards {', '.join(map(str, options.boards))}: the configuration leaves all triangles switched off"
             )
-
-    @property
-    def period_s(self) -> float:
-        """The longest period of all boards."""
-        periods = [set_up.period_ms for set_up in self._set_ups(self._boards or range(FIRST_BOARD, LAST_BOARD + 1))]
-        return max(*periods, self.options.inertial_period_ms if self.options.all_inertial else 0) / 1e3
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """The boards that were named, or else those that answer; a listener learns them from their data.
@@ -149,7 +144,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         if not self._told:
             self._tell_what_is_odd(link)
         self._told = bool(self._boards)
-        self.layout = self._layout()
+        self._fit_boards()
         return self.patches_set_up(self._boards)
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
@@ -219,7 +214,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             for s in self.options.special_boards
         )
         self.options = msgspec.structs.replace(self.options, period_ms=period_ms, special_boards=special)
-        self.layout = self._layout()
+        self._fit_boards()
         await self.rebaseline(link, patches)
         return 1e3 / period_ms
 
@@ -243,9 +238,12 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
     def _is_mtb4(self, board: int) -> bool:
         return self._board_type.get(board, _MTB3_TYPE if self.options.old_style else 0) != _MTB3_TYPE
 
-    def _layout(self) -> Layout:
+    def _fit_boards(self) -> None:
+        """Have layout and period fit the boards and how often they send."""
         boards = self._boards or range(FIRST_BOARD, LAST_BOARD + 1)
-        return make_layout(self.options, min(set_up.period_ms for set_up in self._set_ups(boards)) / 1e3)
+        periods_ms = [set_up.period_ms for set_up in self._set_ups(boards)]
+        self.layout = make_layout(self.options, min(periods_ms) / 1e3)
+        self.period_s = max(*periods_ms, self.options.inertial_period_ms if self.options.all_inertial else 0) / 1e3
 
     async def _configure(self, link: Link, boards: Iterable[int], *, inertial: bool = True) -> None:
         set_ups = self._set_ups(boards)

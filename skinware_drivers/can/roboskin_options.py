@@ -12,7 +12,7 @@ from skinware.errors import ConfigurationError
 FIRST_BOARD, LAST_BOARD = 1, 14
 TRIANGLES = 16
 CHANNELS = 12
-NON_TACTILE = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
+NON_TACTILE: dict[str, tuple[int, ...]] = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
 """Channels of each kind of module that feel no touch."""
 TRIANGLE_SKIN_TYPES = (0, 2, 8)
 """Types of skin whose modules are triangles, as long as nobody says otherwise."""

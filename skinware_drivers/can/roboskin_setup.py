@@ -55,7 +55,8 @@ class BoardSetUp:
         self.first: list[bytes] = []
         self.special_board: list[bytes] = []
         self.special_triangles: list[bytes] = []
-        self.period_ms, self.skin_type = options.period_ms, options.skin_type
+        self.period_ms: int = options.period_ms
+        self.skin_type: int = options.skin_type
         self.inertial: Inertial = options.inertial
         self._no_load = options.no_load
         self._inertial_period_ms = options.inertial_period_ms
@@ -68,9 +69,9 @@ class BoardSetUp:
             wanted = set(self._on)
         else:
             wanted = self._set_up_new(options, modules)
-        self.enabled = frozenset(self._on)
+        self.enabled: frozenset[int] = frozenset(self._on)
         named_off = {t for module in modules if module.enabled is False for t in module.triangles}
-        self.wiped = frozenset(wanted - self._on - named_off)
+        self.wiped: frozenset[int] = frozenset(wanted - self._on - named_off)
 
     def inertial_set_up(self) -> list[bytes]:
         """IMU_CONFIG_SET, if the board has an IMU to configure."""

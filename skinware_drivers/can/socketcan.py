@@ -90,11 +90,11 @@ class SocketCanBus(Bus):
             self._wanted = options_from_strings(SocketCanOptions, self.options)
         except ConfigurationError as error:
             raise ConfigurationError(f"bus {channel}: {error}") from None
-        self.narrows = self._wanted.filter == "on"
+        self.narrows: bool = self._wanted.filter == "on"
         self._filters: Sequence[Filter] = ()
         self._socket: socket.socket | None = None
         self._lost_before = 0
-        self.granted_buffer = 0
+        self.granted_buffer: int = 0
         self._stamper = Stamper()
         self._health = ControllerHealth()
         self._is_bound = False
@@ -257,7 +257,7 @@ class SocketCanBus(Bus):
             return
         self._restarts_itself = controller.restart_ms > 0
         # of FD frames a part is faster, and of filtered ones nothing is known: then there is no telling the load
-        self.bit_rate = 0 if self.payload_size > 8 or self.narrows else controller.bit_rate
+        self.bit_rate: int = 0 if self.payload_size > 8 or self.narrows else controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
 
@@ -306,7 +306,7 @@ class SocketCanBus(Bus):
             data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
             words = array.array("I", data)
             self.counters.lost = self._lost_before + words[_MEMINFO_DROPS]
-            self.fullest = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
+            self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
 
 
 def _wire_bits(wire: npt.NDArray[np.void]) -> int:

@@ -18,13 +18,14 @@ answer to any command.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
+from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
@@ -77,26 +78,22 @@ class XelaDriver(CanAdapter[XelaOptions]):
     raw (idle about 32 to 37 thousand); forces are computed by the maker's closed server only.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = XelaOptions
-    types = tuple(t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE))
-    dtype = np.uint16
+    types: Sequence[SensorType] = tuple(
+        t.measured(unit="counts", minimum=0, maximum=0xFFFF) for t in (SHEAR_X, SHEAR_Y, PRESSURE)
+    )
+    dtype: npt.DTypeLike = np.uint16
 
     def __init__(self, options: XelaOptions) -> None:
         super().__init__(options)
         ids = {b: options.identifiers(first) for b, first in zip(options.boards, options.first_id, strict=True)}
-        self.patches = tuple(_patch(board, identifiers) for board, identifiers in ids.items())
+        self.patches: Sequence[Patch] = tuple(_patch(board, identifiers) for board, identifiers in ids.items())
         axes = Values(offset=1, dtype=">u2", count=3)
-        self.layout = Layout(
+        self.layout: Layout = Layout(
             tuple(
                 Frame(f"board {board}", (_block(identifiers),), (8,), axes, patch=board, module=Bits(0, 11))
                 for board, identifiers in ids.items()
             )
         )
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
 
     async def start(self, link: Link) -> None:
         """Command 07 00 to every board."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
+from skinware.cli._format import plural
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from skinware_drivers.runner import PublishMode, Runner
 
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 UNIT_FILE = "skinware@.service"
 _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
@@ -50,7 +51,11 @@ class DriverCommand(click.Command):
                 text = option.description + (f"  [default: {option.default}]" if option.default else "")
                 flag = "--" + option.name.replace("_", "-")
                 self.params.append(click.Option([flag, option.name], metavar=option.kind, help=text))
-        return super().parse_args(ctx, args)
+        ctx.allow_extra_args = True
+        left = super().parse_args(ctx, args)
+        if left:
+            raise click.UsageError(f"{left[0]!r} is no option: name the driver with --driver, a bus with --bus", ctx)
+        return left
 
 
 def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
@@ -146,6 +151,7 @@ def command(
 
     def line_of(bus_name: str, settings: DriverConfig) -> tuple[str, AnyAdapter, Bus]:
         adapter = driver(options_of_bus(driver.Options, settings, bus_name, given))
+        adapter.check()
         bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
         return bus_name, adapter, bus
 
@@ -233,17 +239,16 @@ def _tell_ready(runner: Runner, as_json: bool) -> None:
     if runner.generation is None:
         return
     structure = runner.generation.tables.structure
-    counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
     buses = [line.name for line in runner.lines]
     if as_json:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
+        counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
         print_json({**ready, "types": types, "buses": buses})
     else:
-        click.echo(
-            f"{runner.name}: {counts['patches']} patches, {counts['modules']} modules, {counts['sensors']} sensors"
-            f" on {', '.join(buses)}; publishing (skin-top shows them, Ctrl-C ends)"
-        )
+        patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
+        what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
+        click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
 
 
 def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:

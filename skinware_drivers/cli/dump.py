@@ -123,7 +123,7 @@ def _tell_what_is_missing(bus: Bus) -> None:
         warn(text)
 
 
-command = click.Command(
+command: click.Command = click.Command(
     "skin-dump",
     context_settings=CONTEXT_SETTINGS,
     callback=dump,

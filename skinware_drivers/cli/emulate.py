@@ -83,10 +83,14 @@ def _emulate(
 ) -> None:
     from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
     from skinware_drivers.options import options_from_strings
-    from skinware_drivers.registry import make_bus
+    from skinware_drivers.registry import make_bus, parse_bus_name
     from skinware_drivers.virtual.events import JsonLinesLog
     from skinware_drivers.virtual.hardware import load_emulator, medium_of
 
+    if parse_bus_name(bus_name).interface == "virtual":
+        raise ConfigurationError(
+            f"--bus {bus_name}: nobody else can open it; give vcan0 or pty:./port, or none: skin-driver --bus virtual"
+        )
     emulator = load_emulator(driver)
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
@@ -94,7 +98,7 @@ def _emulate(
     medium = "serial" if framing is not None else medium_of(emulator)
     bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if bus.medium not in (None, medium):
-        where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty or a port"
+        where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty:./port or a port"
         raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
     if medium == "serial" and getattr(options, "foreign_hz", False):
         raise ConfigurationError("--foreign-hz: nothing else hangs on a serial line")

@@ -74,7 +74,7 @@ class SignalWatch:
     """Turns SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
 
     def __init__(self) -> None:
-        self.stopped = False
+        self.stopped: bool = False
         self._reader, self._writer = socket.socketpair()
         self._reader.setblocking(False)
         self._writer.setblocking(False)
@@ -141,7 +141,7 @@ class Emulation:
         self._batch = FrameBatch(256, bus.payload_size)
         self._open = False
         self._backoff_ns = _FIRST_BACKOFF_NS
-        self.send_failures = 0
+        self.send_failures: int = 0
         """Frames given up."""
 
     def run(

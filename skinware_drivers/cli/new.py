@@ -11,8 +11,8 @@ from skinware.cli._command import CONTEXT_SETTINGS, examples, run
 _HOW_TO_RUN = {
     "can": ("skin-driver --driver {name} --bus virtual",),
     "serial": (
-        "skin-emulate --driver {name} --bus pty:/tmp/{name}",
-        "skin-driver --driver {name} --bus /tmp/{name}       # in another terminal",
+        "skin-emulate --driver {name} --bus pty:port",
+        "skin-driver --driver {name} --bus ./port       # in another terminal",
     ),
     "virtual": ("skin-driver --driver {name} --bus virtual",),
 }

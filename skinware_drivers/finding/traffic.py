@@ -43,7 +43,7 @@ class Traffic:
     """
 
     def __init__(self) -> None:
-        self.frames = 0
+        self.frames: int = 0
         self._kept = 0
         self._wire: list[npt.NDArray[Any]] = []
 

@@ -1,1 +1,51 @@
-"""Serial lines: framing, the bus, and the adapter that drivers of serial devices subclass."""
+"""Serial lines: the adapter that drivers of serial devices subclass, framings, and checksums."""
+
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import (
+    CRC8,
+    CRC16_CCITT_FALSE,
+    CRC16_MODBUS,
+    CRC16_WEISS,
+    CRC16_X25,
+    CRC16_XMODEM,
+    CRC32,
+    CRC32C,
+    LRC,
+    SUM8,
+    XOR,
+    Crc,
+    Sum,
+    Xor,
+)
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.packets import Length, LengthTable, Packet
+from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
+
+__all__ = [
+    "COBS",
+    "CRC8",
+    "CRC16_CCITT_FALSE",
+    "CRC16_MODBUS",
+    "CRC16_WEISS",
+    "CRC16_X25",
+    "CRC16_XMODEM",
+    "CRC32",
+    "CRC32C",
+    "HDLC",
+    "LINES",
+    "LRC",
+    "SLIP",
+    "SUM8",
+    "XOR",
+    "Crc",
+    "Delimited",
+    "Field",
+    "Length",
+    "LengthTable",
+    "Packet",
+    "SerialAdapter",
+    "Sum",
+    "Unframed",
+    "Xor",
+]

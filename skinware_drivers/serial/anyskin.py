@@ -11,17 +11,20 @@ message counts after any doubt only if it ends with 0D 0A and the 82 bytes behin
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE
+from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Layout, Sentinel, Values
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.packets import Packet
 
 
@@ -42,24 +45,18 @@ class AnySkinDriver(SerialAdapter[AnySkinOptions]):
     number is shown with ``SUSPECT``.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = AnySkinOptions
-    types = (
+    types: Sequence[SensorType] = (
         TEMPERATURE,
         *(t.measured(scale=1e-6) for t in (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)),
     )
-    dtype = np.float32
+    dtype: npt.DTypeLike = np.float32
 
     def __init__(self, options: AnySkinOptions) -> None:
         super().__init__(options)
         size = 16 * options.mags
-        self.framing = Packet(length=size + 2, trailer=b"\r\n", confirmed=True)
+        self.framing: Framing = Packet(length=size + 2, trailer=b"\r\n", confirmed=True)
         no_number = tuple(Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf))
         values = Values(offset=0, dtype="<f4", count=4 * options.mags)
-        self.layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
+        self.layout: Layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
         channels = taxels(options.mags, *(t.name for t in self.types))
-        self.patches = (Patch("anyskin", (Module(channels, kind="board"),)),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
+        self.patches: Sequence[Patch] = (Patch("anyskin", (Module(channels, kind="board"),)),)

@@ -179,7 +179,7 @@ class Framer(ABC):
     """
 
     def __init__(self) -> None:
-        self.counters = FramerCounters()
+        self.counters: FramerCounters = FramerCounters()
         self._rest = b""
         self._before = 0  # bytes of the stream before the rest
         self._wanted = 0  # the rest cannot be decided before it has so many bytes

@@ -17,15 +17,17 @@ from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
 from skinware_drivers.device_time import DeviceClock
+from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.delimited import Delimited
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
     DATA,
@@ -42,7 +44,7 @@ from skinware_drivers.serial.openpatch_description import (
 )
 from skinware_drivers.serial.stuffing import COBS
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 HELLO, DESCRIBE, START, STOP, PERIOD, ENABLE, TARE, STATUS = range(1, 9)
 BOOT, REPORT, NOTE = 0x60, 0x61, 0x62
@@ -92,8 +94,10 @@ class Refused(BusError):
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     """One open patch on a serial line."""
 
-    Options = OpenPatchOptions
-    framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    framing: Framing = Delimited(COBS, maximum_body=MOST_PAYLOAD, checksum=CRC32, identifier=Field(0))
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike
+    layout: Layout
 
     def __init__(self, options: OpenPatchOptions) -> None:
         super().__init__(options)
@@ -101,7 +105,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._crc = 0
         self._patch: Patch | None = None
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
-        self._period_us = 0
         self._disabled: set[int] = set()
         self._clock = DeviceClock(1e-6)
         self._clock_fails = False
@@ -109,11 +112,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
-
-    @property
-    def period_s(self) -> float:
-        """Time between two updates of every module, s."""
-        return self._period_us / 1e6 or 0.02
 
     @property
     def payload_size(self) -> int:
@@ -144,7 +142,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         log.info("%s: %s, firmware %s", link.bus_name, found.name, found.firmware or "of no version")
         self._description, self._crc, self._patch = found, greeting.crc, found.patch
         self.types, self.dtype, self.layout = found.types, found.dtype, found.layout
-        self._period_us = self._wanted_us or found.period_us
+        self.period_s: float = (self._wanted_us or found.period_us) / 1e6
         self._disabled.clear()
         return [self._patch]
 
@@ -272,7 +270,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if not 0 < hz <= 1e6:
             raise ValueError(f"{hz:g} Hz: give more than 0, up to 1000000")
         await self._set_period(link, round(1e6 / hz))
-        return 1e6 / self._period_us
+        return 1 / self.period_s
 
     @operation()
     async def enable(
@@ -321,7 +319,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         became_us = int.from_bytes(answer[:4], "little")
         if len(answer) < 4 or not became_us:
             raise BadDescription("the patch does not say which period it has now")
-        self._period_us = self._wanted_us = became_us
+        self._wanted_us = became_us
+        self.period_s = became_us / 1e6
 
     # -- asking ---------------------------------------------------------------------------------------------------
 

@@ -231,10 +231,10 @@ class PtyPort(Port):
             self._fd, self._other = os.openpty()  # the other end stays open, so that programs can come and go
         except OSError as error:
             raise BusNotAvailable(f"no pseudo terminal: {error.strerror}") from None
-        self.path = os.ttyname(self._other)
+        self.path: str = os.ttyname(self._other)
         tty.setraw(self._other)
         os.set_blocking(self._fd, False)
-        self.note = f"serial port {self.path}"
+        self.note: str = f"serial port {self.path}"
         if link:
             try:
                 if os.path.islink(link):

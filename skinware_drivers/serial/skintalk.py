@@ -10,20 +10,21 @@ the last record before a pause waits for the next one. With two bytes that can b
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Expand, Frame, Layout, Packed, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.framing import Encoding, Field, Framing, Unframed
 from skinware_drivers.serial.packets import Packet
 
 _START, _STOP = b"1", b"0"
@@ -62,19 +63,18 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
     uid = patch << 4 | cell. Records of patches or cells that the options do not name are counted as unknown.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = SkintalkOptions
-    types = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
-    dtype = np.int32
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=-(1 << 23), maximum=(1 << 23) - 1),)
+    dtype: npt.DTypeLike = np.int32
     baudrate = 2_000_000
-    framing = Packet(sync=b"\x55", length=5, identifier=Field(1), confirmed="each")
-    commands = Unframed()
+    framing: Framing = Packet(sync=b"\x55", length=5, identifier=Field(1), confirmed="each")
+    commands: Encoding | None = Unframed()
 
     def __init__(self, options: SkintalkOptions) -> None:
         super().__init__(options)
         exact = Values(0, Packed(24, signed=True), 1)
         values = exact if options.negative == "twos_complement" else Expand(_off_by_one)
-        self.layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
-        self.patches = tuple(
+        self.layout: Layout = Layout((Frame("record", (), (3,), values, patch=Bits(4, 4), module=Bits(0, 4)),))
+        self.patches: Sequence[Patch] = tuple(
             Patch(
                 f"patch {number}",
                 [Module(taxels(1, first_uid=number << 4 | i), key=i, kind="cell") for i in range(options.cells)],
@@ -83,11 +83,6 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
             for number in options.patches
         )
 
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
-
     async def start(self, link: Link) -> None:
         """Start all patches."""
         await link.send(0, _START)
@@ -95,11 +90,6 @@ class SkintalkDriver(SerialAdapter[SkintalkOptions]):
     async def stop(self, link: Link) -> None:
         """Stop all patches."""
         await link.send(0, _STOP)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Start all patches again: there is no question that one would answer, but it may have lost its power."""
-        await link.send(0, _START)
-        return False
 
 
 def _off_by_one(

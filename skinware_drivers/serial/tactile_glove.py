@@ -10,17 +10,19 @@ what follows it is one, too: a packet that lost bytes could otherwise pass with 
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Layout, Packed, Values
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Packet
 
 _FIRST = 0x3C
@@ -43,10 +45,9 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
     Values are those of the wire (0 is the greatest pressure); ``physical`` is 4095 - value, as the maker shows it.
     """
 
-    Options: ClassVar[type[msgspec.Struct]] = TactileGloveOptions
-    types = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
-    dtype = np.uint16
-    framing = Packet(
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", scale=-1, offset=4095, minimum=0, maximum=4095),)
+    dtype: npt.DTypeLike = np.uint16
+    framing: Framing = Packet(
         sync=(range(_FIRST, _FIRST + _MOST), 0x01),
         length=5,
         trailer=b"\0",
@@ -54,14 +55,9 @@ class TactileGloveDriver(SerialAdapter[TactileGloveOptions]):
         header=2,
         confirmed="each",
     )
-    layout = Layout((Frame("taxel", (), (2,), Values(0, Packed(12, skip=4), 1), module=Bits(0, 8)),))
+    layout: Layout = Layout((Frame("taxel", (), (2,), Values(0, Packed(12, skip=4), 1), module=Bits(0, 8)),))
 
     def __init__(self, options: TactileGloveOptions) -> None:
         super().__init__(options)
         modules = [Module(taxels(1, first_uid=i), key=_FIRST + i, kind="taxel") for i in range(options.taxels)]
-        self.patches = (Patch("glove", modules),)
-
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1e3
+        self.patches: Sequence[Patch] = (Patch("glove", modules),)

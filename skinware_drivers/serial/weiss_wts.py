@@ -33,10 +33,10 @@ from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_WEISS
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
 _HEADER = 5
@@ -96,25 +96,20 @@ class Refused(BusError):
 class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     """One WTS on a serial line."""
 
-    Options = WeissWtsOptions
-    framing = Packet(
+    framing: Framing = Packet(
         sync=(0xAA, 0xAA, 0xAA),
         length=Length(Field(4, 2), more=8),
         maximum=8 + _MOST_PAYLOAD,
         checksum=CRC16_WEISS,
         identifier=Field(3),
     )
-    dtype = np.uint16
+    layout: Layout
+    dtype: npt.DTypeLike = np.uint16
 
     def __init__(self, options: WeissWtsOptions) -> None:
         super().__init__(options)
         self._matrix = b""
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
-
-    @property
-    def period_s(self) -> float:
-        """As the sensor is told, s."""
-        return self.options.period_ms / 1e3
 
     @property
     def payload_size(self) -> int:
@@ -138,7 +133,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         if not 1 <= count <= _MOST_CELLS or not full_scale:
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
         log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
-        self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
+        self.types: Sequence[SensorType] = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
         self.layout, self._matrix = self._layout(count), answer
         return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{columns}x{rows}")])]
 

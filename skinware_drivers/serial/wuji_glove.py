@@ -18,10 +18,11 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Stamp, Values
@@ -30,10 +31,10 @@ from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
-from skinware_drivers.serial.framing import Field
+from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
 
-log = logging.getLogger("skinware.driver")
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _INFO, _HAND, _DIAGNOSTICS, _STREAM, _GET, _SET = 0x0101, 0x0103, 0x0301, 0x0401, 0x0501, 0x0502
 _RATE, _U16 = 2, 0  # key and type of the configuration value
@@ -75,8 +76,7 @@ class Refused(BusError):
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     """One board on a serial line."""
 
-    Options = WujiGloveOptions
-    framing = Packet(
+    framing: Framing = Packet(
         sync=(0xAA, (_DATA, _ANSWER)),
         length=Length(Field(2, 2), more=0),
         maximum=3088,
@@ -84,16 +84,16 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         covers=(2, -2),
         identifier=Field(1),
     )
-    commands = Packet(
+    commands: Encoding | None = Packet(
         sync=(0xAA, 0x56),
         length=Length(Field(2, 2), more=0),
         maximum=512,
         checksum=CRC16_CCITT_FALSE,
         covers=(2, -2),
     )
-    types = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
-    dtype = np.float32
-    layout = Layout(
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="1", minimum=0, maximum=1),)
+    dtype: npt.DTypeLike = np.float32
+    layout: Layout = Layout(
         [
             Frame(
                 "frame",
@@ -111,13 +111,8 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         super().__init__(options)
         self._number = 0
         self._wanted_hz = options.rate_hz
-        self._rate_hz = float(options.rate_hz or _USUAL_HZ)
+        self.period_s: float = 1 / (options.rate_hz or _USUAL_HZ)
         self._on = True
-
-    @property
-    def period_s(self) -> float:
-        """Time between two frames, s."""
-        return 1 / self._rate_hz
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the board who it is; who only listens need not know."""
@@ -128,7 +123,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             log.info("%s: glove board %s, firmware %s", link.bus_name, serial_number, info[28:32].hex("."))
             name = {0: "left glove", 1: "right glove"}.get(hand[0], name)
             if not self._wanted_hz:
-                self._rate_hz = await self._get_rate(link)
+                self.period_s = 1 / await self._get_rate(link)
         module = Module([Sensor("pressure", cell) for cell in range(_N)], kind=f"{_ROWS}x{_COLUMNS}")
         return [Patch(name, [module])]
 
@@ -167,7 +162,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             raise ValueError(f"{hz} Hz: give 1 to 1000")
         await self._set_rate(link, hz)
         self._wanted_hz = hz
-        return self._rate_hz
+        return 1 / self.period_s
 
     @operation()
     async def enable(self, link: Link, patches: Sequence[Patch], on: bool = True) -> None:  # noqa: ARG002
@@ -184,7 +179,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
 
     async def _set_rate(self, link: Link, hz: int) -> None:
         await self._ask(link, _SET, struct.pack("<HBH", _RATE, _U16, hz))
-        self._rate_hz = await self._get_rate(link)
+        self.period_s = 1 / await self._get_rate(link)
 
     async def _get_rate(self, link: Link) -> float:
         answer = await self._ask(link, _GET, struct.pack("<H", _RATE), size=3)

@@ -8,6 +8,7 @@ which the next thing happens. What blocks instead of waiting, or waits for what 
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import selectors
 import sys
@@ -25,6 +26,8 @@ from skinware_drivers.testing.defect import defect
 
 T = TypeVar("T")
 
+_EXPAND_LOG = logging.getLogger("skinware.driver.expand")
+"""Where exceptions are told that the package caught from a driver's code."""
 _BEGINNING_NS = 5_000_000_000_000
 _TURNS_AT_ONE_MOMENT = 20_000
 _NAPS_WITHOUT_TIMER = 40
@@ -45,7 +48,7 @@ class HandClock:
     """
 
     def __init__(self) -> None:
-        self.now_ns = _BEGINNING_NS
+        self.now_ns: int = _BEGINNING_NS
         self.before_passing: list[Callable[[], object]] = []
         self.turns = 0
         self._timers: set[HandTimer] = set()
@@ -202,7 +205,8 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
         if isinstance(error, pytest.fail.Exception):
             failures.append(error)
         elif not failures:
-            unseen.append(_short_trace(error) if error is not None else str(context["message"]))
+            trace = _short_trace(error) if error is not None else str(context["message"])
+            unseen.append(f"the driver raised an exception in the event loop, where nobody catches it:\n{trace}")
 
     async def scenario() -> T:
         loop = asyncio.get_running_loop()
@@ -222,10 +226,15 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
             failures.append(error)
 
     thread = threading.Thread(target=work, name="driver under test", daemon=True)  # one that hangs must not hang pytest
-    thread.start()
-    _watch(thread, clock)
+    told = _Told(unseen)
+    _EXPAND_LOG.addHandler(told)
+    try:
+        thread.start()
+        _watch(thread, clock)
+    finally:
+        _EXPAND_LOG.removeHandler(told)
     if unseen:
-        defect(f"the driver raised an exception in the event loop, where nobody catches it:\n{unseen[0]}")
+        defect(unseen[0])
     if failures:
         # told anew: the trace of the first would keep everything alive that the test has to look after
         error = failures.pop()
@@ -233,6 +242,17 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
         del error
         defect(what)
     return outcome[0]
+
+
+class _Told(logging.Handler):
+    """Writes down the messages of a log."""
+
+    def __init__(self, messages: list[str]) -> None:
+        super().__init__()
+        self._messages = messages
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._messages.append(record.getMessage())
 
 
 def _watch(thread: threading.Thread, clock: HandClock) -> None:

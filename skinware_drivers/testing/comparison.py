@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.structure import Structure
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.rig import SHOWN_ANYWAY, Running, sensor_name
 
@@ -48,7 +49,7 @@ class Comparison:
     def __init__(self, rig: Running) -> None:
         self.rig = rig
         require(rig.record.frames, "nothing was published")
-        self.structure = rig.record.frames[-1].structure
+        self.structure: Structure = rig.record.frames[-1].structure
         n = rig.truth.n_values
         require(
             self.structure.n_sensors == rig.n_values,
@@ -67,7 +68,9 @@ class Comparison:
         self._felt_ns = [
             np.array([burst.time_ns for burst in rig.truth.bursts.get(number, [])]) for number in rig.numbers
         ]
-        self.updates = [update for module in range(self.structure.n_modules) for update in self._of_module(module)]
+        self.updates: list[Update] = [
+            update for module in range(self.structure.n_modules) for update in self._of_module(module)
+        ]
         self.updates.sort(key=lambda update: update.frame)
 
     @property

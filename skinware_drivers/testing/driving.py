@@ -15,8 +15,8 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.runner import PublishMode, Runner
+from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.pty import emulated_on_a_pty
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
@@ -39,7 +39,7 @@ class Driving:
         listen_only: bool,
         publish: PublishMode | None = None,
     ) -> None:
-        self.ready = threading.Event()
+        self.ready: threading.Event = threading.Event()
         self.failure: BaseException | None = None
         self.runner: Runner | None = None
         self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]
@@ -165,11 +165,12 @@ def emulated_skin(
 
     Args:
         driver: its registered name, or its class.
-        emulator: a class; by default the one registered under the driver's name. Those of serial drivers get a pseudo
-            terminal.
+        emulator: a class; by default the one registered under the driver's name, unless there is a ``bus``. Those of
+            serial drivers get a pseudo terminal.
         name: of the driver in the namespace.
         driver_options: options of the driver.
-        bus: a bus' name (``vcan0``, a pseudo terminal), where the devices are already; then nothing is emulated here.
+        bus: a bus' name (``vcan0``, a pseudo terminal). Without ``emulator``, the devices are there already; with it,
+            they are brought there.
         emulator_options: options of the devices.
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver
@@ -182,6 +183,9 @@ def emulated_skin(
                 defect(f"say which emulator {driver} is to run on")
             if adapter.medium == "serial":
                 bus = running.enter_context(emulated_on_a_pty(factory, **emulator_options))
+        elif emulator is not None:
+            own = make_bus(bus, payload_size=adapter.payload_size)
+            running.enter_context(emulated_on(own, emulator, **emulator_options))
         if bus or factory is None:
             line = make_bus(bus, payload_size=adapter.payload_size)
         else:

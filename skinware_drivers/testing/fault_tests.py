@@ -66,6 +66,8 @@ class FaultTests(Suite):
 
     def test_foreign_frames_disturb_nothing(self) -> None:
         """Other devices on the bus (on a serial line: noise between frames) are counted and change nothing."""
+        if self.driver.medium == "virtual":
+            return  # nobody else is there
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
@@ -96,8 +98,8 @@ class FaultTests(Suite):
         play(scenario)
 
     async def _own_identifiers(self, rig: Running) -> Collection[int]:
-        own: Collection[int] | None = getattr(rig.devices, "identifiers", None)
-        return {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)} if own is None else own
+        told: Collection[int] = getattr(rig.devices, "identifiers", ())
+        return told or {*rig.wire.identifiers, *(i for i, _ in rig.wire.sent)}
 
     async def _damage(self, rig: Running, fault: Fault) -> None:
         """Run, damage some frames, and let the last burst come through."""

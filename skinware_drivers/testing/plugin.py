@@ -119,7 +119,7 @@ def pty_patch() -> Iterator[Callable[..., str]]:
 
     The arguments are an emulator's class or registered name, and its options. All are gone at the end.
     """
-    from skinware_drivers.testing.pty import emulated_on_a_pty
+    from skinware_drivers.testing.carrying import emulated_on_a_pty
 
     with ExitStack() as running:
         yield lambda emulator, **options: running.enter_context(emulated_on_a_pty(emulator, **options))

@@ -75,7 +75,7 @@ class Recorder:
         self.frames: list[DriverFrame] = []
         self.times_ns: list[int] = []
         self.keep = True
-        self.count = 0
+        self.count: int = 0
         self.reader: DriverReader | None = None
         self._clock = clock
 
@@ -127,14 +127,14 @@ class Rig:
     ) -> None:
         self.case = case
         self.clock = clock
-        self.adapter = case.adapter()
+        self.adapter: AnyAdapter = case.adapter()
         options = case.options(**emulated)
         n_felt = len(case.emulator(options).places())
-        self.truth = Truth(clock, n_felt, pattern, case.shown)
-        self.devices = case.emulator(options, log=None, source=self.truth)
+        self.truth: Truth = Truth(clock, n_felt, pattern, case.shown)
+        self.devices: Any = case.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
         framing = getattr(self.devices, "framing", None)
-        self.wire = Interference(self.devices if framing is None else OnTheLine(self.devices, framing))
+        self.wire: Interference = Interference(self.devices if framing is None else OnTheLine(self.devices, framing))
         self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
 
     @property
@@ -153,7 +153,7 @@ class Handshakes(Rig):
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
-        self.link = Link(self.bus)
+        self.link: Link = Link(self.bus)
 
     async def __aenter__(self) -> Self:
         self.adapter.fit(self.bus)
@@ -190,7 +190,7 @@ class Running(Rig):
 
     def __init__(self, case: Case, clock: HandClock, pattern: Pattern, *, listen_only: bool = False, **more: Any):
         super().__init__(case, clock, pattern, listen_only=listen_only, **more)
-        self.record = Recorder(clock)
+        self.record: Recorder = Recorder(clock)
         self.answers = 0
         self.runner: Runner | None = None
         self._listen_only = listen_only

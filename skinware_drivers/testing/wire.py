@@ -65,7 +65,7 @@ class Truth:
     ) -> None:
         self.pattern = pattern
         self.n_felt = n_felt
-        self.n_values = len(shown([0] * n_felt))
+        self.n_values: int = len(shown([0] * n_felt))
         self.bursts: dict[int, list[Burst]] = {}
         self.remember = True
         self._clock = clock

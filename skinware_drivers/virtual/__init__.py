@@ -1,1 +1,8 @@
-"""Emulated hardware, in this process or on a real bus."""
+"""Emulated hardware, in this process or on a real bus: what emulators are made of, and emulators."""
+
+from skinware_drivers.virtual.adapter import VirtualAdapter
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
+from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.press import on_a_grid
+
+__all__ = ["CanFrame", "Device", "Emulator", "EmulatorOptions", "VirtualAdapter", "on_a_grid"]

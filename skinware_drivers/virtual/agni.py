@@ -8,8 +8,8 @@ from __future__ import annotations
 import functools
 import operator
 import struct
-from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -44,25 +44,10 @@ class EmulatedAgni(Emulator[EmulatedAgniOptions]):
         payload_size: longest message.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedAgniOptions
     full_scale = 4095
     swing = 3500
+    numbers: Sequence[int] = (1,)
     payload_size = 4104
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The device."""
-        return (1,)
-
-    @property
-    def period_s(self) -> float:
-        """Unless it is told another."""
-        return self.options.period_ms / 1e3
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """None: bytes."""
-        return (0,)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All values."""

@@ -6,8 +6,8 @@ Source: ``arduino/5X_binary_burst_stream`` of github.com/raunaqbhirangi/anyskin.
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -30,20 +30,13 @@ class EmulatedAnySkin(Emulator[EmulatedAnySkinOptions]):
     Values: temperature, x, y and z of magnetometer 0, of magnetometer 1 ... in degrees Celsius and microtesla.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedAnySkinOptions
     full_scale = 50_000
     lowest = -50_000
     rest = 25
     swing = 400
-    numbers = (1,)
-    identifiers: ClassVar[Collection[int]] = ()
+    numbers: Sequence[int] = (1,)
     payload_size = 1032
-    framing = Unframed(payload_size)
-
-    @property
-    def period_s(self) -> float:
-        """Of a message."""
-        return self.options.period_ms / 1e3
+    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """Four values at each magnetometer."""

@@ -6,8 +6,8 @@ that the answer about a property other than TACT goes to group 6.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Collection, Sequence
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,18 +28,15 @@ class EmulatedBarrettOptions(EmulatorOptions, frozen=True, forbid_unknown_fields
 class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
     """Pucks on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`. Values are in 1/256 N/cm2."""
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedBarrettOptions
     full_scale = 0xFFF
     swing = 3_000
-    period_s = 0.02
-    identifiers = frozenset(range(0x800)) - {
+    identifiers: Collection[int] = frozenset(range(0x800)) - {
         i for i in range(0x800) if i >> 5 & 31 not in range(11, 15) and i & 0x41F not in (0x405, 11, 12, 13, 14)
     }
 
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The nodes."""
-        return self.options.nodes
+    def __init__(self, options: EmulatedBarrettOptions, **more: Any) -> None:
+        self.numbers: Sequence[int] = options.nodes
+        super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
         """Three columns of eight cells."""

@@ -75,10 +75,10 @@ class Board(ABC):
     units: ClassVar[Units]
 
     def __init__(self, address: int, parts: BoardParts, now_ns: int) -> None:
-        self.address = address
+        self.address: int = address
         self.parts = parts
-        self.alive = True
-        self.cycle = 0
+        self.alive: bool = True
+        self.cycle: int = 0
         self._identifiers_for: tuple[object, list[int]] = None, []
         self._power_up(now_ns)
 
@@ -86,7 +86,7 @@ class Board(ABC):
         self._ready_ns = ready_ns
         self.parts.touch.stream_from(None)
         self.next_burst_ns: int | None = None
-        self.inertial = InertialSensors(self.units)
+        self.inertial: InertialSensors = InertialSensors(self.units)
         self._data_class = DATA
         self._no_acks = 0
         self._recalibration_due = False

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Collection, Sequence
 from functools import partial
 from importlib import resources
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -48,21 +48,16 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
     say), which keep their default.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedCanopenOptions
     full_scale = 4095
     rest = 100
     swing = 3500
-    period_s = 0.02
 
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The node ids."""
-        return self.options.nodes
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """Of the predefined connection set."""
-        return {0x000} | {function + node for function in range(0x080, 0x780, 0x80) for node in (0, *self.numbers)}
+    def __init__(self, options: EmulatedCanopenOptions, **more: Any) -> None:
+        self.numbers: Sequence[int] = options.nodes
+        super().__init__(options, **more)
+        functions = range(0x080, 0x780, 0x80)  # of the predefined connection set
+        own = {function + node for function in functions for node in (0, *options.nodes)}
+        self.identifiers: Collection[int] = {0x000} | own
 
     def places(self) -> npt.NDArray[np.float64]:
         """A grid, as nothing says where they are."""

@@ -6,8 +6,8 @@ Source: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino``.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Collection, Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -28,17 +28,11 @@ class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True, forbid_unknown_fiel
 class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
     """One finger, device 0; see :class:`skinware_drivers.virtual.emulator.Emulator`."""
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedCyskinCpmOptions
     full_scale = 0xFFFF
     rest = 800
     swing = 6_000
-    numbers = (0,)
-    identifiers = frozenset((0x405, 0x407, 0x409, 0x40B))
-
-    @property
-    def period_s(self) -> float:
-        """Of a set."""
-        return self.options.period_ms / 1e3
+    numbers: Sequence[int] = (0,)
+    identifiers: Collection[int] = frozenset((0x405, 0x407, 0x409, 0x40B))
 
     def places(self) -> npt.NDArray[np.float64]:
         """Sixteen taxels."""

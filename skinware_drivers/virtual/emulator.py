@@ -10,13 +10,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, TypeVar
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
 from skinware_drivers.virtual.foreign import ForeignTraffic
@@ -51,7 +53,7 @@ class Device:
         self.number = number
         self.transmitter = transmitter
         self.memory: dict[str, Any] = {}
-        self.cycle = 0
+        self.cycle: int = 0
         self.alive = True
         self.ready_ns = now_ns
         self.streams_from_ns: int | None = None
@@ -98,8 +100,10 @@ class Device:
         return skipped
 
 
-class Emulator(Stage, Generic[OptionsT]):
+class Emulator(Stage, HasOptions[OptionsT]):
     """Emulated devices on one bus. A subclass says what follows; faults and time are taken care of.
+
+    In the brackets is named which options it has: ``class EmulatedThumb(Emulator[EmulatedThumbOptions])``.
 
     Args:
         options: which devices, what they feel, and what is wrong with them.
@@ -109,7 +113,10 @@ class Emulator(Stage, Generic[OptionsT]):
     Attributes:
         medium: what the devices are connected by: ``can`` or ``serial``. On a serial line, what the payloads of frames
             hold is all that there is: identifiers are 0, and a command is the bytes that the host wrote at once.
-        Options: options; becomes those of ``skin-emulate`` and of ``--bus virtual?...``.
+        Options: those options; they become those of ``skin-emulate`` and of ``--bus virtual?...``.
+        numbers: of the devices. To be set before ``Emulator.__init__`` where the options say which there are.
+        identifiers: every one that the devices or their host can use: no foreign device does. None on a serial line.
+        period_s: time from burst to burst of a device that sends by itself; an option ``period_ms`` sets it.
         full_scale: greatest value that a device can send.
         lowest: least value that it can send.
         rest: value of a sensor that nobody touches.
@@ -118,15 +125,18 @@ class Emulator(Stage, Generic[OptionsT]):
     """
 
     medium: ClassVar[str] = "can"
-    Options: ClassVar[type[EmulatorOptions]]
+    Options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    least_options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    numbers: Sequence[int] = (0,)
+    identifiers: Collection[int] = ()
     full_scale: ClassVar[int]
     lowest: ClassVar[int] = 0
     rest: ClassVar[int] = 0
     swing: ClassVar[int]
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
-        super().__init__(log, ("lost", "repeated", "truncated", "corrupted", "foreign"))
-        self.options = options
+        Stage.__init__(self, log, ("lost", "repeated", "truncated", "corrupted", "foreign"))
+        HasOptions.__init__(self, options)
         self._source = source
         self.devices: dict[int, Device] = {}
         self._random: dict[int, np.random.Generator] = {}
@@ -139,21 +149,6 @@ class Emulator(Stage, Generic[OptionsT]):
                     raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")
 
     # What a subclass says
-
-    @property
-    @abstractmethod
-    def numbers(self) -> Sequence[int]:
-        """Numbers of the devices."""
-
-    @property
-    @abstractmethod
-    def period_s(self) -> float:
-        """Time from burst to burst of a device that sends by itself."""
-
-    @property
-    @abstractmethod
-    def identifiers(self) -> Collection[int]:
-        """Every identifier that the devices or their host can use: no foreign device does."""
 
     @abstractmethod
     def places(self) -> npt.NDArray[np.float64]:

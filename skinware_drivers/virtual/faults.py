@@ -55,11 +55,11 @@ class BoardFaults:
         self._random = np.random.default_rng([options.seed, ordinal, 1])
         self._lose, self._wrong_length = options.lose, options.wrong_length
         self._jitter_us = options.jitter_us
-        self.last_cycle = options.dead_after_cycles if address in options.dead else None
-        self.disconnected = np.zeros(TRIANGLES, np.bool_)
-        self.not_acknowledging = np.zeros(TRIANGLES, np.bool_)
-        self.version = 0
-        self.broken = np.zeros((TRIANGLES, CHANNELS), np.bool_)
+        self.last_cycle: int | None = options.dead_after_cycles if address in options.dead else None
+        self.disconnected: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
+        self.not_acknowledging: npt.NDArray[np.bool_] = np.zeros(TRIANGLES, np.bool_)
+        self.version: int = 0
+        self.broken: npt.NDArray[np.bool_] = np.zeros((TRIANGLES, CHANNELS), np.bool_)
         for board, triangle in options.places("not_connected", 2):
             if board == address:
                 self.disconnected[triangle] = True

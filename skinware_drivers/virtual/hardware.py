@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options import nearest_name
+from skinware_drivers.options import load_entry_point, nearest_name
 
 EMULATORS = "skinware.emulators"
 """The entry point group in which emulators register, under the name of the driver they serve."""
@@ -87,12 +87,12 @@ def load_emulator(name: str) -> HardwareFactory:
     """
     known = {entry.name: entry for entry in entry_points(group=EMULATORS)}
     if name not in known:
-        raise ConfigurationError(f"there is no emulator {name!r}{nearest_name(name, known)}")
-    try:
-        loaded: HardwareFactory = known[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"emulator {name!r} ({known[name].value}) cannot be loaded: {error}") from error
-    return loaded
+        names = nearest_name(name, known)
+        raise ConfigurationError(
+            f"there is no emulator {name!r}{names}. One of yours has to be installed: pip install -e ."
+        )
+    emulator: HardwareFactory = load_entry_point(known[name], f"emulator {name!r}")
+    return emulator
 
 
 __all__ = ["EMULATORS", "EmulatedHardware", "EventLog", "HardwareFactory", "WireFrame", "load_emulator", "medium_of"]

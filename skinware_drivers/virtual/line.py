@@ -42,7 +42,7 @@ class VirtualSerialBus(SerialBus):
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
         emulator = load_emulator(channel)
-        self.hardware = emulator(options_from_strings(emulator.Options, options or {}))
+        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
 
     @property
     def note(self) -> str:

@@ -75,7 +75,7 @@ class Mtb4(Board):
         elif command == 0x50:
             if not self._set_triangles(payload):
                 return False
-            self.next_burst_ns = None
+            self.next_burst_ns: None = None
             self._calibrate(now_ns, "command")
         elif command == 0x07:
             if payload[1]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,11 +50,11 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
         payload_size: longest payload of a message.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedOpenPatchOptions
     full_scale = 0xFFFF
     rest = 1000
     swing = 40_000
-    framing = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
+    framing: Delimited = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
+    numbers: Sequence[int] = (1,)
     payload_size = 1024
 
     def __init__(self, options: EmulatedOpenPatchOptions, **more: Any) -> None:
@@ -68,21 +68,6 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
             b"\x04\x01" + bytes((0, options.modules)),
         ]
         self._crc = zlib.crc32(b"".join(self._items))
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The patch."""
-        return (1,)
-
-    @property
-    def period_s(self) -> float:
-        """Unless it is told another."""
-        return self.options.period_ms / 1e3
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """Every type."""
-        return range(256)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All taxels on one square."""

@@ -6,8 +6,8 @@ Source: ``skintalk.c`` of github.com/t173/skinvis. Frames are the bytes on the l
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,24 +28,16 @@ class EmulatedSkintalkOptions(EmulatorOptions, frozen=True, forbid_unknown_field
 class EmulatedSkintalk(Emulator[EmulatedSkintalkOptions]):
     """Patches on one line; see :class:`skinware_drivers.virtual.emulator.Emulator`. Values: one for each cell."""
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedSkintalkOptions
     full_scale = 0x7F_FFFF
     lowest = -0x80_0000
     rest = 50_000
     swing = 2_000_000
-    identifiers: ClassVar[Collection[int]] = ()
     payload_size = 64
-    framing = Unframed(payload_size)
+    framing: Unframed = Unframed(payload_size)
 
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The patches."""
-        return self.options.patches
-
-    @property
-    def period_s(self) -> float:
-        """Of every cell."""
-        return self.options.period_ms / 1e3
+    def __init__(self, options: EmulatedSkintalkOptions, **more: Any) -> None:
+        self.numbers: Sequence[int] = options.patches
+        super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
         """The cells of a patch."""

@@ -52,9 +52,9 @@ class Stage(ABC):
     """
 
     def __init__(self, log: EventLog | None, counted: Sequence[str]) -> None:
-        self.wire = Wire()
+        self.wire: Wire = Wire()
         self.log: EventLog = _Unlogged() if log is None else log
-        self.counts = dict.fromkeys(("frames", "bursts", "commands", *counted, "unheard"), 0)
+        self.counts: dict[str, int] = dict.fromkeys(("frames", "bursts", "commands", *counted, "unheard"), 0)
         self._actors: list[Actor] = []
         self._scheduled: list[_Scheduled] = []
         self._now_ns: int | None = None

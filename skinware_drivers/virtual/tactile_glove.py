@@ -5,8 +5,8 @@ Source: what tactile-filters ``linux/libio/SerialInput.cpp`` reads. Frames are t
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -29,19 +29,12 @@ class EmulatedTactileGlove(Emulator[EmulatedTactileGloveOptions]):
     Values: one for each taxel, as it is sent: pressure lowers it.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedTactileGloveOptions
     full_scale = 0xFFF
     rest = 4000
     swing = -3000
-    numbers = (1,)
-    identifiers: ClassVar[Collection[int]] = ()
+    numbers: Sequence[int] = (1,)
     payload_size = 64
-    framing = Unframed(payload_size)
-
-    @property
-    def period_s(self) -> float:
-        """Of all taxels."""
-        return self.options.period_ms / 1e3
+    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All taxels on one square."""

@@ -6,8 +6,8 @@ Source: the programs wts_driver and wts_ft; the vectors in tests/serial/test_wei
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -53,25 +53,10 @@ class EmulatedWeissWts(Emulator[EmulatedWeissWtsOptions]):
         payload_size: longest message.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedWeissWtsOptions
     full_scale = 4095
     swing = 3500
+    numbers: Sequence[int] = (1,)
     payload_size = 2064
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The sensor."""
-        return (1,)
-
-    @property
-    def period_s(self) -> float:
-        """Unless it is told another."""
-        return self.options.period_ms / 1e3
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """None: bytes."""
-        return (0,)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All cells."""

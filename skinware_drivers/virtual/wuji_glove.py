@@ -8,8 +8,8 @@ from __future__ import annotations
 import binascii
 import math
 import struct
-from collections.abc import Collection, Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -45,29 +45,15 @@ class EmulatedWujiGlove(Emulator[EmulatedWujiGloveOptions]):
         payload_size: longest message.
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedWujiGloveOptions
     full_scale = 4096
     swing = 3500
+    numbers: Sequence[int] = (1,)
+    period_s: float = 1 / _USUAL_HZ  # unless it is told another
     payload_size = 3088
 
     def __init__(self, options: EmulatedWujiGloveOptions, **more: Any) -> None:
         super().__init__(options, **more)
         self.wire.speed = 12  # USB, full speed
-
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The board."""
-        return (1,)
-
-    @property
-    def period_s(self) -> float:
-        """Unless it is told another."""
-        return 1 / _USUAL_HZ
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """None: bytes."""
-        return (0,)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All cells."""

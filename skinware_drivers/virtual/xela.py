@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -33,25 +33,15 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
     Values: x, y, z of taxel 0, of taxel 1 ... Several boards have identifiers 0x20 apart (4x4) or 0x100 apart (4x6).
     """
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedXelaOptions
     full_scale = 0xFFFF
     rest = 33_000
     swing = 9_000
 
-    @property
-    def numbers(self) -> Sequence[int]:
-        """The boards."""
-        return self.options.boards
-
-    @property
-    def period_s(self) -> float:
-        """Of every taxel."""
-        return self.options.period_ms / 1e3
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        """Of taxels and of commands."""
-        return {taxel for board in self.numbers for taxel in self._taxels(board)} | set(range(0x200, 0x210))
+    def __init__(self, options: EmulatedXelaOptions, **more: Any) -> None:
+        self.numbers: Sequence[int] = options.boards
+        super().__init__(options, **more)
+        taxels = {taxel for board in options.boards for taxel in self._taxels(board)}
+        self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
     def places(self) -> npt.NDArray[np.float64]:
         """Three axes a taxel."""

@@ -33,11 +33,7 @@ class Tip(CanAdapter[NoOptions]):
     dtype = np.uint8
     patches = (Patch("tip", [Module(taxels(8))]),)
     layout = Layout([Frame("all", [Identifier(TIP_IDENTIFIER)], length=(8,), values=Values(0, "u1", 8))])
-
-    @property
-    def period_s(self) -> float:
-        """Nominal time between two updates, s."""
-        return PERIOD_S
+    period_s = PERIOD_S
 
 
 def can_frame(identifier: int, payload: bytes) -> bytes:

@@ -7,13 +7,13 @@ Identifier ``18A50000 | node << 8 | half``. Payload: sequence number (uint16 LE)
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE
+from skinware_drivers.adapter import NoOptions
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
@@ -38,7 +38,7 @@ def half(number: int) -> Frame:
     )
 
 
-class FdPatchDriver(CanAdapter[Any]):
+class FdPatchDriver(CanAdapter[NoOptions]):
     types = (PRESSURE.measured(unit="counts", maximum=0xFFFF),)
     dtype = np.uint16
     patches = tuple(Patch(f"node {n}", [Module(taxels(60, first_uid=n << 8))], key=n) for n in NODES)
@@ -64,16 +64,12 @@ class EmulatedFdOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True
 
 
 class EmulatedFdPatch(Emulator[EmulatedFdOptions]):
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedFdOptions
     full_scale = 0xFFFF
     rest = 100
     swing = 20_000
     period_s = PERIOD_S
     numbers = NODES
-
-    @property
-    def identifiers(self) -> Collection[int]:
-        return {0x98A5_0000 + (node << 8) + part for node in NODES for part in (0, 1)}
+    identifiers = frozenset(0x98A5_0000 + (node << 8) + part for node in NODES for part in (0, 1))
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(60, 10)

@@ -16,7 +16,7 @@ from skinware_drivers.can import roboskin_boards
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
-from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
 from skinware_drivers.finding.attended import attended
@@ -156,9 +156,12 @@ class Hangs(Answers):
         return "late"
 
 
+class ModelOptions(RoboskinOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    model: str
+
+
 class NeedsOptions(Answers):
-    class Options(msgspec.Struct):
-        model: str
+    Options = ModelOptions
 
 
 def test_a_port_is_asked_by_one_driver_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:

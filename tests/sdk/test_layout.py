@@ -270,11 +270,83 @@ def test_expand_is_the_escape() -> None:
     assert decoder.state.values.tolist() == [7, 7, 7, 9, 9]  # two more than there are channels are dropped
 
 
+Expanded = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]
+
+
+def one_value_below_128(payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]) -> Expanded:
+    rows = np.arange(len(payload))
+    if (payload[:, 0] > 127).any():
+        raise ValueError("what is this?")
+    return rows, np.zeros_like(rows), payload[:, 0].astype(np.int64)
+
+
+def test_an_expand_that_raises_costs_the_frames_for_which_it_does(caplog: pytest.LogCaptureFixture) -> None:
+    layout = Layout(
+        [
+            Frame("expanded", [Identifier(0x100)], [8], Expand(one_value_below_128), module=0),
+            Frame("beside", [Identifier(0x101)], [8], Values(0, "u1", 1), module=1),
+        ]
+    )
+    modules = [Module(taxels(1), key=0), Module(taxels(1, first_uid=1), key=1)]
+    sent = [(0x100, bytes([value] + [0] * 7)) for value in (1, 200, 3, 201)] + [(0x101, bytes([255] * 8))]
+    decoder = decode(layout, modules, "i2", sent)
+    assert decoder.state.values.tolist() == [3, 255]
+    assert not decoder.state.status.any()
+    assert decoder.state.bus_counters[0].tolist() == [0, 0, 2]
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("updates")] == 3
+    (told,) = caplog.records
+    assert "frame 'expanded': its Expand function raised ValueError: what is this? (" in told.getMessage()
+    assert "test_layout.py:" in told.getMessage()
+
+
+def test_half_a_cycle_that_cannot_be_expanded_shows_nothing() -> None:
+    layout = Layout(
+        [
+            Frame("expanded", [Identifier(0x100)], [8], Expand(one_value_below_128)),
+            Frame("plain", [Identifier(0x101)], [8], Values(0, "u1", 1, to=[1])),
+        ],
+        Cycle(["expanded", "plain"], maximum_age_s=1),
+    )
+    sent = [(0x100, bytes([5] * 8)), (0x101, bytes([6] * 8)), (0x100, bytes([128] * 8)), (0x101, bytes([7] * 8))]
+    decoder = decode(layout, [Module(taxels(2))], "u1", sent)
+    assert decoder.state.values.tolist() == [5, 6]
+    assert decoder.state.bus_counters[0].tolist() == [0, 0, 1]
+    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
+    assert (counters["updates"], counters["orphans"]) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda payload, length: (np.arange(2), np.zeros(1, np.int64), np.zeros(1)),
+        lambda payload, length: (np.array([9]), np.array([0]), np.array([1])),
+        lambda payload, length: (np.array([0]), np.array([0]), np.array(["one"])),
+        lambda payload, length: None,
+    ],
+    ids=["unequal", "no such row", "no number", "nothing"],
+)
+def test_what_an_expand_must_not_return_is_counted(wrong: Any, caplog: pytest.LogCaptureFixture) -> None:
+    decoder = decode(one(Expand(wrong)), [Module(taxels(1))], "u1", [(0x100, bytes(8))])
+    assert decoder.state.status.tolist() == [Status.NEVER_SEEN]
+    assert decoder.state.bus_counters[0].tolist() == [0, 0, 1]
+    assert "frame 'data': its Expand function raised" in caplog.text
+
+
+def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
+    layout = Layout([Frame("any", length=[1], values=Values(0, "u1", 1))])
+    decoder = decode(layout, [Module(taxels(1))], "u1", [(0, b"\1"), (0x7FF, b"\2"), (0x123, b"\3"), (5, b"\1\2")])
+    assert decoder.state.values.tolist() == [3]
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("updates")] == 3
+    assert decoder.state.bus_counters[0].tolist() == [0, 1, 0]
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: Layout([Frame("f")]), "'f': say which payload lengths"),
+        (lambda: Layout([Frame("f", length=[8])]), "'f': it has no values"),
         (lambda: one(Values(6, "<u2", 2)), "values end at byte 10"),
-        (lambda: one(Values(0, "u1", 2, to=(0,))), "`to` names 1 channels"),
+        (lambda: one(Values(0, "u1", 2, to=(0,))), "`count` is 2, but the length of `to` is 1"),
         (lambda: one(()), "it has no values"),
         (lambda: one((Values(0, "u1", 1), Values(7, "<u2", 1))), "values end at byte 9"),
         (lambda: one(Values(0, Packed(12, skip=8), 1)), "8 bits before the first value"),

@@ -123,10 +123,7 @@ class FingertipDriver(SerialAdapter[NoOptions]):
     types = (PRESSURE.measured(unit="counts"),)
     dtype = np.uint16
     layout = Layout([Frame("taxels", [Identifier(DATA)], [2 * N_TAXELS], Values(0, "<u2", N_TAXELS))])
-
-    @property
-    def period_s(self) -> float:
-        return 0.01
+    period_s = 0.01
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         reply = await link.request(ASK, b"who", Match(ANSWER, prefix=b"I am "), timeout_s=0.2)

@@ -12,7 +12,7 @@ from skinware import DriverReader, PatchState
 from skinware.errors import RequestFailed
 from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import driving_lines, read_until
 

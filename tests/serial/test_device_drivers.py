@@ -14,7 +14,7 @@ from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
-from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.agni import EmulatedAgni
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.weiss_wts import message as weiss_message

@@ -125,5 +125,6 @@ def test_a_device_may_tell_how_its_frames_lie_in_the_stream() -> None:
 
 
 def test_another_kind_of_bus_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="is a can bus, FingertipDriver speaks serial"):
-        FingertipDriver(NoOptions()).fit(SocketCanBus("vcan0"))
+    words = r"bus port is a CAN bus; FingertipDriver needs a serial line, as /dev/ttyUSB0, \./port"
+    with pytest.raises(ConfigurationError, match=words):
+        FingertipDriver(NoOptions()).fit(SocketCanBus("port"))

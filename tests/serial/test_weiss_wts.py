@@ -13,7 +13,7 @@ from skinware import DriverFrame, DriverReader, PatchState
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
-from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
 from tests.sdk.driving import driving_lines, read_until
 

@@ -13,7 +13,7 @@ from skinware import DriverReader, PatchState, Status
 from skinware.errors import RequestFailed
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.wuji_glove import Refused, WujiGloveDriver, WujiGloveOptions
-from skinware_drivers.testing.pty import emulated_on_a_pty
+from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
 from tests.sdk.driving import driving_lines, read_until
 

@@ -7,7 +7,7 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -73,12 +73,11 @@ class Fingertips(CanAdapter[NoOptions]):
 class EmulatedFingertips(Emulator[EmulatorOptions]):
     """Silent until started."""
 
-    Options: ClassVar[type[EmulatorOptions]] = EmulatorOptions
     full_scale = 0xFFFF
     swing = 1000
     numbers = NODES
     period_s = 0.02
-    identifiers: ClassVar[Collection[int]] = frozenset(base | node for base in (0x80, 0x100, 0x180) for node in NODES)
+    identifiers = frozenset(base | node for base in (0x80, 0x100, 0x180) for node in NODES)
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(6, 3)

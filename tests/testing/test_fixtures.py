@@ -27,6 +27,7 @@ from skinware_drivers.testing.driving import EmulatedSkin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
+from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 
 class TapeDriver(SerialAdapter[NoOptions]):
@@ -42,7 +43,6 @@ class TapeDriver(SerialAdapter[NoOptions]):
 class EmulatedTape(Emulator[EmulatorOptions]):
     """It sends zero-free bodies, so that its stuffing is only a number in front."""
 
-    Options = EmulatorOptions
     full_scale = 0x7FFF
     swing = 1000
     numbers = (0,)
@@ -93,6 +93,15 @@ def test_emulated_devices_on_a_pseudo_terminal(
     skin = emulated_skin(TapeDriver, bus=pty_patch(EmulatedTape, pattern="cycle"))
     frame = read_until(skin.reader, lambda frame: not frame.status.any())
     assert len(set(frame.values.tolist())) == 1
+
+
+def test_devices_are_brought_to_a_can_interface(
+    emulated_skin: Callable[..., EmulatedSkin], vcan: Callable[[], str]
+) -> None:
+    skin = emulated_skin(Fingertips, EmulatedFingertips, bus=vcan(), pattern="cycle")
+    frame = read_until(skin.reader, lambda frame: not frame.status.any())
+    assert skin.hardware is None
+    assert len(frame.values) == 12
 
 
 @pytest.mark.parametrize("fixture", ["vcan", "can_pair"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +22,6 @@ class Strip(Emulator[EmulatorOptions]):
     """Two bytes behind AA, as soon as it gets a question mark; its values are its own."""
 
     medium = "serial"
-    Options: ClassVar[type[EmulatorOptions]] = EmulatorOptions
     full_scale = 200
     swing = 100
     numbers = (0,)

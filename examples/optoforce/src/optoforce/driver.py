@@ -13,21 +13,27 @@ in x, y and z.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from skinware import Status
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
-from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Flag, Frame, Identifier, Layout, Stamp, Values
-from skinware_drivers.link import Link
-from skinware_drivers.operations import operation
-from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import Sum
-from skinware_drivers.serial.framing import Field
-from skinware_drivers.serial.packets import LengthTable, Packet
+from skinware_drivers import (
+    Flag,
+    Frame,
+    Identifier,
+    Layout,
+    Link,
+    Module,
+    Patch,
+    Stamp,
+    Values,
+    check_options,
+    operation,
+    taxels,
+)
+from skinware_drivers.serial import Field, LengthTable, Packet, SerialAdapter, Sum
 
 SUM = Sum(width=16, order="big")
 DATA = Packet(
@@ -59,7 +65,6 @@ class OptoforceOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OptoforceDriver(SerialAdapter[OptoforceOptions]):
     """One converter on each line. A sensor is a taxel of three axes; its uid is its number. Values are raw counts."""
 
-    Options: ClassVar[type[msgspec.Struct]] = OptoforceOptions
     framing = DATA
     commands = SETTINGS
     baudrate = 1_000_000
@@ -81,23 +86,13 @@ class OptoforceDriver(SerialAdapter[OptoforceOptions]):
             [Frame("sample", [Identifier(identifier)], [4 + 6 * sensors], axes, flags=flags, stamp=counter)]
         )
 
-    @property
-    def period_s(self) -> float:
-        """As the options say."""
-        return self.options.period_ms / 1000
-
     async def start(self, link: Link) -> None:
-        """Set it up; it then sends."""
+        """Set it up; it then sends. Also called when it has fallen silent: it may have been unplugged."""
         await self._set_up(link, self.options.period_ms)
 
     async def stop(self, link: Link) -> None:
         """Make it silent."""
         await self._set_up(link, SILENCE_MS)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:
-        """It is silent, and answers no questions: it may have been unplugged. Set it up again."""
-        await self._set_up(link, self.options.period_ms)
-        return False
 
     @operation()
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

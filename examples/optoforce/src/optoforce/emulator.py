@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
-from skinware_drivers.virtual.emulator import Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 
 class EmulatedOptoforceOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -26,12 +26,9 @@ class EmulatedOptoforce(Emulator[EmulatedOptoforceOptions]):
     """One converter, device 0."""
 
     medium = "serial"
-    Options: ClassVar[type[EmulatorOptions]] = EmulatedOptoforceOptions
     lowest = -32768
     full_scale = 32767
     swing = 9_000
-    numbers = (0,)
-    identifiers = frozenset((0,))
     period_s = 0.01  # unless it is told another
 
     def places(self) -> npt.NDArray[np.float64]:
@@ -50,7 +47,7 @@ class EmulatedOptoforce(Emulator[EmulatedOptoforceOptions]):
             self.start(device, now_ns, period_ms / 1000)
         return True
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[tuple[int, bytes]]:
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         """One packet with all sensors."""
         model = 0x0A if self.options.sensors == 1 else 0x1C
         packet = struct.pack(">4B2H", 0xAA, 7, 8, model, device.cycle & 0xFFFF, self.options.status)

@@ -1,4 +1,4 @@
-"""Emulated devices on a pseudo terminal, in a thread: what a program opens is a serial port like any other."""
+"""Emulated devices on a bus, in a thread: what a driver opens at the other end is a bus like any other."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.testing.defect import require
@@ -53,17 +54,29 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
         options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
-    hardware = factory(msgspec.convert(options, factory.Options, strict=False))
-    bus, control = PtyBus("", payload_size=_LONGEST_WRITE), _Control()
+    bus = PtyBus("", payload_size=_LONGEST_WRITE)
     framing = getattr(factory, "framing", None)
     if framing is not None:
         bus.use(framing)
+    with emulated_on(bus, factory, **options):
+        yield bus.note.removeprefix("serial port ")
+
+
+@contextmanager
+def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
+    """Run emulated devices on a bus as long as the ``with`` lasts.
+
+    Args:
+        bus: not open yet.
+        emulator: class of an emulator.
+        options: of the emulator.
+    """
+    given = msgspec.convert(options, emulator.Options, strict=False)
+    hardware, control = emulator(given), _Control()
 
     def run() -> None:
         try:
-            Emulation(bus, hardware, control).run(
-                control, bus_name="pty", driver=str(emulator), options=msgspec.defstruct("NoOptions", [])()
-            )
+            Emulation(bus, hardware, control).run(control, bus_name=bus.name, driver=str(emulator), options=given)
         except BaseException as error:  # noqa: BLE001  (raised in the test)
             control.failure = error
             control.ready.set()
@@ -74,7 +87,7 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
         require(control.ready.wait(_LONGEST_S), "the emulated patch did not start")
         if control.failure is not None:
             raise control.failure
-        yield bus.note.removeprefix("serial port ")
+        yield
     finally:
         control.stop()
         thread.join(_LONGEST_S)
@@ -84,4 +97,4 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
         raise control.failure
 
 
-__all__ = ["emulated_on_a_pty"]
+__all__ = ["emulated_on", "emulated_on_a_pty"]

@@ -1,0 +1,98 @@
+"""What goes wrong in the first hour with a driver of one's own gets an answer that says what to do."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware.cli._command import exit_status
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
+from skinware_drivers.can import CanAdapter
+from skinware_drivers.cli.driver import command
+from skinware_drivers.cli.emulate import emulate
+from skinware_drivers.options import load_entry_point
+from skinware_drivers.registry import parse_bus_name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["xela", "--bus", "virtual"], "'xela' is no option: name the driver with --driver"),
+        (["--bus", "virtual", "--bus", "virtual"], "bus virtual is named twice"),
+        (["--bus", "can0", "--bus", "can0"], "bus can0 is named twice"),
+        (["--bus", "virtual", "--driver", "xelo"], r"did you mean 'xela'\?.*pip install -e \."),
+        (["--bus", "virtual", "--driver", "xela", "--boards", "a"], r"boards=a: give a whole number \(number 1"),
+        (["--bus", "virtual&lose=0.1"], r"options begin with a question mark, as in virtual\?lose"),
+        (["--bus", "port", "--driver", "anyskin"], r"port is a CAN bus; AnySkinDriver needs a serial line.*\./port"),
+        (["--bus", "./port", "--driver", "xela"], r"\./port is a serial line; XelaDriver needs a CAN bus, as vcan0"),
+    ],
+)
+def test_skin_driver_says_what_to_do(
+    arguments: list[str], words: str, capsys: pytest.CaptureFixture[str], namespace: object
+) -> None:
+    assert exit_status(command, arguments) == 2
+    told = capsys.readouterr().err
+    assert re.search(words, told), told
+
+
+def test_an_emulator_on_a_bus_that_nobody_else_can_open_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        emulate(["--bus", "virtual", "--driver", "xela"])
+    assert "nobody else can open it; give vcan0 or pty:./port" in capsys.readouterr().err
+
+
+def test_a_path_may_have_an_equals_sign() -> None:
+    assert parse_bus_name("/dev/serial/by-id/a=b").channel == "/dev/serial/by-id/a=b"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("import nonsuch", r"ModuleNotFoundError: No module named 'nonsuch' \(.*mine_\w+\.py:1\)"),
+        ("x =\n", r"SyntaxError: .*mine_\w+\.py, line 1\)$"),
+        ("1 / 0", r"ZeroDivisionError: division by zero \(.*mine_\w+\.py:1\)"),
+        ("from skinware_drivers import Layout\nLayout([])", r"1 to 200 frames.*mine_\w+\.py:2\)"),
+        ("", r"has no attribute 'Driver'$"),
+    ],
+)
+def test_a_driver_that_cannot_be_imported_says_where(
+    text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    module = f"mine_{abs(hash(text))}"  # a module is imported once
+    (tmp_path / f"{module}.py").write_text(text)
+    with pytest.raises(ConfigurationError, match=f"driver 'mine' .* cannot be loaded: .*{words}"):
+        load_entry_point(EntryPoint("mine", f"{module}:Driver", "skinware.drivers"), "driver 'mine'")
+
+
+class Complete(CanAdapter[NoOptions]):
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint16
+    patches = (Patch("finger", [Module(taxels(4))]),)
+    layout = Layout([Frame("all", [Identifier(0x100)], [8], Values(0, "<u2", 4))])
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"types": ()}, "Wrong has no `types`"),
+        ({"patches": ()}, "Wrong has no `patches`"),
+        ({"layout": None}, "Wrong has no `layout`"),
+        ({"patches": Complete.patches[0]}, "make no skin: 'Patch' object is not iterable"),
+        ({"patches": (Patch("finger", Module(taxels(4))),)}, "make no skin: 'Module' object is not iterable"),  # type: ignore[arg-type]
+        ({"patches": (Patch("finger", [Module(taxels(4, "presure"))]),)}, "declares no type 'presure'"),
+        ({"dtype": np.uint64}, "values of dtype uint64: choose one of"),
+    ],
+)
+def test_what_a_driver_forgot_is_found_before_it_runs(changed: dict[str, Any], words: str) -> None:
+    Complete(NoOptions()).check()
+    wrong: type[Complete] = type("Wrong", (Complete,), changed)
+    with pytest.raises(ConfigurationError, match=words):
+        wrong(NoOptions()).check()

@@ -1,0 +1,102 @@
+"""Which options a driver and an emulator have stands in the brackets of their base, and nowhere else."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Generic, TypeVar
+
+import msgspec
+import pytest
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.adapter import NoOptions
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.virtual.emulator import Emulator, EmulatorOptions
+from tests.testing.fingertips import EmulatedFingertips, Fingertips
+
+OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+Other = TypeVar("Other")
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    period_ms: Annotated[int, msgspec.Meta(ge=0)] = 40
+
+
+class MoreOptions(Options, frozen=True, forbid_unknown_fields=True):
+    fast: bool = False
+
+
+class EmulatedOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    period_ms: int = 40
+
+
+class Driver(CanAdapter[Options]):
+    pass
+
+
+def test_the_class_in_the_brackets_is_that_of_the_options() -> None:
+    assert Driver.Options is Options
+    assert Driver(Options()).options == Options(40)
+    assert Fingertips.Options is NoOptions
+    assert EmulatedFingertips.Options is EmulatorOptions
+
+
+def test_a_subclass_has_those_of_its_base() -> None:
+    class Same(Driver):
+        pass
+
+    class More(Driver):
+        Options = MoreOptions
+
+    class StillMore(More):
+        pass
+
+    assert Same.Options is Options
+    assert More.Options is MoreOptions
+    assert StillMore.Options is MoreOptions
+
+
+def test_a_class_between_may_leave_it_open() -> None:
+    class Between(CanAdapter[OptionsT], Generic[Other, OptionsT]):
+        pass
+
+    class Named(Between[int, Options]):
+        pass
+
+    assert Between.Options is NoOptions
+    assert Named.Options is Options
+
+
+@pytest.mark.parametrize("wrong", [int, Any, "Options"])
+def test_what_is_no_class_of_options_is_refused(wrong: Any) -> None:
+    with pytest.raises(ConfigurationError, match=r"class Wrong: its base has .* in brackets.* msgspec\.Struct"):
+        type("Wrong", (CanAdapter,), {"__orig_bases__": (CanAdapter[wrong],)})
+
+
+def test_an_emulator_needs_the_options_that_all_emulators_have() -> None:
+    with pytest.raises(ConfigurationError, match=r"has Options in brackets.* .*EmulatorOptions"):
+
+        class Emulated(Emulator[Options]):  # type: ignore[type-var]
+            pass
+
+
+def test_a_line_that_says_something_else_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="Options = NoOptions contradicts the Options that"):
+
+        class Twice(CanAdapter[Options]):
+            Options = NoOptions
+
+
+def test_an_option_period_ms_is_the_period() -> None:
+    class Emulated(Emulator[EmulatedOptions]):
+        full_scale = swing = 1
+
+        def places(self) -> Any:
+            raise NotImplementedError
+
+        def frames(self, device: Any, values: Any) -> Any:
+            raise NotImplementedError
+
+    assert Driver(Options(period_ms=7)).period_s == 0.007
+    assert Emulated(EmulatedOptions()).period_s == 0.04
+    assert Driver(Options(period_ms=0)).period_s == Driver.period_s == 0.02  # 0: that of the device, say
+    assert Fingertips(NoOptions()).period_s == 0.02

@@ -16,7 +16,6 @@ from skinware_drivers.testing.defect import require
 from skinware_drivers.virtual.hardware import load_emulator
 
 _LONGEST_S = 30.0
-_LONGEST_WRITE = 4096
 
 
 class _Control:
@@ -49,15 +48,12 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     """Run emulated devices as long as the ``with`` lasts; yields the path of their serial port.
 
     Args:
-        emulator: class or registered name of an emulator whose frames are the bytes on the line, or have a ``framing``.
+        emulator: class or registered name of an emulator of serial devices.
         options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     hardware = factory(msgspec.convert(options, factory.Options, strict=False))
-    bus, control = PtyBus("", payload_size=_LONGEST_WRITE), _Control()
-    framing = getattr(factory, "framing", None)
-    if framing is not None:
-        bus.use(framing)
+    bus, control = PtyBus("", payload_size=getattr(factory, "payload_size", 8)), _Control()
 
     def run() -> None:
         try:

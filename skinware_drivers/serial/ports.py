@@ -95,10 +95,7 @@ class DescriptorPort(Port):
 
     def write(self, data: bytes) -> int:
         """Write what fits into the kernel's buffer."""
-        try:
-            return os.write(self._fd, data)
-        except BlockingIOError:
-            return 0
+        return _write_some(self._fd, data)
 
     def close(self) -> None:
         """Let go of it."""
@@ -261,10 +258,7 @@ class PtyPort(Port):
 
     def write(self, data: bytes) -> int:
         """What fits into the kernel's buffer; nobody may be reading."""
-        try:
-            return os.write(self._fd, data)
-        except BlockingIOError:
-            return 0
+        return _write_some(self._fd, data)
 
     def close(self) -> None:
         """Take the port away."""
@@ -275,6 +269,13 @@ class PtyPort(Port):
         os.close(self._fd)
         os.close(self._other)
         self._fd = -1
+
+
+def _write_some(fd: int, data: bytes) -> int:
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0
 
 
 def _wait_for_one_byte(fd: int) -> None:

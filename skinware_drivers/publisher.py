@@ -13,22 +13,11 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
-from skinware_drivers.bus import BusCounters
+from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = (
-    "frames",
-    "lost",
-    "errors",
-    "refused",
-    "sent",
-    "send_failures",
-    "polls_missed",
-    "overflows",
-    "bus_offs",
-)
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
@@ -202,17 +191,7 @@ class Publisher:
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
         for row, c in zip(self._counts, self.bus_counters, strict=True):
-            row[: len(OWN_BUS_COUNTERS)] = (
-                c.frames,
-                c.lost,
-                c.error_frames,
-                c.refused,
-                c.sent,
-                c.send_failures,
-                c.polls_missed,
-                c.overflows,
-                c.bus_offs,
-            )
+            row[: len(OWN_BUS_COUNTERS)] = c.row()
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 

@@ -84,7 +84,7 @@ def test_frames_held_back_by_a_false_beginning_have_the_times_at_which_they_came
         assert [identifier for identifier, _, _ in found] == [1, 2, 3]
         assert [time_ns for _, _, time_ns in found[:2]] == reads[1:]
         assert found[2][2] > reads[-1]
-        assert (bus.counters.error_frames, bus.framing_counters.skipped_bytes) == (1, len(false_beginning))
+        assert (bus.counters.error_frames, bus.counters.framing.skipped_bytes) == (1, len(false_beginning))
 
 
 def test_garbage_is_skipped_and_counted() -> None:
@@ -96,7 +96,32 @@ def test_garbage_is_skipped_and_counted() -> None:
         found = receive(bus, 2)
         assert [payload[:1] for _, payload, _ in found] == [b"\1", b"\2"]
         assert bus.counters.error_frames == 2
-        assert bus.framing_counters.skipped_bytes == len(garbage) + 1 + len(damaged)
+        assert bus.counters.framing.skipped_bytes == len(garbage) + 1 + len(damaged)
+
+
+def test_counters_go_on_over_another_framing_and_another_opening() -> None:
+    with line() as device:
+        with opened(device.path) as bus:
+            device.write(data_frame(1) + b"half")
+            receive(bus, 1)
+            batch = FrameBatch(8, 64)
+
+            def is_read() -> bool:
+                if is_readable(bus, 0.05):
+                    bus.receive(batch, 0)
+                return bus.counters.framing.bytes_in == len(data_frame(1)) + 4
+
+            wait_until(is_read)
+            bus.use(PACKETS)
+            device.write(PACKETS.encode(1, b"one"))
+            receive(bus, 1)
+            bus.close()
+            bus.open()
+            device.write(PACKETS.encode(1, b"two"))
+            receive(bus, 1)
+        counters = bus.counters.framing
+        assert (counters.frames, counters.skipped_bytes) == (3, 4)
+        assert counters.bytes_in == counters.frame_bytes + counters.skipped_bytes
 
 
 def test_more_frames_than_a_batch_holds_stay_and_keep_the_bus_readable() -> None:

@@ -193,6 +193,9 @@ class Adapter(ABC, Generic[OptionsT]):
 
         Returns:
             Who answered, in a few words for people; None if nobody did.
+
+        Raises:
+            BusError: it could not be asked; ``HandshakeTimeout``: nobody answered.
         """
         return None
 

@@ -132,6 +132,12 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         module = Module([Sensor("pressure", cell) for cell in range(_N)], kind=f"{_ROWS}x{_COLUMNS}")
         return [Patch(name, [module])]
 
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Which hand it is for; nothing that it is asked disturbs a board that sends."""
+        [patch] = await cls(cls.Options()).describe(link)
+        return f"Wuji {patch.name}"
+
     async def configure(self, link: Link) -> None:
         """Set the rate, if the options want one."""
         if self._wanted_hz:
@@ -198,13 +204,8 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     ) -> bytes:
         self._number = self._number % 0xFFFF + 1
         head = struct.pack("<HH", command, self._number)
-        for attempt in range(tries):
-            try:
-                reply = await link.request(0, head + arguments, Match(_ANSWER, prefix=head), timeout_s=_TIMEOUT_S)
-                break
-            except HandshakeTimeout:
-                if attempt == tries - 1:
-                    raise
+        answer = Match(_ANSWER, prefix=head)
+        reply = await link.request(0, head + arguments, answer, timeout_s=_TIMEOUT_S, tries=tries)
         status, result = reply.payload[4:5], reply.payload[5:]
         if status not in (b"", b"\0"):
             raise Refused(command, status[0])

@@ -40,7 +40,9 @@ class ScriptedLink(Link):
         super().__init__(SerialBus("/dev/ttyNOWHERE"))
         self._answer = answer
 
-    async def request(self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float) -> Reply:
+    async def request(
+        self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
+    ) -> Reply:
         said = self._answer(identifier, payload[1:])
         if said is None:
             raise HandshakeTimeout("no answer")

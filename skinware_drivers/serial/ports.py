@@ -60,16 +60,17 @@ class DescriptorPort(Port):
     Args:
         name: for messages.
         serial: pyserial's object, which stays the owner.
+        hang_up: False: DTR and RTS stay as they are when it is closed.
     """
 
-    def __init__(self, name: str, serial: Any) -> None:
+    def __init__(self, name: str, serial: Any, *, hang_up: bool = True) -> None:
         self._name = name
         self._serial = serial
         self._fd: int = serial.fileno()
         os.set_blocking(self._fd, False)
         self._is_tty = os.isatty(self._fd)
         if self._is_tty:
-            _wait_for_one_byte(self._fd)
+            _set_up(self._fd, hang_up)
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
 
@@ -278,10 +279,13 @@ def _write_some(fd: int, data: bytes) -> int:
         return 0
 
 
-def _wait_for_one_byte(fd: int) -> None:
-    """Make a read of nothing fail rather than return nothing, which then means that the device is gone."""
+def _set_up(fd: int, hang_up: bool) -> None:
+    """Set what pyserial has no name for."""
     with contextlib.suppress(termios.error):
         settings = termios.tcgetattr(fd)
+        if not hang_up:
+            settings[2] &= ~termios.HUPCL
+        # a read of nothing fails rather than return nothing, which then means that the device is gone
         settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
         termios.tcsetattr(fd, termios.TCSANOW, settings)
 

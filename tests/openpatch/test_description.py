@@ -43,10 +43,11 @@ class ScriptedLink(Link):
     async def request(
         self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
     ) -> Reply:
-        said = self._answer(identifier, payload[1:])
-        if said is None:
-            raise HandshakeTimeout("no answer")
-        return Reply(0, 0x40 + identifier, payload[:1] + said)
+        for _ in range(tries):
+            said = self._answer(identifier, payload[1:])
+            if said is not None:
+                return Reply(0, 0x40 + identifier, payload[:1] + said)
+        raise HandshakeTimeout("no answer")
 
 
 def answering(items: Sequence[bytes], **greeting: Any) -> Answer:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import socket
+import termios
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
+from serial import serialposix
 from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
@@ -297,6 +301,36 @@ def test_refusals_say_what_to_do(
     with pytest.raises(BusNotAvailable, match=message) as raised:
         SerialBus("/dev/ttyS9").open()
     assert raised.value.reason == reason
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_dtr_and_rts_get_their_levels_when_the_port_is_opened(up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pseudo terminal has no such wires: what pyserial asks the kernel for is looked at."""
+    asked: list[tuple[int, int]] = []
+
+    def ioctl(_fd: int, request: int, argument: bytes = b"") -> bytes:
+        asked.append((request, int.from_bytes(argument[:4], "little")))
+        return argument
+
+    monkeypatch.setattr(serialposix, "fcntl", SimpleNamespace(**{**vars(fcntl), "ioctl": ioctl}))
+    level = "yes" if up else "no"
+    with line() as device, opened(device.path, options={"dtr": level, "rts": level}):
+        wires = {argument: request for request, argument in asked if request in (termios.TIOCMBIS, termios.TIOCMBIC)}
+    wanted = termios.TIOCMBIS if up else termios.TIOCMBIC
+    assert wires == {termios.TIOCM_DTR: wanted, termios.TIOCM_RTS: wanted}
+
+
+def test_a_port_can_be_told_not_to_hang_up() -> None:
+    with line() as device:
+        settings = termios.tcgetattr(device.master)
+        settings[2] |= termios.HUPCL
+        termios.tcsetattr(device.master, termios.TCSANOW, settings)
+        for options, hangs_up in (({}, True), ({"hang_up": "no"}, False), ({}, False)):  # as it was, if not told
+            with opened(device.path, options=options):
+                pass
+            assert bool(termios.tcgetattr(device.master)[2] & termios.HUPCL) == hangs_up
+    with pytest.raises(ConfigurationError, match="hang_up=no is for ports of this machine"):
+        SerialBus("socket://localhost:1", {"hang_up": "no"}).open()
 
 
 def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:

@@ -188,11 +188,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             return False
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
-        await self.configure(link)
-        await self.start(link)
-
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
         """Say which errors it reports."""
         self._tell = tell

@@ -226,11 +226,10 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
+    async def revive(self, link: Link, patch: Patch) -> None:
+        """Set it up and start it again, with a clock that begins anew."""
         self._clock = DeviceClock(1e-6)
-        await self.configure(link)
-        await self.start(link)
+        await super().revive(link, patch)
 
     def _take_greeting(self, link: Link, greeting: Greeting) -> None:
         if self._patch is None:

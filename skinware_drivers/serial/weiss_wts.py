@@ -172,10 +172,6 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
             return False
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Start it again."""
-        await self.start(link)
-
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
         """Take the present values as zero."""

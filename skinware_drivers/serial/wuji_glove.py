@@ -161,11 +161,6 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             return False
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
-        await self.configure(link)
-        await self.start(link)
-
     @operation()
     async def rate(self, link: Link, patches: Sequence[Patch], hz: int) -> float:  # noqa: ARG002
         """Set the frames per second; returns what it became."""

@@ -97,12 +97,12 @@ def test_its_bytes_are_those_of_the_protocol() -> None:
     assert patch.totals()["commands"] == 1
 
 
-@pytest.mark.parametrize("n", [0, 1, 253, 254, 255, 508, 509])
-@pytest.mark.parametrize("pattern", [b"\1", b"\0", b"\1" * 254 + b"\0", b"\0" + b"\1" * 254])
-def test_stuffing(n: int, pattern: bytes) -> None:
-    data = (pattern * n)[:n]
-    assert stuff(data) == wire.stuff(data)
-    assert unstuff(stuff(data)) == data
+def test_stuffing() -> None:
+    for pattern in (b"\1", b"\0", b"\1" * 254 + b"\0", b"\0" + b"\1" * 254):
+        for n in (0, 1, 253, 254, 255, 508, 509):
+            data = (pattern * n)[:n]
+            assert stuff(data) == wire.stuff(data)
+            assert unstuff(stuff(data)) == data
 
 
 def test_what_was_never_stuffed_is_nothing() -> None:

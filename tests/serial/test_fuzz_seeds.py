@@ -9,8 +9,6 @@ import random
 import tomllib
 from pathlib import Path
 
-import pytest
-
 from tests.serial.framings import EXAMPLES
 from tests.serial.fuzzing import examples_of_drivers, run
 
@@ -50,9 +48,13 @@ def test_every_framing_has_seeds() -> None:
     assert set(EXAMPLES) | ours & set(examples_of_drivers()) == set(NAMES)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_seeds_and_what_comes_of_them(name: str) -> None:
-    example = {**EXAMPLES, **examples_of_drivers()}[name]
-    inputs, rng = seeds_of(name), random.Random(1)
-    for data in [*inputs, *(changed(inputs, rng) for _ in range(N_CHANGED))]:
-        run(example, data)
+def test_seeds_and_what_comes_of_them() -> None:
+    known = {**EXAMPLES, **examples_of_drivers()}
+    for name in NAMES:
+        inputs, rng = seeds_of(name), random.Random(1)
+        for data in [*inputs, *(changed(inputs, rng) for _ in range(N_CHANGED))]:
+            try:
+                run(known[name], data)
+            except BaseException as error:
+                error.add_note(f"{name}: {data.hex()}")
+                raise

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_DRIVER = "roboskin"
 _EMULATED = "skin-emulate.options"
+_LONGEST_COMMAND = {"can": 8, "serial": 4096}
 _EXIT_FAILED, _EXIT_CONFIGURATION, _EXIT_NO_BUS = 1, 2, 3
 
 
@@ -90,7 +91,7 @@ def _emulate(
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
     medium = medium_of(emulator)
-    bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", 8))
+    bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if bus.medium not in (None, medium):
         where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty or a port"
         raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")

@@ -16,6 +16,7 @@ from skinware_drivers.testing.defect import require
 from skinware_drivers.virtual.hardware import load_emulator
 
 _LONGEST_S = 30.0
+_LONGEST_WRITE = 4096
 
 
 class _Control:
@@ -53,7 +54,7 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     hardware = factory(msgspec.convert(options, factory.Options, strict=False))
-    bus, control = PtyBus("", payload_size=getattr(factory, "payload_size", 8)), _Control()
+    bus, control = PtyBus("", payload_size=_LONGEST_WRITE), _Control()
 
     def run() -> None:
         try:

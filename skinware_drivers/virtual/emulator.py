@@ -111,7 +111,6 @@ class Emulator(Stage, Generic[OptionsT]):
 
     Attributes:
         medium: what the devices are connected by; for serial lines see :mod:`.serial_device`.
-        payload_size: longest payload that they can hear.
         Options: options; becomes those of ``skin-emulate`` and of ``--bus virtual?...``.
         full_scale: greatest value that a device can send.
         lowest: least value that it can send.
@@ -121,7 +120,6 @@ class Emulator(Stage, Generic[OptionsT]):
     """
 
     medium: ClassVar[str] = "can"
-    payload_size: ClassVar[int] = 8
     Options: ClassVar[type[EmulatorOptions]]
     full_scale: ClassVar[int]
     lowest: ClassVar[int] = 0

@@ -17,7 +17,7 @@ _HEARD = "heard"  # in the memory of a device: the beginning of a command whose 
 class SerialEmulatorOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How often a device sends; an emulator adds what the device is."""
 
-    period_ms: Annotated[float, Meta(gt=0, description="time between two bursts, unless it is told another, ms")] = 10
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two bursts, unless it is told another, ms")] = 10
 
 
 OptionsT = TypeVar("OptionsT", bound=SerialEmulatorOptions)
@@ -37,7 +37,6 @@ class SerialEmulator(Emulator[OptionsT]):
     """
 
     medium = "serial"
-    payload_size = 4096
     speed_mbit_s: ClassVar[int] = 1
 
     def __init__(self, options: OptionsT, **more: Any) -> None:

@@ -22,7 +22,7 @@ class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown
 
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches")] = (1, 2, 3, 4, 5, 6, 7, 8)
     cells: Annotated[int, Meta(ge=1, le=16, description="cells of each patch")] = 16
-    period_ms: Annotated[float, Meta(gt=0, description="time between two records of a cell, ms")] = 20
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two records of a cell, ms")] = 20
 
 
 class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):

@@ -20,7 +20,7 @@ class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unk
     """What the glove is."""
 
     taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
-    period_ms: Annotated[float, Meta(gt=0, description="time between two packets of a taxel, ms")] = 30
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
 
 
 class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):

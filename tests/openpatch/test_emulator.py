@@ -135,7 +135,7 @@ class Silent:
 
 @contextmanager
 def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
-    bus, stop = PtyBus(str(link), payload_size=patch.payload_size), Stop()
+    bus, stop = PtyBus(str(link), payload_size=4096), Stop()
     ready = threading.Event()
 
     class Ready(Silent):

@@ -100,8 +100,11 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
 
 def test_a_device_that_says_nothing_is_asked_again() -> None:
     with line() as where, driving(where.path) as runner:
-        first = where.read()
-        assert first == where.read()
+        question = FRAMING.encode(ASK, b"who")
+        heard = where.read()
+        while len(heard) < 2 * len(question):
+            heard += where.read()
+        assert heard.startswith(2 * question)
         with device(where):
             wait_until(lambda: runner.ready)
             with DriverReader("fingertip") as reader:
@@ -128,7 +131,7 @@ def test_every_program_sees_what_became_of_every_byte() -> None:
     answer, good = FRAMING.encode(ANSWER, b"I am tip1"), data_frame(2) + data_frame(3)
     garbage, idle, tail = b"garbage" * 3 + b"\0", b"\0" * 5, data_frame(4)[:7]
     with line() as where, driving(where.path) as runner:
-        assert where.read() == FRAMING.encode(ASK, b"who")
+        assert where.read().startswith(FRAMING.encode(ASK, b"who"))
         where.write(answer)
         wait_until(lambda: runner.ready)
         where.write(garbage + data_frame(2) + idle + bytes(damaged) + data_frame(3) + tail)

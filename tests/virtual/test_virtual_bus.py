@@ -165,7 +165,7 @@ def test_the_descriptor_is_readable_when_frames_are_due_and_not_before() -> None
             assert time.monotonic_ns() >= due_ns
             batch.clear()
             assert with_clock.receive(batch, 0) >= 1
-            assert batch.time_ns[0] == due_ns
+            assert batch.time_ns[0] >= due_ns  # later, if nobody came for so long that frames were lost
     finally:
         with_clock.close()
 

@@ -113,7 +113,9 @@ class Bus(ABC):
     """One link to hardware.
 
     Attributes:
+        medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
+        counters: what happened on it so far.
         narrows: frames that nobody wants can be left out, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known.
         wire_bits: about how many bits the frames seen so far took on the wire; counted where the bit rate is known.
@@ -128,9 +130,6 @@ class Bus(ABC):
         options: the ``key=value`` pairs behind ``?``, as strings.
         payload_size: the longest payload the driver's layout knows, 8 or 64 for CAN.
         listen_only: refuse every ``send``.
-
-    Attributes:
-        medium: kind of bus, as drivers name it; None: whatever the driver speaks.
 
     Raises:
         skinware.errors.ConfigurationError: an option is unknown or has a bad value.

@@ -2,26 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-OWN_BUS_COUNTERS = (
-    "frames",
-    "lost",
-    "errors",
-    "refused",
-    "sent",
-    "send_failures",
-    "polls_missed",
-    "overflows",
-    "bus_offs",
-    "bytes_in",
-    "frame_bytes",
-    "idle_bytes",
-    "skipped_bytes",
-    "checksum_errors",
-    "bad_form",
-)
-"""Names of the counters in ``BusCounters.row``, for people and other programs."""
+from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 
 @dataclass
@@ -55,7 +37,7 @@ class BusCounters:
     """Frames received."""
     lost: int = 0
     """Frames that the kernel (or the interface's queue) dropped before we could read them."""
-    error_frames: int = 0
+    errors: int = 0
     """CAN error frames and their like."""
     refused: int = 0
     """Frames that do not fit this bus' batch (remote frames, FD frames on a classic layout)."""
@@ -72,26 +54,18 @@ class BusCounters:
     framing: FramerCounters = field(default_factory=FramerCounters)
     """Of a serial line."""
 
-    def row(self) -> tuple[int, ...]:
-        """The counts, in the order of ``OWN_BUS_COUNTERS``."""
-        framing = self.framing
-        return (
-            self.frames,
-            self.lost,
-            self.error_frames,
-            self.refused,
-            self.sent,
-            self.send_failures,
-            self.polls_missed,
-            self.overflows,
-            self.bus_offs,
-            framing.bytes_in,
-            framing.frame_bytes,
-            framing.idle_bytes,
-            framing.skipped_bytes,
-            framing.checksum_errors,
-            framing.refused,
-        )
 
+_OWN = {each.name: each.name for each in fields(BusCounters) if each.name != "framing"} | {
+    "bytes_in": "framing.bytes_in",
+    "frame_bytes": "framing.frame_bytes",
+    "idle_bytes": "framing.idle_bytes",
+    "skipped_bytes": "framing.skipped_bytes",
+    "checksum_errors": "framing.checksum_errors",
+    "bad_form": "framing.refused",
+}
+OWN_BUS_COUNTERS = tuple(_OWN)
+"""Names of what a bus counts, for people and other programs."""
+read_own = attrgetter(*_OWN.values())
+"""The counts of a ``BusCounters``, in the order of ``OWN_BUS_COUNTERS``."""
 
-__all__ = ["OWN_BUS_COUNTERS", "BusCounters", "FramerCounters"]
+__all__ = ["OWN_BUS_COUNTERS", "BusCounters", "FramerCounters", "read_own"]

@@ -13,7 +13,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
-from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters
+from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
@@ -190,8 +190,7 @@ class Publisher:
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
-        for row, c in zip(self._counts, self.bus_counters, strict=True):
-            row[: len(OWN_BUS_COUNTERS)] = c.row()
+        self._counts[:, : len(OWN_BUS_COUNTERS)] = [read_own(counters) for counters in self.bus_counters]
         self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 

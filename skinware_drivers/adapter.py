@@ -225,6 +225,9 @@ class Adapter(HasOptions[OptionsT], ABC):
 
         Returns:
             Who answered, in a few words for people; None if nobody did.
+
+        Raises:
+            BusError: it could not be asked; ``HandshakeTimeout``: nobody answered.
         """
         return None
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.status import BusReason
+from skinware_drivers.counters import BusCounters
 
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h)."""
@@ -109,30 +109,6 @@ class FrameBatch:
         self.time_ns[self.stop] = time_ns
         self.bus[self.stop] = bus
         self.stop += 1
-
-
-@dataclass
-class BusCounters:
-    """What happened on one bus since it was opened, counted by the bus itself."""
-
-    frames: int = 0
-    """Frames received."""
-    lost: int = 0
-    """Frames that the kernel (or the interface's queue) dropped before we could read them."""
-    errors: int = 0
-    """CAN error frames and their like."""
-    refused: int = 0
-    """Frames that do not fit this bus' batch (remote frames, FD frames on a classic layout)."""
-    sent: int = 0
-    """Frames handed to the wire."""
-    send_failures: int = 0
-    """Sends that the interface refused."""
-    polls_missed: int = 0
-    """Polls of devices that only answer which could not be sent in time."""
-    overflows: int = 0
-    """How often the controller told that it had lost frames."""
-    bus_offs: int = 0
-    """How often the controller left the wire."""
 
 
 class Bus(ABC):
@@ -257,7 +233,6 @@ __all__ = [
     "EXTENDED_FLAG",
     "REMOTE_FLAG",
     "Bus",
-    "BusCounters",
     "Filter",
     "FrameBatch",
     "wire_dtype",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -141,21 +142,27 @@ class Link:
                 self._late.append((now_ns() + _LATE_NS, matches))
             self._tell_bus()
 
-    async def request(self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float) -> Reply:
+    async def request(
+        self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
+    ) -> Reply:
         """Send one frame and wait for the first answer to it; older frames do not count.
+
+        It is sent up to ``tries`` times, for lines that lose something now and then; it must do no harm twice.
 
         Raises:
             HandshakeTimeout: no answer in time.
             BusSendError: as ``send``.
         """
         with self._waiting((reply,), may_be_late=True) as queue:
-            await self.send(identifier, payload)
-            try:
-                async with asyncio.timeout(timeout_s):  # not wait_for: that of Python 3.11 forgets cancellations
-                    return await queue.get()
-            except TimeoutError:
-                sent = f"{identifier:03X} [{payload.hex(' ').upper()}]"
-                raise HandshakeTimeout(f"{self.bus_name}: no answer to {sent} within {timeout_s:g} s") from None
+            for _ in range(tries):
+                await self.send(identifier, payload)
+                # not wait_for: that of Python 3.11 forgets cancellations
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(timeout_s):
+                        return await queue.get()
+        sent = f"{identifier:03X} [{payload.hex(' ').upper()}]"
+        times = "" if tries == 1 else f", {tries} times"
+        raise HandshakeTimeout(f"{self.bus_name}: no answer to {sent} within {timeout_s:g} s{times}")
 
     async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
         """Send one frame and gather all answers that come within ``duration_s``.

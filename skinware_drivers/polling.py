@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from skinware.errors import BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
-from skinware_drivers.bus import BusCounters
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.link import Link
 
 

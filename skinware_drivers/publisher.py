@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
-from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -15,14 +13,12 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
-from skinware_drivers.bus import BusCounters
+from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-_OWN_COUNTERS = tuple(field.name for field in fields(BusCounters))
-_read_own = attrgetter(*_OWN_COUNTERS)
-ALL_BUS_COUNTERS = (*_OWN_COUNTERS, *BUS_COUNTERS)
+ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
@@ -194,8 +190,8 @@ class Publisher:
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
-        self._counts[:, : len(_OWN_COUNTERS)] = [_read_own(counters) for counters in self.bus_counters]
-        self._counts[:, len(_OWN_COUNTERS) :] = self._state.bus_counters
+        self._counts[:, : len(OWN_BUS_COUNTERS)] = [read_own(counters) for counters in self.bus_counters]
+        self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
         return self._counts
 
     def _update_patch_states(self, time_ns: int) -> None:

@@ -26,8 +26,8 @@ from skinware.structure import Structure
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
 """Titles of the cells of a row."""
 
-_OWN_COLUMNS = ("lost", "orphans")
-"""Counters that have columns of their own."""
+_NOT_AMONG_OTHERS = ("lost", "orphans", "bytes_in", "frame_bytes", "idle_bytes")
+"""Counters that have columns of their own, and those that grow while all is well: the chosen row shows them."""
 
 DRIVER, BUS, PATCH = "driver", "bus", "patch"
 
@@ -81,7 +81,7 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
     for bus, counters in enumerate(reader.bus_counters(frame)):
         state = bus_state_name(int(frame.bus_state[bus]))
         reason = bus_reason_name(int(frame.bus_reason[bus]))
-        lost, others = count_text(counters.get("lost")), counters_text(counters, besides=_OWN_COLUMNS)
+        lost, others = count_text(counters.get("lost")), counters_text(counters, besides=_NOT_AMONG_OTHERS)
         told = f"{reason.replace('_', '-')}  {others}".rstrip() if reason else others
         cells = (f"  {structure.buses[bus]}", was + state, "", "", "", lost, "", told)
         rows.append(Row(RowKey(name, BUS, bus), cells, was + state, counters))
@@ -106,7 +106,7 @@ def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row
             f"{fresh[patch]}/{total[patch]}",
             "",
             count_text(counters.get("orphans")),
-            counters_text(counters, besides=_OWN_COLUMNS),
+            counters_text(counters, besides=_NOT_AMONG_OTHERS),
         )
         rows.append(Row(RowKey(reader.name, PATCH, patch), cells, state, counters))
     return rows

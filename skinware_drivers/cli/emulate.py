@@ -94,19 +94,11 @@ def _emulate(
     emulator = load_emulator(driver)
     given = {name: _text(value) for name, value in texts.items() if value is not None}
     options = options_from_strings(emulator.Options, given)
-    framing = getattr(emulator, "framing", None)
-    medium = "serial" if framing is not None else medium_of(emulator)
+    medium = medium_of(emulator)
     bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if bus.medium not in (None, medium):
         where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty:./port or a port"
         raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
-    if medium == "serial" and getattr(options, "foreign_hz", False):
-        raise ConfigurationError("--foreign-hz: nothing else hangs on a serial line")
-    if framing is not None:
-        from skinware_drivers.serial.bus import SerialBus
-
-        if isinstance(bus, SerialBus):
-            bus.use(framing)
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from skinware.errors import BusError, BusNotAvailable, ConfigurationError
+from skinware.errors import BusError, BusNotAvailable, ConfigurationError, HandshakeTimeout
 from skinware.realtime import now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
@@ -185,6 +185,8 @@ async def _ask_all(bus: Bus, bus_name: str, drivers: Mapping[str, type[AnyAdapte
             for name, driver in drivers.items():
                 try:
                     told = await asyncio.wait_for(driver.identify(link, idle=idle), _IDENTIFY_S)
+                except HandshakeTimeout:
+                    continue
                 except BusError as error:
                     problems[name] = str(error)
                 except TimeoutError:

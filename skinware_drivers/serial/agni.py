@@ -149,6 +149,12 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._patch = Patch(f"device {device}", modules)
         return [self._patch]
 
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Its number and how many sensors it has, which it tells also while it sends."""
+        _, device, n_sensors = (await cls._ask(link))[:3]
+        return f"AGNI device {device} with {n_sensors} sensors"
+
     async def configure(self, link: Link) -> None:
         """Set the period of all sensors, if the options want one."""
         if self._period_ms:
@@ -178,11 +184,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             return False
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
-        await self.configure(link)
-        await self.start(link)
-
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
         """Say which errors it reports."""
         self._tell = tell
@@ -209,15 +210,12 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             return False
         return True
 
-    async def _ask(self, link: Link, tries: int = _TRIES) -> bytes:
+    @staticmethod
+    async def _ask(link: Link, tries: int = _TRIES) -> bytes:
         """The configuration.
 
         Raises:
             HandshakeTimeout: no answer.
         """
-        for _ in range(tries - 1):
-            try:
-                return await self._ask(link, 1)
-            except HandshakeTimeout:
-                continue
-        return (await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S)).payload
+        reply = await link.request(0, command(_CONFIGURATION), Match(0), timeout_s=_TIMEOUT_S, tries=tries)
+        return reply.payload

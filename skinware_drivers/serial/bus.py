@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.framing import Encoding, Framed, Framer, FramerCounters, Framing, Unframed
+from skinware_drivers.serial.framing import Encoding, Framed, Framer, Framing, Unframed
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
 from skinware_drivers.serial.ports import Port, PtyPort
 
@@ -34,7 +34,7 @@ class SerialBus(Bus):
     with ``serial_number`` or ``vid_pid`` the port of that USB device, under whatever path it has when it is opened.
 
     Every frame has the time at which its last byte was read. Frames arrive in the order of the stream. Damaged ones
-    are counted in ``counters.errors``, and in more detail in ``framing_counters``.
+    are counted in ``counters.errors``, and in more detail in ``counters.framing``.
 
     Args:
         channel: path or URL; empty if the options say which USB device.
@@ -73,8 +73,7 @@ class SerialBus(Bus):
         self._backlog: list[tuple[Framed, npt.NDArray[np.int64]]] = []
         self._framer: Framer = self._framing.framer()
         self._reads: list[tuple[int, int]] = []
-        self._before = FramerCounters()
-        self._told, self._told_ns, self._is_garbled = FramerCounters(), 0, False
+        self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     def use(self, framing: Framing, commands: Encoding | None = None, baudrate: int | None = None) -> None:
         """Say what is on the line. What was received but not fetched is dropped.
@@ -87,11 +86,6 @@ class SerialBus(Bus):
         self._framing, self._commands = framing, commands or framing
         self._baudrate = baudrate or self._baudrate
         self._begin_anew()
-
-    @property
-    def framing_counters(self) -> FramerCounters:
-        """What was found and what was skipped since the bus was made."""
-        return _sum(self._before, self._framer.counters)
 
     def open(self) -> None:
         """Open the port for us alone, raw, with nothing in its buffers.
@@ -182,10 +176,11 @@ class SerialBus(Bus):
         return "" if self._port is None else self._port.note
 
     def _begin_anew(self) -> None:
-        self._before = _sum(self._before, self._framer.counters)
-        self._before.skipped_bytes += self._framer.pending
+        counters = self.counters.framing
+        counters.skipped_bytes += self._framer.pending
         self._framer = self._framing.framer()
-        self._told, self._told_ns, self._is_garbled = FramerCounters(), 0, False
+        self._framer.counters = counters
+        self._told, self._told_ns, self._is_garbled = replace(counters), 0, False
         self._reads.clear()
         self._backlog.clear()
 
@@ -200,12 +195,12 @@ class SerialBus(Bus):
         if not chunk:
             return
         time_ns = now_ns()
-        framer = self._framer
-        known = framer.counters.bytes_in
-        damaged = framer.counters.checksum_errors + framer.counters.refused
+        framer, counters = self._framer, self.counters.framing
+        known = framer.position
+        damaged = counters.checksum_errors + counters.refused
         framed = framer.feed(chunk)
-        self.counters.errors += framer.counters.checksum_errors + framer.counters.refused - damaged
-        self._reads.append((framer.counters.bytes_in, time_ns))
+        self.counters.errors += counters.checksum_errors + counters.refused - damaged
+        self._reads.append((framer.position, time_ns))
         if len(framed):
             fits = framed.length <= self.payload_size
             if not fits.all():
@@ -219,7 +214,7 @@ class SerialBus(Bus):
 
     def _tell_garbled(self, time_ns: int) -> None:
         """Whether more was skipped than was good since it was last told."""
-        now, before = self._framer.counters, self._told
+        now, before = self.counters.framing, self._told
         self._is_garbled = now.skipped_bytes - before.skipped_bytes > now.frame_bytes - before.frame_bytes
         self._told, self._told_ns = replace(now), time_ns
 
@@ -233,7 +228,7 @@ class SerialBus(Bus):
 
     def _forget_reads(self) -> None:
         """Keep the times of the bytes that are still held back."""
-        undecided = self._framer.counters.bytes_in - self._framer.pending
+        undecided = self._framer.position - self._framer.pending
         if not self._framer.pending:
             self._reads.clear()
         while self._reads and self._reads[0][0] <= undecided:
@@ -298,10 +293,6 @@ def _split_options(channel: str, options: dict[str, str]) -> tuple[dict[str, str
     own = set(SerialOptions.__struct_fields__)
     query = "&".join(f"{key}={text}" if text else key for key, text in options.items() if key not in own)
     return {key: text for key, text in options.items() if key in own}, f"?{query}" if query else ""
-
-
-def _sum(one: FramerCounters, other: FramerCounters) -> FramerCounters:
-    return FramerCounters(**{f.name: getattr(one, f.name) + getattr(other, f.name) for f in fields(FramerCounters)})
 
 
 __all__ = ["PtyBus", "SerialBus"]

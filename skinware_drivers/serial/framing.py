@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from skinware_drivers.counters import FramerCounters
 from skinware_drivers.serial.gather import Bytes, Indices, copy_rows
 
 MANY_BYTES = 2048
@@ -75,26 +76,6 @@ class Field:
             raise ValueError(f"{value} does not fit into a field of {self.size} bytes with mask {mask:#x}")
         kept = int.from_bytes(frame[self.offset : self.end], self.order) & ~mask
         frame[self.offset : self.end] = (kept | value).to_bytes(self.size, self.order)
-
-
-@dataclass
-class FramerCounters:
-    """What a framer has seen since it was made."""
-
-    bytes_in: int = 0
-    """Bytes it was fed."""
-    frame_bytes: int = 0
-    """Bytes of good frames, with everything that belongs to their framing."""
-    idle_bytes: int = 0
-    """Delimiters between frames that end nothing."""
-    skipped_bytes: int = 0
-    """Bytes that belong to no good frame."""
-    frames: int = 0
-    """Good frames."""
-    checksum_errors: int = 0
-    """Frames whose checksum was wrong, or bytes that looked like the beginning of one."""
-    refused: int = 0
-    """Frames of a length or form that cannot be, or bytes that looked like the beginning of one."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +156,7 @@ class Framer(ABC):
     """Finds the frames of one stream.
 
     Attributes:
-        counters: what it has seen.
+        counters: what it has seen; several that follow each other on one line can be given the same.
     """
 
     def __init__(self) -> None:
@@ -183,6 +164,11 @@ class Framer(ABC):
         self._rest = b""
         self._before = 0  # bytes of the stream before the rest
         self._wanted = 0  # the rest cannot be decided before it has so many bytes
+
+    @property
+    def position(self) -> int:
+        """Bytes of the stream so far."""
+        return self._before + len(self._rest)
 
     @property
     def pending(self) -> int:

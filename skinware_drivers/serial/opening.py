@@ -31,6 +31,9 @@ class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stop_bits: Annotated[Literal[1, 2], Meta(description="stop bits")] = 1
     rtscts: Annotated[bool, Meta(description="hardware flow control")] = False
     low_latency: Annotated[bool, Meta(description="ask the adapter to hand on bytes at once")] = True
+    dtr: Annotated[bool, Meta(description="level of DTR once the port is open")] = True
+    rts: Annotated[bool, Meta(description="level of RTS once the port is open, without rtscts")] = True
+    hang_up: Annotated[bool, Meta(description="no: DTR and RTS stay as they are when the port is closed")] = True
 
 
 def find_port(channel: str, options: SerialOptions) -> str:
@@ -81,6 +84,8 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
         ConfigurationError: pyserial knows no such URL, or the port has no such setting.
     """
     is_url = "://" in path
+    if is_url and not options.hang_up:
+        raise ConfigurationError(f"{path}: hang_up=no is for ports of this machine: it is the machine that hangs up")
     try:
         line = serial.serial_for_url(
             path,
@@ -95,12 +100,13 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
         )
     except (serial.SerialException, ValueError) as error:
         raise ConfigurationError(f"{path}: {error}") from None
+    line.dtr, line.rts = options.dtr, options.rts
     try:
         line.open()
     except (OSError, ValueError, EOFError, NotImplementedError) as error:  # SerialException is an OSError
         raise _refusal(path, error, baudrate) from None
     if not is_url or path.startswith("socket://"):
-        port: Port = DescriptorPort(path, line)
+        port: Port = DescriptorPort(path, line, hang_up=options.hang_up)
     else:
         port = ThreadedPort(path, line)
     if options.low_latency and not is_url and not os.path.realpath(path).startswith("/dev/pts/"):

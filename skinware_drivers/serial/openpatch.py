@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
@@ -52,6 +52,7 @@ _REPLY = 0x40
 
 _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
+_TRIES_AFTER_RESET = 10  # opening a port resets many boards, which hear nothing while their boot loader waits
 _LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _MOST_MATTERS = 50
@@ -180,6 +181,14 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         else:
             time_ns[rows] = sampled_ns
 
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """The patch's name; whether it streams makes no difference to what is asked."""
+        asking = cls(OpenPatchOptions())
+        await asking._greet(link, tries=_TRIES_AFTER_RESET)
+        [patch] = await asking.describe(link)
+        return f"open patch: {patch.name}"
+
     # -- looking after it -----------------------------------------------------------------------------------------
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
@@ -215,11 +224,10 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
         return True
 
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
+    async def revive(self, link: Link, patch: Patch) -> None:
+        """Set it up and start it again, with a clock that begins anew."""
         self._clock = DeviceClock(1e-6)
-        await self.configure(link)
-        await self.start(link)
+        await super().revive(link, patch)
 
     def _take_greeting(self, link: Link, greeting: Greeting) -> None:
         if self._patch is None:
@@ -339,15 +347,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         """
         self._number = self._number % 255 + 1
         number = bytes((self._number,))
-        for attempt in range(tries):
-            try:
-                reply = await link.request(
-                    request, number + arguments, Match(_REPLY + request, prefix=number), timeout_s=timeout_s
-                )
-                break
-            except HandshakeTimeout:
-                if attempt == tries - 1:
-                    raise
+        answer = Match(_REPLY + request, prefix=number)
+        reply = await link.request(request, number + arguments, answer, timeout_s=timeout_s, tries=tries)
         if len(reply.payload) < 2:
             raise BadDescription(f"the answer to request {request:#04x} has {len(reply.payload)} bytes")
         if reply.payload[1]:

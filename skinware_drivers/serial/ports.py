@@ -60,16 +60,17 @@ class DescriptorPort(Port):
     Args:
         name: for messages.
         serial: pyserial's object, which stays the owner.
+        hang_up: False: DTR and RTS stay as they are when it is closed.
     """
 
-    def __init__(self, name: str, serial: Any) -> None:
+    def __init__(self, name: str, serial: Any, *, hang_up: bool = True) -> None:
         self._name = name
         self._serial = serial
         self._fd: int = serial.fileno()
         os.set_blocking(self._fd, False)
         self._is_tty = os.isatty(self._fd)
         if self._is_tty:
-            _wait_for_one_byte(self._fd)
+            _set_up(self._fd, hang_up)
             with contextlib.suppress(OSError):
                 fcntl.ioctl(self._fd, termios.TIOCEXCL)
 
@@ -95,10 +96,7 @@ class DescriptorPort(Port):
 
     def write(self, data: bytes) -> int:
         """Write what fits into the kernel's buffer."""
-        try:
-            return os.write(self._fd, data)
-        except BlockingIOError:
-            return 0
+        return _write_some(self._fd, data)
 
     def close(self) -> None:
         """Let go of it."""
@@ -261,10 +259,7 @@ class PtyPort(Port):
 
     def write(self, data: bytes) -> int:
         """What fits into the kernel's buffer; nobody may be reading."""
-        try:
-            return os.write(self._fd, data)
-        except BlockingIOError:
-            return 0
+        return _write_some(self._fd, data)
 
     def close(self) -> None:
         """Take the port away."""
@@ -277,10 +272,20 @@ class PtyPort(Port):
         self._fd = -1
 
 
-def _wait_for_one_byte(fd: int) -> None:
-    """Make a read of nothing fail rather than return nothing, which then means that the device is gone."""
+def _write_some(fd: int, data: bytes) -> int:
+    try:
+        return os.write(fd, data)
+    except BlockingIOError:
+        return 0
+
+
+def _set_up(fd: int, hang_up: bool) -> None:
+    """Set what pyserial has no name for."""
     with contextlib.suppress(termios.error):
         settings = termios.tcgetattr(fd)
+        if not hang_up:
+            settings[2] &= ~termios.HUPCL
+        # a read of nothing fails rather than return nothing, which then means that the device is gone
         settings[6][termios.VMIN], settings[6][termios.VTIME] = 1, 0
         termios.tcsetattr(fd, termios.TCSANOW, settings)
 

@@ -108,7 +108,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
 
     def __init__(self, options: WeissWtsOptions) -> None:
         super().__init__(options)
-        self._matrix = b""
+        self._matrix: tuple[int, ...] = ()
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
 
     @property
@@ -125,17 +125,21 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         if link.listen_only:
             raise BusError("a sensor says how many cells it has only when it is asked: listening alone cannot find out")
         await self.stop(link)
-        answer = await self._ask(link, _MATRIX)
-        if len(answer) < 10:
-            raise BusError(f"the sensor's matrix information has {len(answer)} bytes instead of 10")
-        columns, rows, width, height, full_scale = struct.unpack_from("<5H", answer)
+        matrix = await self._ask_matrix(link)
+        columns, rows, width, height, full_scale = matrix
         count = columns * rows
         if not 1 <= count <= _MOST_CELLS or not full_scale:
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
         log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
-        self.types: Sequence[SensorType] = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
-        self.layout, self._matrix = self._layout(count), answer
+        self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
+        self.layout, self._matrix = self._layout(count), matrix
         return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{columns}x{rows}")])]
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Its matrix, which it tells also while it sends."""
+        columns, rows, *_ = await cls._ask_matrix(link)
+        return f"WTS with {columns} x {rows} cells"
 
     async def start(self, link: Link) -> None:
         """Have it send by itself."""
@@ -155,17 +159,13 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
         try:
-            matrix = await self._ask(link, _MATRIX, tries=1)
+            matrix = await self._ask_matrix(link, tries=1)
         except HandshakeTimeout:
             return False
         if matrix != self._matrix:
             self._tell(patch, Notice.CHANGED)
             return False
         return True
-
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Start it again."""
-        await self.start(link)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
@@ -196,14 +196,17 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         runs = Expand(lambda payload, length: _runs(payload, length, offset, count))
         return Layout([plain, Frame("runs", [Identifier(_DATA), Byte(4, _RLE, _RLE)], lengths, runs, time=time)])
 
-    async def _ask(self, link: Link, command: int, arguments: bytes = b"", *, tries: int = _TRIES) -> bytes:
-        for attempt in range(tries):
-            try:
-                reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S)
-                break
-            except HandshakeTimeout:
-                if attempt == tries - 1:
-                    raise
+    @classmethod
+    async def _ask_matrix(cls, link: Link, *, tries: int = _TRIES) -> tuple[int, ...]:
+        """Columns, rows, width and height of a cell in 1/100 mm, greatest value."""
+        answer = await cls._ask(link, _MATRIX, tries=tries)
+        if len(answer) < 10:
+            raise BusError(f"the sensor's matrix information has {len(answer)} bytes instead of 10")
+        return struct.unpack_from("<5H", answer)
+
+    @classmethod
+    async def _ask(cls, link: Link, command: int, arguments: bytes = b"", *, tries: int = _TRIES) -> bytes:
+        reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S, tries=tries)
         if len(reply.payload) < 2:
             raise BusError(f"the sensor's answer to command {command:#04x} has no status")
         status = int.from_bytes(reply.payload[:2], "little")

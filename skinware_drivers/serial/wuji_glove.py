@@ -127,6 +127,12 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         module = Module([Sensor("pressure", cell) for cell in range(_N)], kind=f"{_ROWS}x{_COLUMNS}")
         return [Patch(name, [module])]
 
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Which hand it is for; nothing that it is asked disturbs a board that sends."""
+        [patch] = await cls(WujiGloveOptions()).describe(link)
+        return f"Wuji {patch.name}"
+
     async def configure(self, link: Link) -> None:
         """Set the rate, if the options want one."""
         if self._wanted_hz:
@@ -149,11 +155,6 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         except HandshakeTimeout:
             return False
         return True
-
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set it up and start it again."""
-        await self.configure(link)
-        await self.start(link)
 
     @operation()
     async def rate(self, link: Link, patches: Sequence[Patch], hz: int) -> float:  # noqa: ARG002
@@ -193,13 +194,8 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     ) -> bytes:
         self._number = self._number % 0xFFFF + 1
         head = struct.pack("<HH", command, self._number)
-        for attempt in range(tries):
-            try:
-                reply = await link.request(0, head + arguments, Match(_ANSWER, prefix=head), timeout_s=_TIMEOUT_S)
-                break
-            except HandshakeTimeout:
-                if attempt == tries - 1:
-                    raise
+        answer = Match(_ANSWER, prefix=head)
+        reply = await link.request(0, head + arguments, answer, timeout_s=_TIMEOUT_S, tries=tries)
         status, result = reply.payload[4:5], reply.payload[5:]
         if status not in (b"", b"\0"):
             raise Refused(command, status[0])

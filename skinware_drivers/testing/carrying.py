@@ -50,14 +50,11 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
     """Run emulated devices as long as the ``with`` lasts; yields the path of their serial port.
 
     Args:
-        emulator: class or registered name of an emulator whose frames are the bytes on the line, or have a ``framing``.
+        emulator: class or registered name of an emulator of serial devices.
         options: of the emulator.
     """
     factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
     bus = PtyBus("", payload_size=_LONGEST_WRITE)
-    framing = getattr(factory, "framing", None)
-    if framing is not None:
-        bus.use(framing)
     with emulated_on(bus, factory, **options):
         yield bus.note.removeprefix("serial port ")
 

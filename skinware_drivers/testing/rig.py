@@ -25,7 +25,6 @@ from skinware_drivers.testing.wire import (
     EmulatedBus,
     EmulatedSerialBus,
     Interference,
-    OnTheLine,
     Pattern,
     Truth,
     make_bus,
@@ -133,8 +132,7 @@ class Rig:
         self.truth: Truth = Truth(clock, n_felt, pattern, case.shown)
         self.devices: Any = case.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
-        framing = getattr(self.devices, "framing", None)
-        self.wire: Interference = Interference(self.devices if framing is None else OnTheLine(self.devices, framing))
+        self.wire: Interference = Interference(self.devices)
         self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
 
     @property

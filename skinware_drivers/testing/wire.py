@@ -17,7 +17,6 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.testing.clock import HandClock, HandTimer
 from skinware_drivers.testing.defect import defect
@@ -78,45 +77,6 @@ class Truth:
             burst = Burst(self._clock.now_ns, np.array(self._shown(felt)))
             self.bursts.setdefault(number, []).append(burst)
         return felt
-
-
-class OnTheLine:
-    """Devices that speak in messages, as the bytes on their serial line.
-
-    Args:
-        hardware: the devices.
-        framing: how their messages lie in the stream.
-    """
-
-    def __init__(self, hardware: EmulatedHardware, framing: Framing) -> None:
-        self._hardware = hardware
-        self._framing = framing
-        self._framer = framing.framer()
-
-    def receive(self, _identifier: int, payload: bytes, now_ns: int) -> None:
-        """Take bytes from the line."""
-        framed = self._framer.feed(payload)
-        for identifier, body in zip(framed.identifier.tolist(), framed.bodies(), strict=True):
-            self._hardware.receive(identifier, body, now_ns)
-
-    def next_due_ns(self) -> int | None:
-        """When ``emit`` is worth calling again."""
-        return self._hardware.next_due_ns()
-
-    def emit(self, now_ns: int) -> list[WireFrame]:
-        """The bytes of each message."""
-        return [
-            WireFrame(time_ns, 0, self._framing.encode(identifier, payload))
-            for time_ns, identifier, payload in self._hardware.emit(now_ns)
-        ]
-
-    def skip(self, now_ns: int) -> int:
-        """Let the devices run on with nobody listening."""
-        return self._hardware.skip(now_ns)
-
-    def totals(self) -> dict[str, int]:
-        """Of the devices."""
-        return self._hardware.totals()
 
 
 @dataclass(frozen=True)
@@ -337,7 +297,6 @@ __all__ = [
     "EmulatedSerialBus",
     "Fault",
     "Interference",
-    "OnTheLine",
     "Pattern",
     "Truth",
     "foreign_identifiers",

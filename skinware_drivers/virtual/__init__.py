@@ -4,5 +4,16 @@ from skinware_drivers.virtual.adapter import VirtualAdapter
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
 from skinware_drivers.virtual.press import on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
-__all__ = ["CanFrame", "Device", "Emulator", "EmulatorOptions", "VirtualAdapter", "on_a_grid"]
+__all__ = [
+    "CanFrame",
+    "Device",
+    "Emulator",
+    "EmulatorOptions",
+    "SerialEmulator",
+    "SerialEmulatorOptions",
+    "VirtualAdapter",
+    "cut_packets",
+    "on_a_grid",
+]

@@ -1,6 +1,6 @@
 """An emulated AnySkin board: sends from power-up to the end, and hears nothing.
 
-Source: ``arduino/5X_binary_burst_stream`` of github.com/raunaqbhirangi/anyskin. Frames are the bytes on the line.
+Source: ``arduino/5X_binary_burst_stream`` of github.com/raunaqbhirangi/anyskin.
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.serial.framing import Unframed
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
-class EmulatedAnySkinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAnySkinOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the board is."""
 
     mags: Annotated[int, Meta(ge=1, le=64, description="magnetometers of the board")] = 5
-    period_ms: Annotated[int, Meta(ge=1, description="time between two messages, ms")] = 10
 
 
-class EmulatedAnySkin(Emulator[EmulatedAnySkinOptions]):
-    """One board, device 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+class EmulatedAnySkin(SerialEmulator[EmulatedAnySkinOptions]):
+    """One board, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
 
     Values: temperature, x, y and z of magnetometer 0, of magnetometer 1 ... in degrees Celsius and microtesla.
     """
@@ -34,9 +33,6 @@ class EmulatedAnySkin(Emulator[EmulatedAnySkinOptions]):
     lowest = -50_000
     rest = 25
     swing = 400
-    numbers: Sequence[int] = (1,)
-    payload_size = 1032
-    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """Four values at each magnetometer."""
@@ -46,6 +42,6 @@ class EmulatedAnySkin(Emulator[EmulatedAnySkinOptions]):
         """It sends by itself."""
         self.start(device, now_ns)
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         """One message."""
-        return [(0, struct.pack(f"<{len(values)}f", *values) + b"\r\n")]
+        return [struct.pack(f"<{len(values)}f", *values) + b"\r\n"]

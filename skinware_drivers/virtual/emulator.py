@@ -46,7 +46,9 @@ class Device:
         number: how the emulator's options name it.
         memory: what commands have set; gone after a restart.
         cycle: bursts sent since the first power-up; the number of the next one.
+        ready_ns: when it could hear and send, since it last got power.
         streams_from_ns: when it began to send by itself; None: it does not.
+        sampled_ns: when the values of its last burst were felt.
     """
 
     def __init__(self, number: int, emulator: Emulator[Any], transmitter: Transmitter, now_ns: int) -> None:
@@ -57,6 +59,7 @@ class Device:
         self.alive = True
         self.ready_ns = now_ns
         self.streams_from_ns: int | None = None
+        self.sampled_ns = now_ns
         self._emulator = emulator
         self._timers: dict[str, tuple[int, int]] = {}  # name -> next, period
 
@@ -111,11 +114,10 @@ class Emulator(Stage, HasOptions[OptionsT]):
         source: the values of every burst, instead of what is felt.
 
     Attributes:
-        medium: what the devices are connected by: ``can`` or ``serial``. On a serial line, what the payloads of frames
-            hold is all that there is: identifiers are 0, and a command is the bytes that the host wrote at once.
+        medium: what the devices are connected by; for serial lines see :mod:`.serial_device`.
         Options: those options; they become those of ``skin-emulate`` and of ``--bus virtual?...``.
         numbers: of the devices. To be set before ``Emulator.__init__`` where the options say which there are.
-        identifiers: every one that the devices or their host can use: no foreign device does. None on a serial line.
+        identifiers: every one that the devices or their host can use: no foreign device does.
         period_s: time from burst to burst of a device that sends by itself; an option ``period_ms`` sets it.
         full_scale: greatest value that a device can send.
         lowest: least value that it can send.
@@ -194,12 +196,19 @@ class Emulator(Stage, HasOptions[OptionsT]):
         device.streams_from_ns = None
         device.stop(_DATA)
 
+    def change_period(self, device: Device, now_ns: int, period_s: float) -> None:
+        """Make it send at other times, if it sends by itself."""
+        if device.streams_from_ns is not None:
+            self.stop(device)
+            self.start(device, now_ns, period_s)
+
     def reply(self, device: Device, frame: CanFrame, now_ns: int) -> None:
         """Send one frame beside the data."""
         device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
     def burst(self, device: Device, time_ns: int) -> None:
         """Send what is felt now; faults happen here."""
+        device.sampled_ns = time_ns
         frames = list(self.frames(device, self._values(device, time_ns)))
         delay_ns = self._delay(device, time_ns)
         self._send(device, frames, time_ns, time_ns + delay_ns)

@@ -1,7 +1,6 @@
 """An emulated open patch: what a microcontroller with ``openpatch.h`` does, for those who have none yet.
 
-Source: docs/protocols/patch-serial.md. Frames of the wire are messages: the identifier is the type, the payload is that
-of the message. Framing is the bus' affair.
+Source: docs/protocols/patch-serial.md.
 """
 
 from __future__ import annotations
@@ -15,11 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.serial.checksums import CRC32
-from skinware_drivers.serial.delimited import Delimited
-from skinware_drivers.serial.framing import Field
-from skinware_drivers.serial.stuffing import COBS
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _TAXELS = 12
 _SHORTEST_US, _LONGEST_US = 1000, 1_000_000
@@ -30,36 +26,65 @@ _NEEDED = {0x01: 2, 0x02: 2, 0x03: 4, 0x04: 0, 0x05: 4, 0x06: 2, 0x07: 1, 0x08: 
 _START, _ENABLE = 0x03, 0x06
 _POWER_UP, _BROWN_OUT = 1, 4
 _MASKED = 32
+_LONGEST = 1100  # bytes of a request on the line
 
 
-class EmulatedOpenPatchOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+def message(number: int, payload: bytes) -> bytes:
+    """A message as it goes over the line."""
+    body = bytes([number]) + payload
+    return stuff(body + struct.pack("<I", zlib.crc32(body))) + b"\0"
+
+
+def stuff(data: bytes) -> bytes:
+    """Without zeros: before each run of other bytes its length and one; a run of 254 is not followed by a zero."""
+    stuffed = b""
+    runs = data.split(b"\0")
+    for at, run in enumerate(runs):
+        while len(run) >= 254:
+            stuffed += b"\xff" + run[:254]
+            run = run[254:]
+            if not run and at == len(runs) - 1:
+                return stuffed
+        stuffed += bytes([len(run) + 1]) + run
+    return stuffed
+
+
+def unstuff(stuffed: bytes) -> bytes:
+    """What it was before; nothing if it was never stuffed."""
+    data, at = b"", 0
+    while at < len(stuffed):
+        code = stuffed[at]
+        run = stuffed[at + 1 : at + code]
+        if len(run) != code - 1:
+            return b""
+        at += code
+        data += run
+        if code < 0xFF and at < len(stuffed):
+            data += b"\0"
+    return data
+
+
+class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the patch is."""
 
     modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
-    period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
+    period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
     serial_number: Annotated[str, Meta(max_length=16, description="by which the patch is known")] = "1"
 
 
-class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
-    """One patch, device number 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
+    """One patch, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
 
     Values: those of the pressure sensors of module 0, of module 1 ...
-
-    Attributes:
-        framing: of the serial line.
-        payload_size: longest payload of a message.
     """
 
     full_scale = 0xFFFF
     rest = 1000
     swing = 40_000
-    framing: Delimited = Delimited(COBS, maximum_body=1024, checksum=CRC32, identifier=Field(0))
-    numbers: Sequence[int] = (1,)
-    payload_size = 1024
 
     def __init__(self, options: EmulatedOpenPatchOptions, **more: Any) -> None:
         super().__init__(options, **more)
-        own_us = 1000 * options.period_ms
+        own_us = round(1000 * options.period_ms)
         text = f"emulated\0{options.serial_number}\0" + "1.0\0"
         self._items = [
             b"\x01" + struct.pack("<III", own_us, _SHORTEST_US, _LONGEST_US) + text.encode(),
@@ -80,7 +105,7 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
             reset=_POWER_UP if is_first else _BROWN_OUT,
             booted_ns=now_ns,
             greeted=False,
-            period_us=1000 * self.options.period_ms,
+            period_us=round(1000 * self.options.period_ms),
             off=set(),
             tared=set(),
             first_cycle=device.cycle,
@@ -97,43 +122,50 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
         if name != "announce":
             self.burst(device, time_ns)
         elif device.streams_from_ns is not None:
-            self.reply(device, (_REPORT, self._report(device, time_ns)), time_ns)
+            self.say(device, message(_REPORT, self._report(device, time_ns)), time_ns)
         elif not device.memory["greeted"]:
-            self.reply(device, (_BOOT, self._greeting(device, time_ns)), time_ns)
+            self.say(device, message(_BOOT, self._greeting(device, time_ns)), time_ns)
 
-    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        """Answer a request."""
-        if not 0x01 <= identifier <= 0x1F or not payload:
-            return False
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """A zero ends every message."""
+        *whole, rest = heard.split(b"\0")
+        return whole, rest[-_LONGEST:]
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        """Answer a request; nothing else means anything to a patch."""
+        heard = unstuff(command)
+        body = heard[:-4]
+        if len(body) < 2 or zlib.crc32(body) != int.from_bytes(heard[-4:], "little") or not 0x01 <= body[0] <= 0x1F:
+            return None
+        request, number, arguments = body[0], body[1:2], body[2:]
         device.memory["greeted"] = True
-        number, arguments = payload[:1], payload[1:]
-        if identifier not in _NEEDED:
+        if request not in _NEEDED:
             error, answer = _UNKNOWN, b""
-        elif len(arguments) < _NEEDED[identifier]:
+        elif len(arguments) < _NEEDED[request]:
             error, answer = _BAD_LENGTH, b""
         else:
-            error, answer = self._answer(device, identifier, arguments, now_ns)
-        self.reply(device, (0x40 + identifier, number + bytes([error]) + answer), now_ns)
-        if error == _OK and identifier == _START:
-            self._say_what_is_off(device, device.memory["off"], now_ns)
-        elif error == _OK and identifier == _ENABLE and not arguments[1]:
-            self._say_what_is_off(device, self._meant(arguments[0]), now_ns)
-        return True
+            error, answer = self._answer(device, request, arguments, now_ns)
+        said = message(0x40 + request, number + bytes([error]) + answer)
+        if error == _OK and request == _START:
+            said += self._what_is_off(device, device.memory["off"])
+        elif error == _OK and request == _ENABLE and not arguments[1]:
+            said += self._what_is_off(device, self._meant(arguments[0]))
+        return said
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A message for each module that is on."""
         memory = device.memory
         cycles = device.cycle - memory["first_cycle"]
         memory["stamp_us"] = memory["us"] + memory["period_us"] * (cycles - memory["us_cycle"])
-        frames = []
+        sent = []
         for module in range(self.options.modules):
             if module in memory["off"]:
                 continue
             own = [0] * _TAXELS if module in memory["tared"] else values[_TAXELS * module : _TAXELS * (module + 1)]
             header = struct.pack("<BHIB", module, cycles & 0xFFFF, memory["stamp_us"] & 0xFFFF_FFFF, 0)
-            frames.append((_DATA, header + struct.pack(f"<{_TAXELS}H", *own)))
-        memory["sent"] += len(frames)
-        return frames
+            sent.append(message(_DATA, header + struct.pack(f"<{_TAXELS}H", *own)))
+        memory["sent"] += len(sent)
+        return sent
 
     def _answer(self, device: Device, request: int, arguments: bytes, now_ns: int) -> tuple[int, bytes]:
         memory = device.memory
@@ -175,18 +207,18 @@ class EmulatedOpenPatch(Emulator[EmulatedOpenPatchOptions]):
         cycles = device.cycle - memory["first_cycle"]
         memory["us"] += memory["period_us"] * (cycles - memory["us_cycle"])
         memory["us_cycle"], memory["period_us"] = cycles, period_us
-        if device.streams_from_ns is not None:
-            self.stop(device)
-            self.start(device, now_ns, period_us / 1e6)
+        self.change_period(device, now_ns, period_us / 1e6)
         return _OK, struct.pack("<I", period_us)
 
-    def _say_what_is_off(self, device: Device, modules: Collection[int], now_ns: int) -> None:
+    def _what_is_off(self, device: Device, modules: Collection[int]) -> bytes:
         if device.streams_from_ns is None:
-            return
+            return b""
         cycles = device.cycle - device.memory["first_cycle"]
+        said = b""
         for module in sorted(modules):
             header = struct.pack("<BHIB", module, cycles & 0xFFFF, device.memory["stamp_us"] & 0xFFFF_FFFF, _MASKED)
-            self.reply(device, (_DATA, header + bytes(2 * _TAXELS)), now_ns)
+            said += message(_DATA, header + bytes(2 * _TAXELS))
+        return said
 
     def _greeting(self, device: Device, now_ns: int) -> bytes:
         uptime_ms = (now_ns - device.memory["booted_ns"]) // 1_000_000

@@ -1,6 +1,6 @@
 """Emulated patches that are read with skintalk: silent until '1', then a record for every cell, until '0'.
 
-Source: ``skintalk.c`` of github.com/t173/skinvis. Frames are the bytes on the line.
+Source: ``skintalk.c`` of github.com/t173/skinvis.
 """
 
 from __future__ import annotations
@@ -13,48 +13,51 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.serial.framing import Unframed
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
-class EmulatedSkintalkOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Which patches there are."""
 
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches")] = (1, 2, 3, 4, 5, 6, 7, 8)
     cells: Annotated[int, Meta(ge=1, le=16, description="cells of each patch")] = 16
-    period_ms: Annotated[int, Meta(ge=1, description="time between two records of a cell, ms")] = 20
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two records of a cell, ms")] = 20
 
 
-class EmulatedSkintalk(Emulator[EmulatedSkintalkOptions]):
-    """Patches on one line; see :class:`skinware_drivers.virtual.emulator.Emulator`. Values: one for each cell."""
+class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
+    """Patches on one line; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+
+    Values: one for each cell.
+    """
 
     full_scale = 0x7F_FFFF
     lowest = -0x80_0000
     rest = 50_000
     swing = 2_000_000
-    payload_size = 64
-    framing: Unframed = Unframed(payload_size)
 
     def __init__(self, options: EmulatedSkintalkOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.patches
+        self.numbers = options.patches
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
         """The cells of a patch."""
         return on_a_grid(self.options.cells, 4)
 
-    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
-        """Start and stop; other bytes mean nothing."""
-        for byte in payload:
-            if byte == ord("1"):
-                self.start(device, now_ns)
-            elif byte == ord("0"):
-                self.stop(device)
-        return b"0" in payload or b"1" in payload
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """Commands are single bytes, and mean nothing but start and stop."""
+        return [bytes([byte]) for byte in heard if byte in b"01"], b""
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
+        """No word."""
+        if command == b"1":
+            self.start(device, now_ns)
+        else:
+            self.stop(device)
+        return b""
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A record for each cell."""
         return [
-            (0, bytes((0x55, device.number << 4 | cell)) + struct.pack(">i", value)[1:])
-            for cell, value in enumerate(values)
+            bytes((0x55, device.number << 4 | cell)) + struct.pack(">i", value)[1:] for cell, value in enumerate(values)
         ]

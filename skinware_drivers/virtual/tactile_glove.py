@@ -1,6 +1,6 @@
 """An emulated tactile glove: sends from power-up to the end, and hears nothing.
 
-Source: what tactile-filters ``linux/libio/SerialInput.cpp`` reads. Frames are the bytes on the line.
+Source: what tactile-filters ``linux/libio/SerialInput.cpp`` reads.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.serial.framing import Unframed
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 
-class EmulatedTactileGloveOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the glove is."""
 
     taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
-    period_ms: Annotated[int, Meta(ge=1, description="time between two packets of a taxel, ms")] = 30
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
 
 
-class EmulatedTactileGlove(Emulator[EmulatedTactileGloveOptions]):
-    """One glove, device 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
+    """One glove, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
 
     Values: one for each taxel, as it is sent: pressure lowers it.
     """
@@ -32,9 +32,6 @@ class EmulatedTactileGlove(Emulator[EmulatedTactileGloveOptions]):
     full_scale = 0xFFF
     rest = 4000
     swing = -3000
-    numbers: Sequence[int] = (1,)
-    payload_size = 64
-    framing: Unframed = Unframed(payload_size)
 
     def places(self) -> npt.NDArray[np.float64]:
         """All taxels on one square."""
@@ -44,6 +41,6 @@ class EmulatedTactileGlove(Emulator[EmulatedTactileGloveOptions]):
         """It sends by itself."""
         self.start(device, now_ns)
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         """A packet for each taxel."""
-        return [(0, bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0))) for taxel, value in enumerate(values)]
+        return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]

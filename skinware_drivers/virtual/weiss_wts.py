@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual.commands import cut
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
 _BEGIN = b"\xaa\xaa\xaa"
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
@@ -38,50 +38,37 @@ def message(command: int, payload: bytes) -> bytes:
     return head + struct.pack("<H", crc(head))
 
 
-class EmulatedWeissWtsOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedWeissWtsOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the sensor is."""
 
     columns: Annotated[int, Meta(ge=1, le=32, description="cells in a row")] = 4
     rows: Annotated[int, Meta(ge=1, le=32, description="rows of cells")] = 8
-    period_ms: Annotated[int, Meta(ge=1, le=65_535, description="between two frames if it streams from power-up")] = 10
 
 
-class EmulatedWeissWts(Emulator[EmulatedWeissWtsOptions]):
-    """One sensor, device number 1; see :class:`skinware_drivers.virtual.emulator.Emulator`.
-
-    Attributes:
-        payload_size: longest message.
-    """
+class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
+    """One sensor, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
 
     full_scale = 4095
     swing = 3500
-    numbers: Sequence[int] = (1,)
-    payload_size = 2064
 
     def places(self) -> npt.NDArray[np.float64]:
         """All cells."""
         return on_a_grid(self.options.columns * self.options.rows, self.options.columns)
 
-    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
-        """Answer every command that the bytes complete."""
-        heard = device.memory.get("heard", b"") + payload
-        commands, device.memory["heard"] = cut(
-            heard, _BEGIN, lambda part: 8 + int.from_bytes(part[4:6], "little") if len(part) >= 6 else 0
-        )
-        for command in commands:
-            status, answer = self._do(device, command, now_ns)
-            self.reply(device, (0, message(command[3], struct.pack("<H", status) + answer)), now_ns)
-        return bool(commands)
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """Commands say how long they are."""
+        return cut_packets(heard, _BEGIN, lambda part: 8 + int.from_bytes(part[4:6], "little") if len(part) >= 6 else 0)
 
-    def burst(self, device: Device, time_ns: int) -> None:
-        """Frames tell the time since power-up."""
-        device.memory["ms"] = (time_ns - device.ready_ns) // 1_000_000
-        super().burst(device, time_ns)
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
+        """A status, and what was asked for."""
+        status, answer = self._do(device, command, now_ns)
+        return message(command[3], struct.pack("<H", status) + answer)
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """One message with all cells, without run lengths."""
-        header = struct.pack("<IB", device.memory["ms"] & 0xFFFF_FFFF, 0)
-        return [(0, message(0x00, header + struct.pack(f"<{len(values)}H", *self._tared(device, values))))]
+        uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000
+        header = struct.pack("<IB", uptime_ms & 0xFFFF_FFFF, 0)
+        return [message(0x00, header + struct.pack(f"<{len(values)}H", *self._tared(device, values)))]
 
     def _tared(self, device: Device, values: Sequence[int]) -> Sequence[int]:
         if device.memory.pop("tare", False):

@@ -19,7 +19,7 @@ from skinware_drivers.cli.emulate import emulate
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
-from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions
+from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
 from tests.conftest import wait_until
 from tests.openpatch import wire
 from tests.sdk.driving import driving_lines, read_until
@@ -40,19 +40,22 @@ def emulated(**options: Any) -> EmulatedOpenPatch:
 
 
 class Talk:
-    """A conversation with a patch whose time the test owns."""
+    """A conversation with a patch whose time the test owns: (type, payload) of its messages."""
 
     def __init__(self, patch: EmulatedOpenPatch) -> None:
         self.patch = patch
         self.now_ns = 10**12
+        self.framer = OpenPatchDriver.framing.framer()
         patch.skip(self.now_ns)
 
     def hear(self, duration_ms: int) -> list[tuple[int, bytes]]:
         self.now_ns += duration_ms * MS
-        return [(frame.identifier, frame.payload) for frame in self.patch.emit(self.now_ns)]
+        framed = self.framer.feed(b"".join(frame.payload for frame in self.patch.emit(self.now_ns)))
+        assert self.framer.counters.skipped_bytes == self.framer.pending == 0
+        return list(zip(framed.identifier.tolist(), framed.bodies(), strict=True))
 
     def ask(self, request: int, *arguments: int) -> list[tuple[int, bytes]]:
-        self.patch.receive(request, bytes((9, *arguments)), self.now_ns)
+        self.patch.receive(0, wire.frame(request, bytes((9, *arguments))), self.now_ns)
         return self.hear(1)
 
 
@@ -82,6 +85,30 @@ def test_it_speaks_the_protocol() -> None:
     assert talk.hear(500) == []
 
 
+def test_its_bytes_are_those_of_the_protocol() -> None:
+    patch, items = emulated(), SAID.items()
+    patch.skip(10**12)
+    request = wire.frame(1, b"\x09\x01\x00")
+    patch.receive(0, b"\x05garbage" + request[:3], 10**12)
+    patch.receive(0, request[3:] + b"\0" + request, 10**12)  # the first lies behind garbage that no zero ended
+    answer = wire.frame(0x41, bytes((9, 0)) + wire.greeting(items, reset=1))
+    said = b"".join(frame.payload for frame in patch.emit(10**12 + MS))
+    assert said == wire.frame(0x60, wire.greeting(items, reset=1)) + answer
+    assert patch.totals()["commands"] == 1
+
+
+def test_stuffing() -> None:
+    for pattern in (b"\1", b"\0", b"\1" * 254 + b"\0", b"\0" + b"\1" * 254):
+        for n in (0, 1, 253, 254, 255, 508, 509):
+            data = (pattern * n)[:n]
+            assert stuff(data) == wire.stuff(data)
+            assert unstuff(stuff(data)) == data
+
+
+def test_what_was_never_stuffed_is_nothing() -> None:
+    assert unstuff(b"\x05abc") == b""
+
+
 class Stop:
     """Ends an emulation in another thread."""
 
@@ -108,8 +135,7 @@ class Silent:
 
 @contextmanager
 def running(patch: EmulatedOpenPatch, link: Path) -> Iterator[None]:
-    bus, stop = PtyBus(str(link), payload_size=patch.payload_size), Stop()
-    bus.use(patch.framing)
+    bus, stop = PtyBus(str(link), payload_size=4096), Stop()
     ready = threading.Event()
 
     class Ready(Silent):

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
-from skinware import DriverReader, PatchState
+from skinware import PatchState
 from skinware.errors import RequestFailed
-from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
-from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.serial.agni import AgniDriver, command
+from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
-from tests.sdk.driving import driving_lines, read_until
+from tests.sdk.driving import read_until
 
 CONFIGURATION = bytes.fromhex("F0 C4 00 C0 F4")
 STOP = bytes.fromhex("F0 C4 00 00 34")
 START = bytes.fromhex("F0 C4 00 F1 C5")
 MS = 1_000_000
-
-
-@contextmanager
-def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
-    with emulated_on_a_pty(EmulatedAgni, **emulated) as path:
-        driver = AgniDriver(AgniOptions(**options))
-        bus = SerialBus(path, payload_size=driver.payload_size)
-        with driving_lines([(driver, bus)], "agni"), DriverReader("agni", timeout_s=30) as reader:
-            yield reader
 
 
 def test_bytes_of_commands_are_those_of_the_vectors() -> None:
@@ -62,8 +50,11 @@ def test_the_emulated_device_byte_for_byte() -> None:
 
 
 def test_a_device_that_streams_already_and_describes_itself() -> None:
-    emulated = {"pattern": "cycle", "streaming": True, "sensors": (5, 300)}
-    with driven(emulated, time_unit_us=1.0, period_ms=20) as reader:
+    emulated: dict[str, Any] = {"pattern": "cycle", "streaming": True, "sensors": (5, 300)}
+    with emulated_skin(
+        AgniDriver, EmulatedAgni, driver_options={"time_unit_us": 1.0, "period_ms": 20}, **emulated
+    ) as skin:
+        reader = skin.reader
         frame = read_until(reader, lambda f: not f.status.any())
         structure = frame.structure
         assert structure.patch_name.tolist() == [b"device 7"]
@@ -79,8 +70,11 @@ def test_a_device_that_streams_already_and_describes_itself() -> None:
 
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
-    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+    faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with emulated_skin(
+        AgniDriver, EmulatedAgni, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
+    ) as skin:
+        reader = skin.reader
         for live in (True, False, True):
             frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
             for module in (0, 1):

@@ -8,43 +8,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.checksums import (
-    CRC8,
-    CRC16_CCITT_FALSE,
-    CRC16_MODBUS,
-    CRC16_WEISS,
-    CRC16_X25,
-    CRC16_XMODEM,
-    CRC32,
-    CRC32C,
-    LRC,
-    SUM8,
-    XOR,
-    Checksum,
-    Crc,
-    Sum,
-    Xor,
-)
+from skinware_drivers.serial import checksums
+from skinware_drivers.serial.checksums import Checksum, Crc, Sum, Xor
 from tests.serial.streams import BUSY
 
 CHECK = b"123456789"
 KNOWN: list[tuple[Checksum, int]] = [
-    (CRC8, 0xF4),
-    (CRC16_XMODEM, 0x31C3),
-    (CRC16_CCITT_FALSE, 0x29B1),
-    (CRC16_MODBUS, 0x4B37),
-    (CRC16_X25, 0x906E),
-    (CRC32, 0xCBF43926),
-    (CRC32C, 0xE3069283),
-    (CRC16_WEISS, 0x6EB4),
+    (checksums.CRC8, 0xF4),
+    (checksums.CRC16_XMODEM, 0x31C3),
+    (checksums.CRC16_CCITT_FALSE, 0x29B1),
+    (checksums.CRC16_MODBUS, 0x4B37),
+    (checksums.CRC16_X25, 0x906E),
+    (checksums.CRC32, 0xCBF43926),
+    (checksums.CRC32C, 0xE3069283),
+    (checksums.CRC16_WEISS, 0x6EB4),
     (Crc(width=12, polynomial=0x80F, reflected_out=True), 0xDAF),  # CRC-12/UMTS
     (Crc(width=24, polynomial=0x864CFB, init=0xB704CE), 0x21CF02),  # CRC-24/OPENPGP
     (Crc(width=16, polynomial=0x1021, init=0x89EC, reflected_in=True, reflected_out=True), 0x26B1),  # TMS37157
     (Crc(width=8, polynomial=0x31, reflected_in=True, reflected_out=True), 0xA1),  # CRC-8/MAXIM-DOW
-    (SUM8, sum(CHECK) & 0xFF),
-    (LRC, -sum(CHECK) & 0xFF),
+    (checksums.SUM8, sum(CHECK) & 0xFF),
+    (checksums.LRC, -sum(CHECK) & 0xFF),
     (Sum(width=16), sum(CHECK)),
-    (XOR, 0x31),
+    (checksums.XOR, 0x31),
     (Xor(init=0xFF), 0xCE),
 ]
 
@@ -69,7 +54,7 @@ def test_many_at_once_are_as_one_by_one(checksum: Checksum, data: st.DataObject)
     assert checksum.of_many(buffer, start, stop).tolist() == [checksum.of(piece) for piece in pieces]
 
 
-@pytest.mark.parametrize("crc", [CRC16_WEISS, CRC16_MODBUS, CRC32C, CRC8])
+@pytest.mark.parametrize("crc", [checksums.CRC16_WEISS, checksums.CRC16_MODBUS, checksums.CRC32C, checksums.CRC8])
 def test_long_data_is_as_byte_by_byte(crc: Crc) -> None:
     for size in (64, 65, 127, 128, 129, 257, 1000, 3088):
         data = np.random.default_rng(size).bytes(size)
@@ -78,18 +63,18 @@ def test_long_data_is_as_byte_by_byte(crc: Crc) -> None:
 
 def test_weiss_vectors() -> None:
     """Commands as the devices' public drivers send them, and the residue."""
-    assert CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 21 03 00 00 0A 00")).hex() == "dab5"
-    assert CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 30 00 00")).hex() == "cacf"
-    assert CRC16_WEISS.to_bytes(bytes.fromhex("03 03 00 81 1E 00")).hex() == "2c76"
-    assert CRC16_WEISS.of(CHECK + CRC16_WEISS.to_bytes(CHECK)) == 0
+    assert checksums.CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 21 03 00 00 0A 00")).hex() == "dab5"
+    assert checksums.CRC16_WEISS.to_bytes(bytes.fromhex("AA AA AA 30 00 00")).hex() == "cacf"
+    assert checksums.CRC16_WEISS.to_bytes(bytes.fromhex("03 03 00 81 1E 00")).hex() == "2c76"
+    assert checksums.CRC16_WEISS.of(CHECK + checksums.CRC16_WEISS.to_bytes(CHECK)) == 0
 
 
 def test_order_and_reading() -> None:
-    big = CRC16_XMODEM.with_order("big")
+    big = checksums.CRC16_XMODEM.with_order("big")
     assert big.to_bytes(CHECK) == b"\x31\xc3"
     buffer = np.frombuffer(b"\x31\xc3\x31\xc3", np.uint8)
     assert big.read_many(buffer, np.array([0, 2])).tolist() == [0x31C3, 0x31C3]
-    assert CRC16_XMODEM.read_many(buffer, np.array([1])).tolist() == [0x31C3]
+    assert checksums.CRC16_XMODEM.read_many(buffer, np.array([1])).tolist() == [0x31C3]
 
 
 def test_widths_that_cannot_be_had() -> None:

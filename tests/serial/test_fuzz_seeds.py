@@ -1,24 +1,60 @@
-"""What the fuzzer has found worth keeping, over again."""
+"""What the fuzzer has found worth keeping, over again: as it is, and changed at random, always in the same way.
+
+``tools/fuzz`` goes further, guided by coverage and in another way each time.
+"""
 
 from __future__ import annotations
 
+import random
+import tomllib
 from pathlib import Path
 
 from tests.serial.framings import EXAMPLES
 from tests.serial.fuzzing import examples_of_drivers, run
 
 SEEDS = Path(__file__).parent / "seeds"
+NAMES = sorted(path.stem for path in SEEDS.iterdir())
+N_CHANGED = 30
+LONGEST = 600
 
 
-def test_seeds() -> None:
-    assert {path.stem for path in SEEDS.iterdir()} == set(EXAMPLES)
-    for name, example in EXAMPLES.items():
-        for line in (SEEDS / f"{name}.hex").read_text().split():
-            run(example, bytes.fromhex(line))
+def seeds_of(name: str) -> list[bytes]:
+    return [bytes.fromhex(line) for line in (SEEDS / f"{name}.hex").read_text().split()]
 
 
-def test_framings_of_installed_drivers() -> None:
-    inputs = [bytes(range(at, at + 200)) for at in range(0, 56, 7)]
-    for example in examples_of_drivers().values():
-        for data in inputs:
-            run(example, data)
+def changed(inputs: list[bytes], rng: random.Random) -> bytes:
+    """One input with parts of others and of itself, flipped bits and random bytes."""
+    data = bytearray(rng.choice(inputs))
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randint(0, len(data))
+        what = rng.randrange(5)
+        if what == 0 and data:
+            data[at % len(data)] ^= 1 << rng.randrange(8)
+        elif what == 1:
+            data[at:at] = rng.randbytes(rng.randint(1, 16))
+        elif what == 2:
+            del data[at : at + rng.randint(1, 16)]
+        elif what == 3:
+            data[at:at] = data[rng.randint(0, len(data)) :][:64]
+        else:
+            other = rng.choice(inputs)
+            data[at:] = other[rng.randint(0, len(other)) :]
+    return bytes(data[:LONGEST])
+
+
+def test_every_framing_has_seeds() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    ours = {f"driver_{name}" for name in project["project"]["entry-points"]["skinware.drivers"]}
+    assert set(EXAMPLES) | ours & set(examples_of_drivers()) == set(NAMES)
+
+
+def test_seeds_and_what_comes_of_them() -> None:
+    known = {**EXAMPLES, **examples_of_drivers()}
+    for name in NAMES:
+        inputs, rng = seeds_of(name), random.Random(1)
+        for data in [*inputs, *(changed(inputs, rng) for _ in range(N_CHANGED))]:
+            try:
+                run(known[name], data)
+            except BaseException as error:
+                error.add_note(f"{name}: {data.hex()}")
+                raise

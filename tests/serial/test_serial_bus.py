@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import socket
+import termios
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
+from serial import serialposix
 from serial.rfc2217 import PortManager
 from serial.tools import list_ports
 
@@ -84,7 +88,7 @@ def test_frames_held_back_by_a_false_beginning_have_the_times_at_which_they_came
         assert [identifier for identifier, _, _ in found] == [1, 2, 3]
         assert [time_ns for _, _, time_ns in found[:2]] == reads[1:]
         assert found[2][2] > reads[-1]
-        assert (bus.counters.errors, bus.framing_counters.skipped_bytes) == (1, len(false_beginning))
+        assert (bus.counters.errors, bus.counters.framing.skipped_bytes) == (1, len(false_beginning))
 
 
 def test_garbage_is_skipped_and_counted() -> None:
@@ -96,7 +100,32 @@ def test_garbage_is_skipped_and_counted() -> None:
         found = receive(bus, 2)
         assert [payload[:1] for _, payload, _ in found] == [b"\1", b"\2"]
         assert bus.counters.errors == 2
-        assert bus.framing_counters.skipped_bytes == len(garbage) + 1 + len(damaged)
+        assert bus.counters.framing.skipped_bytes == len(garbage) + 1 + len(damaged)
+
+
+def test_counters_go_on_over_another_framing_and_another_opening() -> None:
+    with line() as device:
+        with opened(device.path) as bus:
+            device.write(data_frame(1) + b"half")
+            receive(bus, 1)
+            batch = FrameBatch(8, 64)
+
+            def is_read() -> bool:
+                if is_readable(bus, 0.05):
+                    bus.receive(batch, 0)
+                return bus.counters.framing.bytes_in == len(data_frame(1)) + 4
+
+            wait_until(is_read)
+            bus.use(PACKETS)
+            device.write(PACKETS.encode(1, b"one"))
+            receive(bus, 1)
+            bus.close()
+            bus.open()
+            device.write(PACKETS.encode(1, b"two"))
+            receive(bus, 1)
+        counters = bus.counters.framing
+        assert (counters.frames, counters.skipped_bytes) == (3, 4)
+        assert counters.bytes_in == counters.frame_bytes + counters.skipped_bytes
 
 
 def test_more_frames_than_a_batch_holds_stay_and_keep_the_bus_readable() -> None:
@@ -272,6 +301,36 @@ def test_refusals_say_what_to_do(
     with pytest.raises(BusNotAvailable, match=message) as raised:
         SerialBus("/dev/ttyS9").open()
     assert raised.value.reason == reason
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_dtr_and_rts_get_their_levels_when_the_port_is_opened(up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pseudo terminal has no such wires: what pyserial asks the kernel for is looked at."""
+    asked: list[tuple[int, int]] = []
+
+    def ioctl(_fd: int, request: int, argument: bytes = b"") -> bytes:
+        asked.append((request, int.from_bytes(argument[:4], "little")))
+        return argument
+
+    monkeypatch.setattr(serialposix, "fcntl", SimpleNamespace(**{**vars(fcntl), "ioctl": ioctl}))
+    level = "yes" if up else "no"
+    with line() as device, opened(device.path, options={"dtr": level, "rts": level}):
+        wires = {argument: request for request, argument in asked if request in (termios.TIOCMBIS, termios.TIOCMBIC)}
+    wanted = termios.TIOCMBIS if up else termios.TIOCMBIC
+    assert wires == {termios.TIOCM_DTR: wanted, termios.TIOCM_RTS: wanted}
+
+
+def test_a_port_can_be_told_not_to_hang_up() -> None:
+    with line() as device:
+        settings = termios.tcgetattr(device.master)
+        settings[2] |= termios.HUPCL
+        termios.tcsetattr(device.master, termios.TCSANOW, settings)
+        for options, hangs_up in (({}, True), ({"hang_up": "no"}, False), ({}, False)):  # as it was, if not told
+            with opened(device.path, options=options):
+                pass
+            assert bool(termios.tcgetattr(device.master)[2] & termios.HUPCL) == hangs_up
+    with pytest.raises(ConfigurationError, match="hang_up=no is for ports of this machine"):
+        SerialBus("socket://localhost:1", {"hang_up": "no"}).open()
 
 
 def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from skinware import DriverFrame, DriverReader
+from skinware.cli.info import command as info
 from skinware.errors import ConfigurationError
 from skinware.status import BusReason, BusState, Status
 from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import LengthTable, Packet
 from tests.conftest import wait_until
 from tests.sdk.driving import read_until
-from tests.serial.lines import N_TAXELS, FingertipDriver, data_frame, device, driving, line, receive
+from tests.serial.lines import (
+    ANSWER,
+    ASK,
+    FRAMING,
+    N_TAXELS,
+    FingertipDriver,
+    data_frame,
+    device,
+    driving,
+    line,
+    receive,
+)
 
 
 def fresh(frame: DriverFrame, tip: int) -> bool:
@@ -62,14 +77,14 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
                 before, memory = tip.value, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
                 bus = runner.lines[1].bus
                 assert isinstance(bus, SerialBus)
-                seen = bus.framing_counters.bytes_in
+                seen = bus.counters.framing.bytes_in
                 values: list[int] = []
                 for frame in reader.in_order(timeout_s=30):
                     if fresh(frame, 0):
                         values.append(int(frame.values[0]))
                     if (
                         tip.value > before + 100
-                        and bus.framing_counters.bytes_in > seen + 3_000_000
+                        and bus.counters.framing.bytes_in > seen + 3_000_000
                         and bus._is_garbled
                     ):
                         break
@@ -77,7 +92,7 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
                 assert runner.lines[0].reason == BusReason.NONE
                 assert values == sorted(values)
                 assert len(set(values)) > 80
-                assert bus.framing_counters.bytes_in - bus.framing_counters.skipped_bytes < 200_000
+                assert bus.counters.framing.bytes_in - bus.counters.framing.skipped_bytes < 200_000
                 assert len(bus._framer._rest) < 100
                 grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory
                 assert grown < 50_000, f"{grown} KiB more"
@@ -85,8 +100,11 @@ def test_a_port_that_babbles_takes_nothing_from_the_others() -> None:
 
 def test_a_device_that_says_nothing_is_asked_again() -> None:
     with line() as where, driving(where.path) as runner:
-        first = where.read()
-        assert first == where.read()
+        question = FRAMING.encode(ASK, b"who")
+        heard = where.read()
+        while len(heard) < 2 * len(question):
+            heard += where.read()
+        assert heard.startswith(2 * question)
         with device(where):
             wait_until(lambda: runner.ready)
             with DriverReader("fingertip") as reader:
@@ -105,6 +123,31 @@ def test_damaged_frames_are_not_shown() -> None:
             for _, frame in zip(range(200), reader.in_order(timeout_s=30), strict=False):
                 assert (frame.values == 7).all()
         assert runner.lines[0].bus.counters.errors > 200
+
+
+def test_every_program_sees_what_became_of_every_byte() -> None:
+    damaged = bytearray(data_frame(1))
+    damaged[4] ^= 0x40
+    answer, good = FRAMING.encode(ANSWER, b"I am tip1"), data_frame(2) + data_frame(3)
+    garbage, idle, tail = b"garbage" * 3 + b"\0", b"\0" * 5, data_frame(4)[:7]
+    with line() as where, driving(where.path) as runner:
+        assert where.read().startswith(FRAMING.encode(ASK, b"who"))
+        where.write(answer)
+        wait_until(lambda: runner.ready)
+        where.write(garbage + data_frame(2) + idle + bytes(damaged) + data_frame(3) + tail)
+        with DriverReader("fingertip") as reader:
+            frame = read_until(reader, lambda frame: frame.values[0] == 3)
+            total = len(answer + garbage + good + idle + damaged + tail)
+            frame = read_until(reader, lambda frame: reader.bus_counters(frame)[0]["bytes_in"] == total)
+            counters = reader.bus_counters(frame)[0]
+            shown = json.loads(CliRunner().invoke(info, ["fingertip", "--json"]).output)["drivers"][0]["buses"][0]
+            assert [shown[name] for name in OWN_BUS_COUNTERS] == [counters[name] for name in OWN_BUS_COUNTERS]
+        assert counters["frame_bytes"] == len(answer + good)
+        assert counters["idle_bytes"] == len(idle)
+        assert counters["skipped_bytes"] == len(garbage + damaged)
+        assert (counters["checksum_errors"] + counters["bad_form"], counters["errors"]) == (2, 2)
+        assert counters["frames"] == 3
+        assert "skipped bytes" in CliRunner().invoke(info, ["fingertip"]).output
 
 
 def test_a_device_may_tell_how_its_frames_lie_in_the_stream() -> None:

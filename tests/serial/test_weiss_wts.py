@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, PatchState
+from skinware import DriverFrame, PatchState
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
-from tests.sdk.driving import driving_lines, read_until
+from tests.sdk.driving import read_until
 
 START_10_MS = bytes.fromhex("AA AA AA 21 03 00 00 0A 00 DA B5")
 MATRIX = bytes.fromhex("AA AA AA 30 00 00 CA CF")
 MS = 1_000_000
-
-
-@contextmanager
-def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
-    with emulated_on_a_pty(EmulatedWeissWts, **emulated) as path:
-        driver = WeissWtsDriver(WeissWtsOptions(**options))
-        bus = SerialBus(path, payload_size=driver.payload_size)
-        with driving_lines([(driver, bus)], "wts"), DriverReader("wts", timeout_s=30) as reader:
-            yield reader
 
 
 def test_bytes_of_commands_are_those_of_the_vectors() -> None:
@@ -66,7 +54,8 @@ def test_the_emulated_sensor_byte_for_byte() -> None:
 
 
 def test_a_sensor_that_streams_already_and_its_operations() -> None:
-    with driven({"pattern": "cycle", "streaming": True, "columns": 3, "rows": 5}) as reader:
+    with emulated_skin(WeissWtsDriver, EmulatedWeissWts, pattern="cycle", streaming=True, columns=3, rows=5) as skin:
+        reader = skin.reader
         frame = read_until(reader, lambda f: not f.status.any())
         assert frame.structure.n_sensors == 15
         assert frame.structure.types[0].maximum == 4095
@@ -85,8 +74,11 @@ def test_a_sensor_that_streams_already_and_its_operations() -> None:
 
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
-    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+    faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with emulated_skin(
+        WeissWtsDriver, EmulatedWeissWts, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
+    ) as skin:
+        reader = skin.reader
 
         def whole(live: bool) -> None:
             frame = read_until(reader, lambda f: (f.patch_state[0] == PatchState.LIVE) == live)

@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 
-from skinware import DriverReader, PatchState, Status
+from skinware import PatchState, Status
 from skinware.errors import RequestFailed
-from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.wuji_glove import Refused, WujiGloveDriver, WujiGloveOptions
-from skinware_drivers.testing.carrying import emulated_on_a_pty
+from skinware_drivers.serial.wuji_glove import Refused, WujiGloveDriver
+from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
-from tests.sdk.driving import driving_lines, read_until
+from tests.sdk.driving import read_until
 
 DEVICE_INFO = bytes.fromhex("AA 56 0A 00 01 01 01 00 A7 FA")
 MS = 1_000_000
-
-
-@contextmanager
-def driven(emulated: dict[str, Any], **options: Any) -> Iterator[DriverReader]:
-    with emulated_on_a_pty(EmulatedWujiGlove, **emulated) as path:
-        driver = WujiGloveDriver(WujiGloveOptions(**options))
-        bus = SerialBus(path, payload_size=driver.payload_size)
-        with driving_lines([(driver, bus)], "glove"), DriverReader("glove", timeout_s=30) as reader:
-            yield reader
 
 
 def test_bytes_of_commands_are_those_of_the_vector() -> None:
@@ -68,7 +56,10 @@ def test_the_emulated_board_byte_for_byte() -> None:
 
 
 def test_values_invalid_cells_and_operations() -> None:
-    with driven({"pattern": "cycle", "invalid": (5,), "hand": "right"}, rate_hz=50) as reader:
+    with emulated_skin(
+        WujiGloveDriver, EmulatedWujiGlove, driver_options={"rate_hz": 50}, pattern="cycle", invalid=(5,), hand="right"
+    ) as skin:
+        reader = skin.reader
         frame = read_until(reader, lambda f: not (f.status & Status.STALE).any())
         assert frame.structure.patch_name.tolist() == [b"right glove"]
         assert np.flatnonzero(frame.status).tolist() == [5]
@@ -88,8 +79,11 @@ def test_values_invalid_cells_and_operations() -> None:
 
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
-    faults = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with driven({"pattern": "cycle", "restart": (1,), "restart_after_s": 1.0, "boot_s": 0.1, **faults}) as reader:
+    faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
+    with emulated_skin(
+        WujiGloveDriver, EmulatedWujiGlove, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
+    ) as skin:
+        reader = skin.reader
         for live in (True, False, True):
             frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
             assert len(set(frame.values.tolist())) == 1

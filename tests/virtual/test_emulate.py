@@ -375,7 +375,8 @@ def test_exit_status(host_buses: list[HostBus], arguments: tuple[str, ...], stat
 def test_a_signal_ends_the_command_with_status_0(number: signal.Signals, tmp_path: Path) -> None:
     """The whole command in a process of its own, on a bus that needs no kernel support."""
     log = tmp_path / "log.jsonl"
-    command = [sys.executable, "-m", "skinware_drivers.cli.emulate", "--bus", "virtual", "--json", "--log", str(log)]
+    emulate = [sys.executable, "-m", "skinware_drivers.cli.emulate"]
+    command = [*emulate, "--driver", "anyskin", "--bus", "pty", "--json", "--log", str(log)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["event"] == "ready"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
@@ -11,36 +12,38 @@ import pytest
 
 from skinware.errors import BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.registry import load_driver
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.virtual import line
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Device, on_a_grid
+from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 from tests.conftest import wait_until
 
 
-class Strip(Emulator[EmulatorOptions]):
+class Strip(SerialEmulator[SerialEmulatorOptions]):
     """Two bytes behind AA, as soon as it gets a question mark; its values are its own."""
 
-    medium = "serial"
     full_scale = 200
     swing = 100
-    numbers = (0,)
-    identifiers = frozenset((0,))
     period_s = 0.002
 
     def places(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         return on_a_grid(2, columns=2)
 
-    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
-        if payload == b"?":
-            self.start(device, now_ns)
-        return payload == b"?"
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        return [b"?"] * heard.count(b"?"), b""
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
+        self.start(device, now_ns)
+        return b""
 
     def feel(self, device: Device, time_s: float) -> Sequence[int]:
         return [7, 1000]
 
-    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
-        return [(0, bytes([0xAA, *values]))]
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        return [bytes([0xAA, *values])]
 
 
 class Long(Strip):
@@ -81,7 +84,7 @@ def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_frames_of_a_program_have_any_length() -> None:
-    bus = VirtualCanBus.with_hardware(Long(EmulatorOptions(streaming=True)), payload_size=400)
+    bus = VirtualCanBus.with_hardware(Long(SerialEmulatorOptions(streaming=True)), payload_size=400)
     bus.open()
     try:
         first = received(bus, 400)[0]
@@ -93,3 +96,26 @@ def test_frames_of_a_program_have_any_length() -> None:
 def test_devices_of_can_are_on_can() -> None:
     assert isinstance(line.virtual_bus("xela"), VirtualCanBus)
     assert isinstance(line.virtual_bus(""), VirtualCanBus)
+
+
+def test_every_driver_has_an_emulator_of_its_medium() -> None:
+    names = entry_points(group=EMULATORS).names
+    assert len(names) > 10
+    for name in names:
+        assert medium_of(load_emulator(name)) == load_driver(name).medium, name
+
+
+def test_commands_come_in_pieces_behind_garbage() -> None:
+    strip = Strip(SerialEmulatorOptions())
+    strip.skip(0)
+    strip.receive(0, b"??!?", 0)
+    assert (strip.totals()["commands"], strip.emit(3_000_000)[0].payload) == (1, bytes([0xAA, 7, 200]))
+    whole = b"\xaa\x02\x01\x02"
+    for at in range(len(whole) + 1):
+        first, rest = cut_packets(b"\0\xaa" + whole[:at], b"\xaa\x02", lambda part: 4 if len(part) >= 3 else 0)
+        assert first + cut_packets(rest + whole[at:], b"\xaa\x02", lambda _: 4)[0] == [whole]
+
+
+def test_nothing_else_hangs_on_a_serial_line() -> None:
+    with pytest.raises(ConfigurationError, match="nothing else hangs on a serial line"):
+        Strip(SerialEmulatorOptions(foreign_hz=1.0))

@@ -157,17 +157,15 @@ def test_the_descriptor_is_readable_when_frames_are_due_and_not_before() -> None
     with_clock = VirtualCanBus("roboskin", {"boards": "7", "streaming": "yes"})
     try:
         with_clock.open()
-        due_ns = with_clock.hardware.next_due_ns()
-        assert due_ns is not None
-        assert due_ns > time.monotonic_ns()
-        assert not is_readable(with_clock)
-        assert is_readable(with_clock, 5)
-        assert 0 <= time.monotonic_ns() - due_ns < 1_000_000_000
-        batch = FrameBatch(100)
-        assert with_clock.receive(batch, 0) >= 1
-        assert batch.time_ns[0] == due_ns
-        assert not is_readable(with_clock)  # frames that follow are taken together a few ms later
-        assert is_readable(with_clock, 5)
+        batch = FrameBatch(1000)
+        for _ in range(3):
+            due_ns = with_clock.hardware.next_due_ns()
+            assert due_ns is not None
+            assert is_readable(with_clock, 30)
+            assert time.monotonic_ns() >= due_ns
+            batch.clear()
+            assert with_clock.receive(batch, 0) >= 1
+            assert batch.time_ns[0] >= due_ns  # later, if nobody came for so long that frames were lost
     finally:
         with_clock.close()
 

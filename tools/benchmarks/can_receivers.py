@@ -20,10 +20,10 @@ from collections.abc import Callable, Sequence
 import can
 from decode import SocketBus, sockets
 
-from skinware_drivers.bus import BusCounters
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.runner import Runner

@@ -269,7 +269,7 @@ def read_ours(path: str, seconds: float, ages_ns: list[int]) -> int:
             ages_ns.append(time.monotonic_ns() - int.from_bytes(stamp, "little"))
     epoll.close()
     bus.close()
-    return bus.framing_counters.frame_bytes
+    return int(bus.counters.framing.frame_bytes)
 
 
 def read_driver(path: str, seconds: float, _ages_ns: list[int]) -> int:
@@ -288,7 +288,7 @@ def read_driver(path: str, seconds: float, _ages_ns: list[int]) -> int:
         import shutil
 
         shutil.rmtree(namespace.path, ignore_errors=True)
-    return bus.framing_counters.frame_bytes
+    return int(bus.counters.framing.frame_bytes)
 
 
 def read_until(path: str, seconds: float, ages_ns: list[int]) -> int:

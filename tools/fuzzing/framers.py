@@ -3,7 +3,8 @@
 Every framing of the tests and of the installed drivers gets an equal part of the time, in a process of its own, with
 at most 1 GiB of memory and 10 s for an input. It begins with the seeds in tests/serial/seeds and with what earlier
 runs left in .cache/fuzz. What it breaks is written to .cache/fuzz/NAME.crash-*, and belongs into the seeds once
-the cause is removed: ``--keep`` writes some of what reached anything new there.
+the cause is removed: ``--keep`` writes some of what reached anything new there. The tests run the seeds, and changes of
+them that are always the same; here everything is different each time.
 """
 
 from __future__ import annotations

@@ -97,7 +97,7 @@ class Adapter(ABC, Generic[OptionsT]):
 
     medium: ClassVar[str]
     Options: ClassVar[type[msgspec.Struct]] = NoOptions
-    types: Sequence[SensorType]
+    types: Sequence[SensorType] = ()
     dtype: npt.DTypeLike = np.uint8
     layout: Layout
     patches: Sequence[Patch] = ()

@@ -114,7 +114,9 @@ class SocketCanBus(Bus):
                 raise BusNotAvailable(
                     "this kernel has no CAN: load it (modprobe can-raw), or use a bus that needs none (--bus virtual)"
                 ) from None
-            raise BusNotAvailable(f"bus {self.channel}: cannot open a CAN socket ({error.strerror})") from None
+            raise BusNotAvailable(
+                f"bus {self.channel}: cannot open a CAN socket ({error.strerror})", reason=BusReason.REFUSED
+            ) from None
         try:
             # also where the layout has none: that there are FD frames on the bus explains why no others are heard
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)

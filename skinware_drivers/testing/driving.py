@@ -38,6 +38,7 @@ class Driving:
         name: str,
         listen_only: bool,
         publish: PublishMode | None = None,
+        wait_for_buses: bool = False,
     ) -> None:
         self.ready = threading.Event()
         self.failure: BaseException | None = None
@@ -46,6 +47,7 @@ class Driving:
         self._name = name
         self._listen_only = listen_only
         self._publish = publish
+        self._wait_for_buses = wait_for_buses
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
 
@@ -58,6 +60,7 @@ class Driving:
                 name=self._name,
                 listen_only=self._listen_only,
                 publish=self._publish,
+                wait_for_buses=self._wait_for_buses,
                 slots=64,
                 on_ready=self.ready.set,
             )
@@ -114,6 +117,7 @@ def driving_lines(
     listen_only: bool = False,
     wait: bool = True,
     publish: PublishMode | None = None,
+    wait_for_buses: bool = False,
 ) -> Iterator[Driving]:
     """A driver on any buses, as long as the ``with`` lasts.
 
@@ -123,8 +127,9 @@ def driving_lines(
         listen_only: send nothing.
         wait: until it publishes.
         publish: see :class:`skinware_drivers.runner.Runner`.
+        wait_for_buses: likewise.
     """
-    running = Driving(lines, name, listen_only, publish)
+    running = Driving(lines, name, listen_only, publish, wait_for_buses)
     running.start()
     try:
         if wait:

@@ -29,7 +29,7 @@ from skinware_drivers.can.socketcan import SocketCanBus
 from tests.can.conftest import ip
 from tests.can.rig import TIP_IDENTIFIER, can_frame, sender, skin
 from tests.conftest import wait_until
-from tests.sdk.driving import read_until
+from tests.sdk.driving import follow, read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
@@ -75,6 +75,18 @@ def test_deleted_and_made_again(vcan: Callable[[], str]) -> None:
         ip("link", "add", "dev", name, "type", "vcan")
         ip("link", "set", name, "up")
         read_until(reader, is_in_order)
+
+
+def test_not_there_when_the_driver_starts(vcan: Callable[[], str]) -> None:
+    name = vcan()
+    ip("link", "del", name)
+    with skin(name, vcan()), DriverReader("tip") as reader:
+        alone = read_until(reader, lambda f: is_fresh(f) and f.bus_state[1] == BusState.LIVE)
+        assert (alone.bus_state[0], alone.bus_reason[0]) == (BusState.GONE, BusReason.INTERFACE_GONE)
+        ip("link", "add", "dev", name, "type", "vcan")
+        ip("link", "set", name, "up")
+        both = follow(reader, is_in_order)
+        assert both.structure.n_patches == 2
 
 
 def test_the_one_report_of_a_loss_went_to_a_send(vcan: Callable[[], str]) -> None:

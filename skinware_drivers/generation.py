@@ -57,6 +57,7 @@ class Generation:
         self.batch = make_batch(self.lines, self.decoder.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patch_state.copy()
+        self.publisher.bus_limits = [line.limits for line in self.lines]
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         for line in self.lines:
             if line.patches:

@@ -36,7 +36,7 @@ def figures(
         counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
         patches.append(
             {
-                "name": bytes(structure.patch_name[patch]).decode(),
+                "name": generation.name_of(patch),
                 "bus": lines[int(structure.patch_bus[patch])].name,
                 "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
                 "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,

@@ -20,7 +20,7 @@ from skinware_drivers.testing.pty import emulated_on_a_pty
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
-_LONGEST_S = 30.0
+_LONGEST_S = 60.0
 
 
 class Driving:
@@ -39,11 +39,13 @@ class Driving:
         listen_only: bool,
         publish: PublishMode | None = None,
         wait_for_buses: bool = False,
+        bus_names: Sequence[str] = (),
     ) -> None:
         self.ready = threading.Event()
         self.failure: BaseException | None = None
         self.runner: Runner | None = None
-        self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]
+        names = bus_names or [f"bus{i}" for i in range(len(lines))]
+        self._lines = [(name, adapter, bus) for name, (adapter, bus) in zip(names, lines, strict=True)]
         self._name = name
         self._listen_only = listen_only
         self._publish = publish
@@ -118,6 +120,7 @@ def driving_lines(
     wait: bool = True,
     publish: PublishMode | None = None,
     wait_for_buses: bool = False,
+    bus_names: Sequence[str] = (),
 ) -> Iterator[Driving]:
     """A driver on any buses, as long as the ``with`` lasts.
 
@@ -128,8 +131,9 @@ def driving_lines(
         wait: until it publishes.
         publish: see :class:`skinware_drivers.runner.Runner`.
         wait_for_buses: likewise.
+        bus_names: of each bus; default: bus0, bus1 ...
     """
-    running = Driving(lines, name, listen_only, publish, wait_for_buses)
+    running = Driving(lines, name, listen_only, publish, wait_for_buses, bus_names)
     running.start()
     try:
         if wait:

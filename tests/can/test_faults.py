@@ -97,11 +97,14 @@ def test_the_one_report_of_a_loss_went_to_a_send(vcan: Callable[[], str]) -> Non
         tips.silent.add(name)
         read_until(reader, lambda f: f.bus_state[0] == BusState.SILENT)
 
+        assert driver.runner is not None
+        bus = driver.runner.lines[0].bus
+
         def lose() -> None:
             ip("link", "del", name)
             for _ in range(3):  # the report of "down", that of "gone", then "no such device"
                 with pytest.raises(BusSendError):
-                    driver.buses[0].send(0x1, b"")
+                    bus.send(0x1, b"")
             ip("link", "add", "dev", name, "type", "vcan")
             ip("link", "set", name, "up")
 

@@ -26,9 +26,9 @@ from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 from tests.can.rig import TIP_IDENTIFIER, can_frame, sender, skin
-from tests.conftest import wait_until
 from tests.sdk.driving import follow, read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from skinware import BusState, DriverReader, DriverWriter, Namespace, PatchState, Status, Structure
 from skinware.errors import ServiceError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 BUS_COUNTERS = ("frames", "lost", "errors", "unknown")
 PATCH_COUNTERS = ("orphans", "updates")

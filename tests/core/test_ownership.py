@@ -14,7 +14,7 @@ import pytest
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, NameInUse, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
 from tests.core.workers import PATIENCE_S, Board, Bomb, Crew
 

@@ -12,8 +12,8 @@ from skinware import DriverWriter, Skin, Snapshot, Structure
 from skinware.errors import Closed, ServiceNotFound, ServiceTimeout, StructureError
 from skinware.realtime import now_ns
 from skinware.threads import SkinReplica
+from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, kill
-from tests.conftest import wait_until
 
 
 class Told:

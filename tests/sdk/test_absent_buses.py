@@ -13,8 +13,8 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
+from skinware_drivers.testing.waiting import wait_until
 from tests.commands import running as running_command
-from tests.conftest import wait_until
 from tests.sdk.driving import TroubledBus, driving, emulated, follow, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

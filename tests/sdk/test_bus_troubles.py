@@ -15,7 +15,7 @@ from skinware_drivers import bus_line
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

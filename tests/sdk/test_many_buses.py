@@ -17,9 +17,9 @@ from skinware import BusReason, BusState, DriverReader
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.commands import running as running_command
-from tests.conftest import wait_until
 from tests.sdk.driving import Driving, commands, driving, emulated, follow, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

@@ -16,9 +16,9 @@ from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from tests.conftest import wait_until
 from tests.sdk.driving import Driving, driving_lines, read_until
 
 MS = 1_000_000

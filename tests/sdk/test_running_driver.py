@@ -15,11 +15,11 @@ from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Stat
 from skinware.errors import NameInUse
 from skinware_drivers import generation
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
-from tests.conftest import wait_until
 from tests.sdk.driving import LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 
 

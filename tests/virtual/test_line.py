@@ -12,10 +12,10 @@ import pytest
 from skinware.errors import BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.serial.packets import Packet
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import line
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from tests.conftest import wait_until
 
 
 class Strip(Emulator[EmulatorOptions]):

@@ -117,7 +117,7 @@ class BusCounters:
     """Frames received."""
     lost: int = 0
     """Frames that the kernel (or the interface's queue) dropped before we could read them."""
-    error_frames: int = 0
+    errors: int = 0
     """CAN error frames and their like."""
     refused: int = 0
     """Frames that do not fit this bus' batch (remote frames, FD frames on a classic layout)."""
@@ -137,7 +137,9 @@ class Bus(ABC):
     """One link to hardware.
 
     Attributes:
+        medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
+        counters: what happened on it so far.
         narrows: frames that nobody wants can be left out, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
@@ -152,9 +154,6 @@ class Bus(ABC):
         options: the ``key=value`` pairs behind ``?``, as strings.
         payload_size: the longest payload the driver's layout knows, 8 or 64 for CAN.
         listen_only: refuse every ``send``.
-
-    Attributes:
-        medium: kind of bus, as drivers name it; None: whatever the driver speaks.
 
     Raises:
         skinware.errors.ConfigurationError: an option is unknown or has a bad value.

@@ -135,6 +135,11 @@ class BusLine:
         if self._become(state, reason):
             self._news.tell(f"{error}; waiting for it to {'come back' if self.opened_ns else 'appear'}")
 
+    @property
+    def is_in_order(self) -> bool:
+        """Whether it delivered frames, and had nothing wrong, when it was last looked at."""
+        return self.state is BusState.LIVE and not self.reason
+
     def look(self, silence_ns: int) -> None:
         """Tell a living bus from one that says nothing, is off the wire, or is gone."""
         if self.bus.fileno() < 0:

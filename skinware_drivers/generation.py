@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import PatchState
 from skinware_drivers.adapter import Watch
 from skinware_drivers.bus import FrameBatch
@@ -21,13 +21,15 @@ from skinware_drivers.publisher import Publisher
 
 log = logging.getLogger("skinware.driver")
 
-BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
+BATCH_FRAMES, _FRAMES_OF_A_BUS, _BATCH_BYTES = 2048, 256, 1 << 20
+_LOOK_PAUSE_NS = NS_PER_S // 20
 
 
 def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
     """Room for what arrives at once; of long frames, fewer do."""
     payload_size = max(line.adapter.payload_size for line in lines)
-    return FrameBatch(max(64, min(BATCH_FRAMES, _BATCH_BYTES // payload_size)), payload_size, headroom)
+    wanted = max(BATCH_FRAMES, _FRAMES_OF_A_BUS * len(lines))
+    return FrameBatch(max(64, min(wanted, _BATCH_BYTES // payload_size)), payload_size, headroom)
 
 
 @dataclass
@@ -52,6 +54,7 @@ class Generation:
     batch: FrameBatch = field(init=False)
     begun_ns: int = field(init=False)
     _known_state: npt.NDArray[np.uint8] = field(init=False)
+    _look_ns: int = 0
 
     def __post_init__(self) -> None:
         self.batch = make_batch(self.lines, self.decoder.headroom)
@@ -82,12 +85,20 @@ class Generation:
         if len(foreign):
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
                 self.decoder.count_unknown(batch, line.link.offer(batch, own))
-        self.update_bus_states()
+        self.update_bus_states(settled=now_ns() >= self._look_ns)
         self.publisher.take(found)
 
-    def update_bus_states(self) -> None:
-        """Tell the publisher what the buses do."""
+    def update_bus_states(self, settled: bool = True) -> None:
+        """Tell the publisher what the buses do.
+
+        Args:
+            settled: look also at buses that were in order the last time.
+        """
+        if settled:
+            self._look_ns = now_ns() + _LOOK_PAUSE_NS
         for line in self.lines:
+            if not settled and line.is_in_order:
+                continue
             line.look(self.publisher.silence_ns)
             self.publisher.bus_state[line.ordinal] = line.state
             self.publisher.bus_reason[line.ordinal] = line.reason

@@ -38,6 +38,7 @@ class Intake:
         self._empty_batch = empty_batch
         self._digest = digest
         self._rest: asyncio.TimerHandle | None = None
+        self._by_fd: dict[int, BusLine] = {}
 
     def start(self) -> None:
         """Begin to listen, in the running loop."""
@@ -77,8 +78,7 @@ class Intake:
     def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:
         """Fill a batch from those buses that have something; whether one of them has more than its share."""
         time_ns = now_ns()
-        by_fd = {line.bus.fileno(): line for line in self._lines}
-        ready = [by_fd[fd] for fd in fds if fd in by_fd]
+        ready = [line for fd in fds if (line := self._line_of(fd)) is not None]
         is_behind = False
         for number, line in enumerate(ready):
             batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
@@ -91,3 +91,10 @@ class Intake:
             except BusNotAvailable as error:
                 line.lose(error)
         return is_behind
+
+    def _line_of(self, fd: int) -> BusLine | None:
+        line = self._by_fd.get(fd)
+        if line is None or line.bus.fileno() != fd:
+            self._by_fd = {line.bus.fileno(): line for line in self._lines}
+            line = self._by_fd.get(fd)
+        return line

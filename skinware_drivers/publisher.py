@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
+from operator import attrgetter
 from typing import Protocol
 
 import numpy as np
@@ -19,18 +21,9 @@ from skinware_drivers.limits import BusLimits
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
-OWN_BUS_COUNTERS = (
-    "frames",
-    "lost",
-    "errors",
-    "refused",
-    "sent",
-    "send_failures",
-    "polls_missed",
-    "overflows",
-    "bus_offs",
-)
-ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
+_OWN_COUNTERS = tuple(field.name for field in fields(BusCounters))
+_read_own = attrgetter(*_OWN_COUNTERS)
+ALL_BUS_COUNTERS = (*_OWN_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
@@ -205,19 +198,8 @@ class Publisher:
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
-        for row, c in zip(self._counts, self.bus_counters, strict=True):
-            row[: len(OWN_BUS_COUNTERS)] = (
-                c.frames,
-                c.lost,
-                c.error_frames,
-                c.refused,
-                c.sent,
-                c.send_failures,
-                c.polls_missed,
-                c.overflows,
-                c.bus_offs,
-            )
-        self._counts[:, len(OWN_BUS_COUNTERS) :] = self._state.bus_counters
+        self._counts[:, : len(_OWN_COUNTERS)] = [_read_own(counters) for counters in self.bus_counters]
+        self._counts[:, len(_OWN_COUNTERS) :] = self._state.bus_counters
         return self._counts
 
     def _update_patch_states(self, time_ns: int) -> None:

@@ -157,7 +157,7 @@ class PythonCanBus(Bus):
             if message is None:
                 continue
             if message.is_error_frame:
-                self.counters.error_frames += 1
+                self.counters.errors += 1
             elif message.is_remote_frame:
                 self.counters.refused += 1
             elif len(self._queue) >= _QUEUE_FRAMES:

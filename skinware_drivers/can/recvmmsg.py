@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import socket
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -33,17 +34,15 @@ _recvmmsg.restype = ctypes.c_int
 
 
 class Rows:
-    """What ``recvmmsg`` needs to put frames straight into the rows of one batch, made once.
+    """What ``recvmmsg`` needs to put frames straight into the rows of one batch; see ``rows_of``.
 
     Attributes:
-        batch: the batch.
-        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, 0 or what was
-            left from before (see ``forget``).
+        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, what was left
+            from before (see ``forget``).
     """
 
     def __init__(self, batch: FrameBatch) -> None:
         capacity, rows = batch.capacity, np.arange(batch.capacity)
-        self.batch = batch
         self.control = np.zeros((capacity, CONTROL_WORDS), np.int64)
         self._iov = np.zeros(capacity, _IOVEC)
         self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
@@ -56,16 +55,15 @@ class Rows:
         self._flags = self._headers["flags"]
         self._address = self._headers.ctypes.data
 
-    def receive(self, fd: int) -> int:
-        """Fill the free rows of the batch; returns how many were filled, -1 on an error (errno)."""
-        first, free = self.batch.stop, self.batch.free
-        self._control_length[first:] = 8 * CONTROL_WORDS  # the kernel wrote what it used
-        address = self._address + _MMSGHDR.itemsize * first
-        count: int = _recvmmsg(fd, address, free, socket.MSG_DONTWAIT, None)
+    def receive(self, fd: int, free: slice) -> int:
+        """Fill free rows of the batch; returns how many were filled, -1 on an error (errno)."""
+        self._control_length[free] = 8 * CONTROL_WORDS  # the kernel wrote what it used
+        address = self._address + _MMSGHDR.itemsize * free.start
+        count: int = _recvmmsg(fd, address, free.stop - free.start, socket.MSG_DONTWAIT, None)
         return count
 
     def forget(self, rows: slice) -> None:
-        """Let no later frame be taken for having this ancillary data, where a frame can come without any."""
+        """Before receiving, where a frame can come without ancillary data: let none seem to have an older one's."""
         self.control[rows] = 0
 
     def any_cut(self, rows: slice) -> bool:
@@ -76,3 +74,13 @@ class Rows:
         """(n,) bool: which of them were."""
         found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
         return found
+
+
+_rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()
+
+
+def rows_of(batch: FrameBatch) -> Rows:
+    """Made once for a batch: all buses that fill it share them, as they share its rows."""
+    if batch not in _rows:
+        _rows[batch] = Rows(batch)
+    return _rows[batch]

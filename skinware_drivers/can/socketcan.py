@@ -26,7 +26,7 @@ from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
-from skinware_drivers.can.recvmmsg import Rows
+from skinware_drivers.can.recvmmsg import Rows, rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
 from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.options import options_from_strings
@@ -96,7 +96,6 @@ class SocketCanBus(Bus):
         self._lost_before = 0
         self.granted_buffer = 0
         self._stamper = Stamper()
-        self._rows = Rows(FrameBatch(1, payload_size))
         self._health = ControllerHealth()
         self._is_bound = False
         self._restarts_itself = True
@@ -206,17 +205,17 @@ class SocketCanBus(Bus):
             raise BusNotAvailable(f"bus {self.channel} is not open")
         if not batch.free:
             return 0
-        if self._rows.batch is not batch:
-            self._rows = Rows(batch)
-        first = batch.stop
-        count = self._rows.receive(self._socket.fileno())
+        rows, first = rows_of(batch), batch.stop
+        free = slice(first, batch.limit)
+        if self._stamper.hardware:
+            rows.forget(free)
+        count = rows.receive(self._socket.fileno(), free)
         if count < 0:
             return self._nothing_received(ctypes.get_errno())
-        batch.time_ns[first : first + count] = self._stamper.read(self._rows.control[first : first + count])
-        if self._stamper.hardware:
-            self._rows.forget(slice(first, first + count))
-        batch.bus[first : first + count] = ordinal
-        kept = self._sort_out(batch, first, count)
+        new = slice(first, first + count)
+        batch.time_ns[new] = self._stamper.read(rows.control[new])
+        batch.bus[new] = ordinal
+        kept = self._sort_out(batch, new, rows)
         batch.stop += kept
         self.counters.frames += kept
         self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
@@ -274,21 +273,20 @@ class SocketCanBus(Bus):
         reason = BusReason.INTERFACE_GONE if number in _AWAY else BusReason.FAILED
         raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
-    def _sort_out(self, batch: FrameBatch, first: int, count: int) -> int:
+    def _sort_out(self, batch: FrameBatch, new: slice, rows: Rows) -> int:
         """Take what is no data frame of this layout out of the new rows; returns how many are left."""
-        rows = slice(first, first + count)
-        identifier, length = batch.wire["identifier"][rows], batch.wire["length"][rows]
-        flags = np.uint32(ERROR_FLAG | REMOTE_FLAG)
-        if not np.bitwise_or.reduce(identifier) & flags and not self._rows.any_cut(rows):
+        wire, first = batch.wire[new], new.start
+        identifier = wire["identifier"]
+        if not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new):
             self._health.heard_data()
-            return count
+            return len(wire)
         is_error = (identifier & np.uint32(ERROR_FLAG)) != 0
-        other = ((identifier & np.uint32(REMOTE_FLAG)) != 0) | (length > batch.payload_size) | self._rows.cut(rows)
+        other = ((identifier & np.uint32(REMOTE_FLAG)) != 0) | (wire["length"] > batch.payload_size) | rows.cut(new)
         other &= ~is_error
-        self.counters.error_frames += int(np.count_nonzero(is_error))
+        self.counters.errors += int(np.count_nonzero(is_error))
         self.counters.refused += int(np.count_nonzero(other))
         good = np.flatnonzero(~(is_error | other))
-        self._take_errors(np.flatnonzero(is_error), good, identifier, batch.wire["payload"][rows])
+        self._take_errors(np.flatnonzero(is_error), good, identifier, wire["payload"])
         good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]

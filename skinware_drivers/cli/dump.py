@@ -115,7 +115,7 @@ def _tell_what_is_missing(bus: Bus) -> None:
     counters = bus.counters
     missing = {
         "lost": counters.lost,
-        "error frames, not shown": counters.error_frames,
+        "error frames, not shown": counters.errors,
         "remote frames, not shown": counters.refused,
     }
     text = ", ".join(f"{count} {what}" for what, count in missing.items() if count)

@@ -106,7 +106,7 @@ async def listen_on(
         frames=traffic.frames,
         rate_hz=traffic.frames / duration_s if duration_s else 0.0,
         load=traffic.load(bit_rate, duration_s) if bit_rate and duration_s else None,
-        error_frames=bus.counters.error_frames,
+        error_frames=bus.counters.errors,
         trouble=reason_text(reason) if reason else "",
         lost=bus.counters.lost,
         classes=traffic.classes(),

@@ -34,7 +34,7 @@ class SerialBus(Bus):
     with ``serial_number`` or ``vid_pid`` the port of that USB device, under whatever path it has when it is opened.
 
     Every frame has the time at which its last byte was read. Frames arrive in the order of the stream. Damaged ones
-    are counted in ``counters.error_frames``, and in more detail in ``framing_counters``.
+    are counted in ``counters.errors``, and in more detail in ``framing_counters``.
 
     Args:
         channel: path or URL; empty if the options say which USB device.
@@ -204,7 +204,7 @@ class SerialBus(Bus):
         known = framer.counters.bytes_in
         damaged = framer.counters.checksum_errors + framer.counters.refused
         framed = framer.feed(chunk)
-        self.counters.error_frames += framer.counters.checksum_errors + framer.counters.refused - damaged
+        self.counters.errors += framer.counters.checksum_errors + framer.counters.refused - damaged
         self._reads.append((framer.counters.bytes_in, time_ns))
         if len(framed):
             fits = framed.length <= self.payload_size

@@ -116,7 +116,7 @@ def test_error_and_remote_frames_are_counted_and_kept_out(vcan: Callable[[], str
     batch = FrameBatch(100)
     receive(bus, batch, 2)
     assert batch.wire["identifier"][:2].tolist() == [0x111, 0x222]
-    assert (bus.counters.error_frames, bus.counters.refused) == (1, 1)
+    assert (bus.counters.errors, bus.counters.refused) == (1, 1)
     bus.close()
 
 

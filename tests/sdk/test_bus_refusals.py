@@ -141,7 +141,7 @@ def test_frames_of_python_can_are_sorted_out_and_counted() -> None:
         assert batch.wire["identifier"][:2].tolist() == [0x473, 0x8000_0473]
         assert batch.wire["payload"][:2, 0].tolist() == [0x40, 0x41]
         assert batch.bus[:2].tolist() == [2, 2]
-        assert (bus.counters.frames, bus.counters.error_frames, bus.counters.refused) == (2, 1, 2)
+        assert (bus.counters.frames, bus.counters.errors, bus.counters.refused) == (2, 1, 2)
         bus.send(0x207, b"\x07\x00")
         heard = other.recv(30)
         assert heard is not None

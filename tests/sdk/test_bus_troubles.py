@@ -204,7 +204,7 @@ def test_what_a_bus_counts_and_notes_is_told(caplog: pytest.LogCaptureFixture) -
 
     def count() -> None:
         counters = buses[1].counters
-        counters.lost, counters.error_frames, counters.refused, counters.send_failures = 3, 5, 2, 1
+        counters.lost, counters.errors, counters.refused, counters.send_failures = 3, 5, 2, 1
 
     with caplog.at_level(logging.WARNING), driving(*buses) as running, DriverReader("roboskin") as reader:
         running.do(count)

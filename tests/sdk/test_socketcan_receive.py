@@ -24,6 +24,7 @@ from skinware_drivers.testing.waiting import wait_until
 
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
+SO_TIMESTAMPING = 37
 RMEM_MAX = "/proc/sys/net/core/rmem_max"
 
 
@@ -282,6 +283,21 @@ def test_stamping_with_hardware_takes_the_kernels_where_there_are_no_others(
         assert stamps.max() <= after_ns + 5_000_000
 
 
+def test_what_another_bus_left_in_a_row_is_no_stamp_of_a_frame_that_has_none(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socketcan, "has_hardware_stamps", lambda *_: True)
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    cable.end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, 0)
+    batch = FrameBatch(10)
+    recvmmsg.rows_of(batch).control[:] = 1  # a second of 1970
+    cable.put(0x123)
+    before_ns = time.monotonic_ns()
+    drain(bus, batch)
+    assert before_ns <= batch.time_ns[0] <= time.monotonic_ns()
+
+
 # What is no data
 
 
@@ -296,7 +312,7 @@ def test_error_and_remote_frames_are_counted_and_kept_out(cable: Cable) -> None:
     assert batch.wire["identifier"][: len(batch)].tolist() == [0x111, 0x222, EXTENDED_FLAG | 0x333]
     assert batch.wire["payload"][: len(batch), 0].tolist() == [0, 2, 5]
     assert np.all(batch.time_ns[: len(batch)] > 0)
-    assert (bus.counters.frames, bus.counters.error_frames, bus.counters.refused) == (3, 2, 1)
+    assert (bus.counters.frames, bus.counters.errors, bus.counters.refused) == (3, 2, 1)
 
 
 def test_fd_frames_on_a_classic_layout_are_counted_whatever_their_length(cable: Cable) -> None:
@@ -308,7 +324,7 @@ def test_fd_frames_on_a_classic_layout_are_counted_whatever_their_length(cable: 
     batch = FrameBatch(10)
     drain(bus, batch)
     assert batch.wire["identifier"][: len(batch)].tolist() == [0x444]
-    assert (bus.counters.frames, bus.counters.refused, bus.counters.error_frames) == (1, 3, 0)
+    assert (bus.counters.frames, bus.counters.refused, bus.counters.errors) == (1, 3, 0)
 
 
 def test_fd_frames_are_data_of_a_layout_that_has_some(cable: Cable) -> None:
@@ -345,7 +361,7 @@ def test_what_the_controller_says_is_known_and_counted(cable: Cable) -> None:
     cable.put(0x111)
     drain(bus, batch)
     assert bus.reason(time.monotonic_ns()) == BusReason.NONE
-    assert (bus.counters.bus_offs, bus.counters.error_frames, bus.counters.frames) == (2, 3, 4)
+    assert (bus.counters.bus_offs, bus.counters.errors, bus.counters.frames) == (2, 3, 4)
 
 
 def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:
@@ -358,11 +374,11 @@ def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:
         cable.put(number)
         while True:
             batch.clear()
-            if not bus.receive(batch, 0) and not bus.counters.error_frames % 100:
+            if not bus.receive(batch, 0) and not bus.counters.errors % 100:
                 break
             seen += batch.wire["identifier"][: len(batch)].tolist()
     assert seen == list(range(20))
-    assert (bus.counters.error_frames, bus.counters.overflows, bus.counters.lost) == (2000, 2000, 0)
+    assert (bus.counters.errors, bus.counters.overflows, bus.counters.lost) == (2000, 2000, 0)
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_frames_held_back_by_a_false_beginning_have_the_times_at_which_they_came
         assert [identifier for identifier, _, _ in found] == [1, 2, 3]
         assert [time_ns for _, _, time_ns in found[:2]] == reads[1:]
         assert found[2][2] > reads[-1]
-        assert (bus.counters.error_frames, bus.framing_counters.skipped_bytes) == (1, len(false_beginning))
+        assert (bus.counters.errors, bus.framing_counters.skipped_bytes) == (1, len(false_beginning))
 
 
 def test_garbage_is_skipped_and_counted() -> None:
@@ -95,7 +95,7 @@ def test_garbage_is_skipped_and_counted() -> None:
         device.write(garbage + b"\0" + data_frame(1) + bytes(damaged) + data_frame(2))
         found = receive(bus, 2)
         assert [payload[:1] for _, payload, _ in found] == [b"\1", b"\2"]
-        assert bus.counters.error_frames == 2
+        assert bus.counters.errors == 2
         assert bus.framing_counters.skipped_bytes == len(garbage) + 1 + len(damaged)
 
 

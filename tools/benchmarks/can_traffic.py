@@ -38,16 +38,15 @@ def burst_frames(boards: int, cycles: int = 16) -> np.ndarray:
 
 
 class Sender:
-    """Sends the same frames to one port, again and again.
+    """Sends the same frames by one socket, again and again.
 
     Args:
-        port: UDP port on the loopback.
+        sock: connected or bound to what receives.
         frames: what to send.
     """
 
-    def __init__(self, port: int, frames: np.ndarray) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(("127.0.0.1", port))
+    def __init__(self, sock: socket.socket, frames: np.ndarray) -> None:
+        self._socket = sock
         self._frames = frames
         self._iov = np.zeros(len(frames), _IOVEC)
         self._iov["base"] = frames.ctypes.data + _FRAME.itemsize * np.arange(len(frames))
@@ -65,16 +64,23 @@ class Sender:
             address = self._headers.ctypes.data + _MMSGHDR.itemsize * self._at
             done = _sendmmsg(self._socket.fileno(), address, portion, 0)
             if done < 0:
-                return  # nobody receives any more
+                return  # nobody receives any more, or the queue of the interface is full
             self.sent += done
             count -= done
             self._at = (self._at + done) % len(self._frames)
 
 
+def connected(port: int) -> socket.socket:
+    """A socket that sends to a UDP port on the loopback."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.connect(("127.0.0.1", port))
+    return sock
+
+
 def main() -> None:
     """Entry point."""
     rate_hz, seconds, boards = float(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
-    senders = [Sender(int(port), burst_frames(boards)) for port in sys.argv[4:]]
+    senders = [Sender(connected(int(port)), burst_frames(boards)) for port in sys.argv[4:]]
     begin = time.monotonic()
     due = 0.0
     while (now := time.monotonic() - begin) < seconds:

@@ -272,7 +272,7 @@ class Runner:
                 np.result_type(*(adapter.dtype for adapter in adapters)),
             )
         except StructureError as error:
-            log.error("what was found makes no skin: %s", error)
+            log.error("what was found makes no skin: %s", str(error))
             return
         known = self.generation
         is_known = known is not None and (known.tables.structure, known.decoder.layouts) == (

@@ -139,5 +139,6 @@ class BusChanges:
 
 
 def _address(bus_name: str) -> str:
-    """A bus' name without its options."""
-    return bus_name.partition("?")[0]
+    """What stays when a bus gets other options; all of its name, where only the options tell which bus it is."""
+    address = bus_name.partition("?")[0]
+    return bus_name if address.endswith(":") else address

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import re
+import shlex
 import signal
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 
 import skinware
 from skinware import realtime, threads
+from skinware_drivers.config import ConfigFile
+from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from tests.commands import PATIENCE_S, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 ELSEWHERE = ("c-and-cpp", "icub")
 """Pages whose snippets other tests run."""
+COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 
 
@@ -101,13 +110,71 @@ def test_links_and_tests_that_are_named_exist(page: Path) -> None:
     assert [target for target in targets if not (page.parent / target).exists()] == []
     if page.parent.name == "tutorials":
         return  # files that are named there are those of the reader's own package: see tests/outside/test_tutorials.py
-    named = re.findall(r"\b(tests/[\w/]+\.py)(?:::(\w+))?", text)
+    named = re.findall(r"\b((?:tests|skinware_drivers/testing)/[\w/]+\.py)(?:::(\w+))?", text)
     missing = [
         (file, name)
         for file, name in named
         if not (ROOT / file).exists() or (name and f"def {name}(" not in (ROOT / file).read_text())
     ]
     assert missing == []
+
+
+def fenced(page: Path, language: str) -> list[str]:
+    """The text of every block of a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if fenced(page, "toml")], ids=lambda page: page.stem)
+def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
+    """Geometry and packages are TOML too; their tables tell."""
+    file = tmp_path / "page.toml"
+    for text in fenced(page, "toml"):
+        if not {"project", "group"} & tomllib.loads(text).keys():
+            file.write_text(re.sub(r"^cpus = .*", "", text, flags=re.MULTILINE))  # that this machine may not have
+            read = ConfigFile(file)
+            driver = load_driver(read.settings.driver or DEFAULT_DRIVER)
+            for bus in read.settings.bus:
+                read.options_of_bus(driver.Options, bus.name)
+
+
+def commands_of(page: Path) -> list[list[str]]:
+    """Our commands in the blocks for the terminal, as words."""
+    lines = "".join(fenced(page, "console")).replace("\\\n", " ").splitlines()
+    simple = [re.split(r" [|>&]( |$)", line)[0].removeprefix("sudo ") for line in lines]
+    words = [shlex.split(line, comments=True) for line in simple]
+    words = [[word for word in line if not re.match(r"[A-Z_]+=", word)] for line in words]
+    return [[Path(line[0]).name, *line[1:]] for line in words if line and Path(line[0]).name in COMMANDS]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands_of(page)], ids=lambda page: page.stem)
+def test_commands_have_the_options_that_a_page_gives_them(page: Path, tmp_path: Path) -> None:
+    if page.parent.name == "tutorials" and page.stem.endswith("-driver"):
+        return  # of drivers that the page makes: tests/outside/test_tutorials.py runs it all
+    file = tmp_path / "any.toml"
+    file.touch()
+    for name, *words in commands_of(page):
+        arguments = [str(file) if word.endswith(".toml") else word for word in words]
+        module = importlib.import_module(COMMANDS[name].module)
+        command: click.Command = vars(module).get("command") or module.emulate
+        try:
+            with contextlib.suppress(click.exceptions.Exit):  # --help and the like
+                command.make_context(name, arguments).close()
+        except click.UsageError as error:
+            pytest.fail(f"{name} {shlex.join(arguments)}: {error.format_message()}")
+
+
+def test_every_driver_that_ships_is_on_the_list() -> None:
+    listed = re.findall(r"^\| \[`(\w+)`\]", (ROOT / "docs/drivers.md").read_text(), re.MULTILINE)
+    ours = [e.name for e in entry_points(group=DRIVERS) if e.value.startswith("skinware_drivers.")]
+    assert sorted(listed) == sorted(ours)
+
+
+def test_every_fault_of_the_reference_has_a_test() -> None:
+    """That those which are named exist, the test above holds."""
+    rows = [line for line in (ROOT / "docs/reference/faults.md").read_text().splitlines() if line.startswith("| ")]
+    faults = [row[1:-1].split("|") for row in rows if not row.startswith("| fault |")]
+    assert len(faults) > 60
+    assert [cells[0].strip() for cells in faults if len(cells) != 4 or "::test_" not in cells[3]] == []
 
 
 def has(cls: type, name: str) -> bool:

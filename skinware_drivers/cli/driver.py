@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("skinware.driver")
 
+UNIT_FILE = "skinware@.service"
+_UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
+"""What stands in that file for this program."""
+
 
 class DriverCommand(click.Command):
     """A command that also takes the options of the driver it is asked to run."""
@@ -47,6 +51,17 @@ class DriverCommand(click.Command):
                 flag = "--" + option.name.replace("_", "-")
                 self.params.append(click.Option([flag, option.name], metavar=option.kind, help=text))
         return super().parse_args(ctx, args)
+
+
+def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
+    """Print the systemd unit that comes with this package, for this very program."""
+    if not wanted:
+        return
+    from importlib.resources import files
+
+    text = (files("skinware_drivers") / "data" / UNIT_FILE).read_text()
+    click.echo(text.replace(_UNIT_PROGRAM, str(Path(sys.argv[0]).absolute())), nl=False)
+    context.exit()
 
 
 @click.command(
@@ -78,6 +93,14 @@ class DriverCommand(click.Command):
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
+@click.option(
+    "--unit",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_unit,
+    help="Print a systemd unit that runs this program as a service, and end.",
+)
 @namespace_option
 @json_option
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
@@ -124,6 +147,7 @@ def command(
     bus_names = list(buses) or [bus.name for bus in settings.bus]
     if not bus_names:
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
+    _refuse_twice(bus_names)
     _check_own_options(buses, settings)
     given = {key: text for key, text in driver_options.items() if text is not None}
 
@@ -139,6 +163,7 @@ def command(
     async def read_buses_again() -> None:
         if config is not None and not buses:  # what the command line names is not the file's to change
             new = _read(config)
+            _refuse_twice([bus.name for bus in new.settings.bus])
             wanted = {bus.name: adapter_of(bus.name, new) for bus in new.settings.bus}
             await runner.buses.change_to(wanted, lambda name, adapter: bus_of(name, adapter, new))
 
@@ -241,6 +266,18 @@ def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
                 f"--bus {name}: the file has options for {', '.join(known)} and none for this bus;"
                 " change the name there"
             )
+
+
+def _refuse_twice(bus_names: Sequence[str]) -> None:
+    """Refuse a bus that stands there twice: its boards would be set up twice, and be two skins."""
+    from skinware_drivers.registry import parse_bus_name
+
+    seen = []
+    for name in bus_names:
+        bus = parse_bus_name(name)
+        if bus in seen:
+            raise ConfigurationError(f"bus {name} is named twice; a driver has each of its buses once")
+        seen.append(bus)
 
 
 def _read(path: Path | None) -> ConfigFile:

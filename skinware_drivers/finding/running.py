@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from urllib.parse import parse_qsl
 
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, ServiceNotFound
@@ -13,6 +14,8 @@ from skinware_drivers.registry import parse_bus_name
 
 _PREFIX = "skinware."
 _PRIVATE = "virtual"
+_OF_A_DEVICE = ("serial_number", "vid_pid")
+"""Options that name a line which has no path."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +68,19 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 def same_bus(one: str, other: str) -> bool:
     """Whether two names mean one bus: what is set behind ``?`` does not count, and links are followed.
 
-    A ``virtual`` bus is nobody else's: each process has its own.
+    Serial lines that are named by their USB device are told apart by that. A ``virtual`` bus is nobody else's: each
+    process has its own.
     """
     place = _place(one)
     return place == _place(other) and place[0] != _PRIVATE
 
 
-def _place(bus_name: str) -> tuple[str, str]:
-    interface, channel, _ = parse_bus_name(bus_name.partition("?")[0])
-    return interface, os.path.realpath(channel) if channel.startswith("/dev/") else channel
+def _place(bus_name: str) -> tuple[str, ...]:
+    address, _, query = bus_name.partition("?")
+    interface, channel, _ = parse_bus_name(address)
+    options = dict(parse_qsl(query))  # of any program's bus: whatever stands there is no error
+    device = (options.get(key, "") for key in _OF_A_DEVICE)
+    return interface, os.path.realpath(channel) if channel.startswith("/dev/") else channel, *device
 
 
 def _look_at(namespace: Namespace, name: str) -> RunningDriver | None:

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,6 +32,8 @@ STAMP = slice(3, 7)
 
 _MOST_KINDS, _MOST_TYPES, _MOST_MODULES, _MOST_AXES = 32, 64, 255, 9
 _MOST_VALUES = 16384  # of all modules together
+_MOST_VALUE_BYTES = MOST_PAYLOAD - DATA_HEADER  # of one module
+_PATCH, _TYPE, _KIND, _MODULES = 1, 2, 3, 4  # tags of items
 _PADDING = 0xFF
 _DTYPES = ("u1", "<i2", "<u2", "<i4", "<f4")
 _MAX_KIND_BYTES = 16
@@ -111,36 +113,28 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Run:
-    """Taxels that are alike.
-
-    Attributes:
-        count: how many.
-        axes: type of each of their values, by place in the description's types; None: means nothing.
-    """
-
-    count: int
-    axes: Sequence[int | None]
-
-
-@dataclass(frozen=True)
 class Kind:
     """A kind of module.
 
     Attributes:
         name: for people.
         dtype: how its values are sent, a numpy dtype.
-        runs: what they are.
+        taxels: sensor type of each value of each taxel, by name; None: the value means nothing.
     """
 
     name: str
     dtype: str
-    runs: Sequence[Run]
+    taxels: Sequence[Sequence[str | None]]
 
     @property
     def n_values(self) -> int:
         """Number of values."""
-        return sum(run.count * len(run.axes) for run in self.runs)
+        return sum(map(len, self.taxels))
+
+    @property
+    def has_sensors(self) -> bool:
+        """Whether any value means something."""
+        return any(name is not None for taxel in self.taxels for name in taxel)
 
 
 @dataclass(frozen=True)
@@ -155,15 +149,15 @@ class Description:
         modules: kind of each module.
     """
 
-    product: str = ""
-    serial_number: str = ""
-    firmware: str = ""
-    period_us: int = 0
-    shortest_us: int = 0
-    longest_us: int = 0
-    types: list[SensorType] = field(default_factory=list)
-    kinds: list[Kind] = field(default_factory=list)
-    modules: list[int] = field(default_factory=list)
+    product: str
+    serial_number: str
+    firmware: str
+    period_us: int
+    shortest_us: int
+    longest_us: int
+    types: Sequence[SensorType]
+    kinds: Sequence[Kind]
+    modules: Sequence[int]
 
     @property
     def name(self) -> str:
@@ -179,15 +173,12 @@ class Description:
     @property
     def patch(self) -> Patch:
         """What users see of it. The taxels of all its modules are numbered in one row: these are their uids."""
-        first_uid, modules = 0, []
+        uid, modules = 0, []
         for number, kind in enumerate(self.kinds[k] for k in self.modules):
             channels: list[Sensor | None] = []
-            for run in kind.runs:
-                is_sensor = any(axis is not None for axis in run.axes)
-                names = [None if axis is None else self.types[axis].name for axis in run.axes]
-                for _ in range(run.count):
-                    channels += [None if name is None else Sensor(name, first_uid) for name in names]
-                    first_uid += is_sensor
+            for taxel in kind.taxels:
+                channels += [None if name is None else Sensor(name, uid) for name in taxel]
+                uid += any(name is not None for name in taxel)
             modules.append(Module(channels, number, kind.name))
         return Patch(self.name, modules)
 
@@ -205,44 +196,39 @@ def read_description(items: Sequence[bytes], crc: int) -> Description:
     """
     if zlib.crc32(b"".join(items)) != crc:
         raise BadDescription("the description changed while it was being read")
-    found = Description()
+    found: Description | None = None
+    types: list[SensorType] = []
+    kinds: list[Kind] = []
+    modules: list[int] = []
     for number, item in enumerate(items):
         reader = _Reader(item, f"item {number} of the description")
-        try:
-            found = _take_item(found, reader)
-        except StructureError as error:
-            raise reader.bad(str(error)) from None
-    return _checked(found)
+        (tag,) = reader.take("B")
+        if tag == _PATCH:
+            found = _patch(reader, types, kinds, modules)
+        elif tag == _TYPE:
+            types.append(_type(reader))
+        elif tag == _KIND:
+            kinds.append(_kind(reader, types))
+        elif tag == _MODULES:
+            modules += _modules(reader, len(kinds))
+            if len(modules) > _MOST_MODULES:
+                break  # it is refused below
+        # other tags are of later versions
+    if found is None:
+        raise BadDescription("the description does not say what the patch is")
+    _check(found)
+    return found
 
 
-def _take_item(found: Description, reader: _Reader) -> Description:
-    (tag,) = reader.take("B")
-    if tag == 1:
-        return _patch(found, reader)
-    if tag == 2:
-        found.types.append(_type(reader))
-    elif tag == 3:
-        found.kinds.append(_kind(reader, len(found.types)))
-    elif tag == 4:
-        (count,) = reader.take("B")
-        for _ in range(count):
-            kind, n_modules = reader.take("BB")
-            if kind >= len(found.kinds):
-                raise reader.bad(f"modules of kind {kind}, but there are only {len(found.kinds)} kinds")
-            found.modules.extend([kind] * n_modules)
-    return found  # other tags are of later versions
-
-
-def _patch(found: Description, reader: _Reader) -> Description:
+def _patch(reader: _Reader, types: list[SensorType], kinds: list[Kind], modules: list[int]) -> Description:
+    """What is said first; the lists are filled by what is said then."""
     period_us, shortest_us, longest_us = reader.take("<III")
     product, serial_number, firmware = (reader.text(MAX_NAME_BYTES) for _ in range(3))
     if not 0 < shortest_us <= period_us <= longest_us:
         raise reader.bad(f"a period of {period_us} us, between {shortest_us} and {longest_us}")
     if not serial_number and not product:
         raise reader.bad("neither a product nor a serial number")
-    return Description(
-        product, serial_number, firmware, period_us, shortest_us, longest_us, found.types, found.kinds, found.modules
-    )
+    return Description(product, serial_number, firmware, period_us, shortest_us, longest_us, types, kinds, modules)
 
 
 def _type(reader: _Reader) -> SensorType:
@@ -255,53 +241,63 @@ def _type(reader: _Reader) -> SensorType:
         minimum, maximum = -math.inf, math.inf
     if not minimum < maximum:
         raise reader.bad(f"type {name!r} ranges from {minimum} to {maximum}")
-    return SensorType(name, number, unit, scale, offset, minimum, maximum)
+    try:
+        return SensorType(name, number, unit, scale, offset, minimum, maximum)
+    except StructureError as error:
+        raise reader.bad(str(error)) from None
 
 
-def _kind(reader: _Reader, n_types: int) -> Kind:
+def _kind(reader: _Reader, types: Sequence[SensorType]) -> Kind:
     name = reader.text(_MAX_KIND_BYTES)
     dtype, n_runs = reader.take("BB")
     if dtype >= len(_DTYPES):
         raise reader.bad(f"kind {name!r} has values of dtype {dtype}; known are 0 to {len(_DTYPES) - 1}")
-    runs = []
+    size, taxels = 0, []
     for _ in range(n_runs):
         count, n_axes = reader.take("<HB")
         axes = reader.take(f"{n_axes}B")
         if not 1 <= n_axes <= _MOST_AXES or not count:
             raise reader.bad(f"kind {name!r} has a run of {count} taxels with {n_axes} axes")
-        if any(axis >= n_types and axis != _PADDING for axis in axes):
-            raise reader.bad(f"kind {name!r} has values of type {max(axes)}, but there are only {n_types} types")
         sensors = [axis for axis in axes if axis != _PADDING]
+        if any(axis >= len(types) for axis in sensors):
+            raise reader.bad(f"kind {name!r} has values of type {max(sensors)}, but there are only {len(types)} types")
         if len(set(sensors)) < len(sensors):
             raise reader.bad(f"kind {name!r} has taxels with two values of one type")
-        runs.append(Run(count, [None if axis == _PADDING else axis for axis in axes]))
-    kind = Kind(name, _DTYPES[dtype], runs)
-    size = kind.n_values * int(_DTYPES[dtype][-1])
-    if not 1 <= size <= MOST_PAYLOAD - DATA_HEADER:
-        raise reader.bad(
-            f"kind {name!r} has {size} bytes of values; 1 to {MOST_PAYLOAD - DATA_HEADER} fit into a message"
-        )
-    return kind
+        size += count * n_axes * int(_DTYPES[dtype][-1])
+        if size <= _MOST_VALUE_BYTES:
+            taxels += [[None if axis == _PADDING else types[axis].name for axis in axes]] * count
+    if not 1 <= size <= _MOST_VALUE_BYTES:
+        raise reader.bad(f"kind {name!r} has {size} bytes of values; 1 to {_MOST_VALUE_BYTES} fit into a message")
+    return Kind(name, _DTYPES[dtype], taxels)
 
 
-def _checked(found: Description) -> Description:
-    if not found.period_us:
-        raise BadDescription("the description does not say what the patch is")
+def _modules(reader: _Reader, n_kinds: int) -> list[int]:
+    modules: list[int] = []
+    (n_entries,) = reader.take("B")
+    for _ in range(n_entries):
+        kind, count = reader.take("BB")
+        if kind >= n_kinds:
+            raise reader.bad(f"modules of kind {kind}, but there are only {n_kinds} kinds")
+        modules += [kind] * count
+    return modules
+
+
+def _check(found: Description) -> None:
+    used = [found.kinds[kind] for kind in found.modules]
     for what, count, most in (
         ("types", len(found.types), _MOST_TYPES),
         ("kinds of module", len(found.kinds), _MOST_KINDS),
         ("modules", len(found.modules), _MOST_MODULES),
-        ("values", sum(found.kinds[kind].n_values for kind in found.modules), _MOST_VALUES),
+        ("values", sum(kind.n_values for kind in used), _MOST_VALUES),
     ):
         if not 1 <= count <= most:
             raise BadDescription(f"the patch has {count} {what}; 1 to {most} can be")
     if len({t.id for t in found.types}) < len(found.types) or len({t.name for t in found.types}) < len(found.types):
         raise BadDescription("two types of the patch share a name or an id")
-    if all(axis is None for k in set(found.modules) for run in found.kinds[k].runs for axis in run.axes):
+    if not any(kind.has_sensors for kind in used):
         raise BadDescription("the patch has no sensors")
-    if {"<i4", "<f4"} <= {found.kinds[kind].dtype for kind in found.modules}:
+    if {"<i4", "<f4"} <= {kind.dtype for kind in used}:
         raise BadDescription("the patch has 32-bit whole numbers beside floating point: no common dtype holds both")
-    return found
 
 
 def _frame(number: int, kind: Kind) -> Frame:

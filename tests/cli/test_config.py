@@ -176,3 +176,5 @@ def test_buses_are_the_same_under_all_their_names(tmp_path: Path) -> None:
     assert not same_bus("can0", "can1")
     assert not same_bus("virtual", "virtual")
     assert same_bus("slcan:/dev/ttyACM0?bitrate=1", "slcan:/dev/ttyACM0")
+    assert same_bus("serial:?serial_number=A1&baudrate=9600", "serial:?serial_number=A1")
+    assert not same_bus("serial:?serial_number=A1", "serial:?serial_number=B2")

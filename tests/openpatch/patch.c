@@ -30,23 +30,29 @@ static const openpatch_type types[] = {
 };
 
 static const openpatch_run finger_runs[] = {{4, 3, {1, 2, 0}}, {1, 1, {3}}};
-static const openpatch_kind finger_kinds[] = {{"fingertip", OPENPATCH_U16, 2, finger_runs}};
-static const openpatch_modules finger_modules[] = {{0, 1}};
+static const openpatch_kind finger_kinds[] = {{OPENPATCH_U16, OPENPATCH_TABLE(finger_runs), "fingertip"}};
+static openpatch_module finger_modules[1];
 
 static const openpatch_run triangle_runs[] = {
     {6, 1, {0}}, {1, 1, {OPENPATCH_PADDING}}, {3, 1, {0}}, {1, 1, {3}}, {1, 1, {0}}};
 static const openpatch_run palm_runs[] = {{16, 1, {0}}};
 static const openpatch_run bones_runs[] = {{2, 2, {4, OPENPATCH_PADDING}}};
-static const openpatch_kind hand_kinds[] = {{"triangle", OPENPATCH_U8, 5, triangle_runs},
-                                            {"palm", OPENPATCH_I16, 1, palm_runs},
-                                            {"bones", OPENPATCH_F32, 1, bones_runs}};
-static const openpatch_modules hand_modules[] = {{0, 3}, {1, 1}, {0, 1}, {2, 2}};
+static const openpatch_kind hand_kinds[] = {{OPENPATCH_U8, OPENPATCH_TABLE(triangle_runs), "triangle"},
+                                            {OPENPATCH_I16, OPENPATCH_TABLE(palm_runs), "palm"},
+                                            {OPENPATCH_F32, OPENPATCH_TABLE(bones_runs), "bones"}};
+static openpatch_module hand_modules[] = {OPENPATCH_MODULE(0), OPENPATCH_MODULE(0), OPENPATCH_MODULE(0),
+                                          OPENPATCH_MODULE(1), OPENPATCH_MODULE(0), OPENPATCH_MODULE(2),
+                                          OPENPATCH_MODULE(2)};
 
 static const openpatch_run wide_runs[] = {{1016, 1, {0}}};
 static const openpatch_run deep_runs[] = {{60, 1, {4}}};
-static const openpatch_kind wide_kinds[] = {{"wide", OPENPATCH_U8, 1, wide_runs},
-                                            {"deep", OPENPATCH_I32, 1, deep_runs}};
-static const openpatch_modules wide_modules[] = {{0, 1}, {1, 2}};
+static const openpatch_kind wide_kinds[] = {{OPENPATCH_U8, OPENPATCH_TABLE(wide_runs), "wide"},
+                                            {OPENPATCH_I32, OPENPATCH_TABLE(deep_runs), "deep"}};
+static openpatch_module wide_modules[] = {OPENPATCH_MODULE(0), OPENPATCH_MODULE(1), OPENPATCH_MODULE(1)};
+
+#define MODEL(name) {20000, 1000, 1000000, "test patch", "", "1.0", OPENPATCH_TABLE(types), \
+                     OPENPATCH_TABLE(name##_kinds), OPENPATCH_TABLE(name##_modules)}
+static const openpatch_description models[] = {MODEL(finger), MODEL(hand), MODEL(wide)};
 
 static volatile sig_atomic_t hangs, speaks;
 static uint32_t first_us;
@@ -56,8 +62,16 @@ static void on_signal(int number) {
     if (number == SIGUSR1) hangs = 1; else speaks = 1;
 }
 
-static void write_bytes(void *context, const uint8_t *bytes, size_t n) {
-    (void)context;
+static int read_byte(void) {
+    uint8_t byte;
+    struct pollfd wait = {0, POLLIN, 0};
+    if (poll(&wait, 1, 0) != 1 || !(wait.revents & POLLIN)) return -1;
+    if (read(0, &byte, 1) == 1) return byte;
+    if (errno == EINTR) return -1;
+    exit(0);
+}
+
+static void write_bytes(const uint8_t *bytes, size_t n) {
     while (n > 0) {
         ssize_t written = write(0, bytes, n);
         if (written < 0 && errno != EINTR) exit(1);
@@ -65,21 +79,18 @@ static void write_bytes(void *context, const uint8_t *bytes, size_t n) {
     }
 }
 
-static uint32_t now_us(void *context) {
+static uint32_t now_us(void) {
     struct timespec now;
-    (void)context;
     clock_gettime(CLOCK_MONOTONIC, &now);
     return (uint32_t)((uint64_t)now.tv_sec * 1000000u + (uint64_t)now.tv_nsec / 1000u) + first_us;
 }
 
-static uint32_t set_period(void *context, uint32_t us) { /* whole milliseconds only */
-    (void)context;
+static uint32_t set_period(uint32_t us) { /* whole milliseconds only */
     return us < 2000 ? 1000 : us / 1000 * 1000;
 }
 
-static uint8_t tare(void *context, uint8_t module) {
+static uint8_t tare(uint8_t module) {
     uint8_t i;
-    (void)context;
     if (module == 2) return OPENPATCH_FAILED;
     for (i = 0; i < MAX_MODULES; i++) if (module == OPENPATCH_ALL || module == i) tared[i] = 1;
     return OPENPATCH_OK;
@@ -90,13 +101,12 @@ static void sample(openpatch *op, uint8_t module, uint32_t us, const char *model
                    int32_t i32[MAX_VALUES]; float f32[MAX_VALUES]; } values;
     static uint8_t each[MAX_VALUES];
     const openpatch_description *d = op->description;
-    uint8_t entry = 0, first = 0, any_bad = 0;
+    const openpatch_kind *kind = &d->kinds[d->modules[module].kind];
+    uint8_t any_bad = 0;
     unsigned i, n = 0;
-    while (module >= first + d->modules[entry].count) first = (uint8_t)(first + d->modules[entry++].count);
-    const openpatch_kind *kind = &d->kinds[d->modules[entry].kind];
     for (i = 0; i < kind->n_runs; i++) n += (unsigned)kind->runs[i].count * kind->runs[i].n_axes;
     for (i = 0; i < n; i++) {
-        unsigned value = tared[module] ? 0 : 5u * module + 3u * i + op->modules[module].sequence;
+        unsigned value = tared[module] ? 0 : 5u * module + 3u * i + d->modules[module].sequence;
         each[i] = 0;
         switch (kind->dtype) {
         case OPENPATCH_U8: values.u8[i] = (uint8_t)(value % 251); break;
@@ -113,46 +123,38 @@ static void sample(openpatch *op, uint8_t module, uint32_t us, const char *model
 
 int main(int argc, char **argv) {
     static openpatch op;
-    static openpatch_module modules[MAX_MODULES];
-    static openpatch_hardware hardware = {NULL, write_bytes, now_us, NULL, set_period, tare};
-    static openpatch_description d = {"test patch", "", "1.0", 20000, 1000, 1000000, 5, 1, 1, types, finger_kinds,
-                                      finger_modules};
+    static const openpatch_hardware hardware = {read_byte, write_bytes, now_us, NULL, set_period, tare};
+    openpatch_description d;
     struct sigaction action;
     uint32_t due_us;
     if (argc < 4) return 2;
     const char *model = argv[1];
+    d = models[model[0] == 'h' ? 1 : model[0] == 'w' ? 2 : 0];
     d.serial_number = argv[2];
-    if (model[0] == 'h') { d.kinds = hand_kinds; d.n_kinds = 3; d.modules = hand_modules; d.n_modules = 4; }
-    if (model[0] == 'w') { d.kinds = wide_kinds; d.n_kinds = 2; d.modules = wide_modules; d.n_modules = 2; }
-    if (argc > 4) first_us = (uint32_t)strtoul(argv[4], NULL, 0) - now_us(NULL);
+    if (argc > 4) first_us = (uint32_t)strtoul(argv[4], NULL, 0) - now_us();
     memset(&action, 0, sizeof action);
     action.sa_handler = on_signal;
     sigaction(SIGUSR1, &action, NULL);
     sigaction(SIGUSR2, &action, NULL);
-    openpatch_init(&op, &d, &hardware, modules, (uint8_t)atoi(argv[3]));
-    due_us = now_us(NULL);
+    openpatch_init(&op, &d, &hardware, (uint8_t)atoi(argv[3]));
+    due_us = now_us();
     for (;;) {
-        uint8_t bytes[32];
         struct pollfd wait = {0, POLLIN, 0};
-        const int32_t left_us = (int32_t)(due_us - now_us(NULL));
+        const int32_t left_us = (int32_t)(due_us - now_us());
         poll(&wait, 1, left_us <= 0 ? 0 : left_us > 20000 ? 20 : left_us / 1000);
-        if (wait.revents & POLLIN) {
-            ssize_t n = read(0, bytes, sizeof bytes), i;
-            if (n <= 0 && errno != EINTR) return 0;
-            for (i = 0; i < n; i++) openpatch_receive(&op, bytes[i]);
-        } else if (wait.revents & (POLLERR | POLLNVAL)) {
+        if (wait.revents & (POLLERR | POLLNVAL)) {
             return 0;
-        } else if (wait.revents & POLLHUP) { /* nobody has the port open */
+        } else if ((wait.revents & (POLLHUP | POLLIN)) == POLLHUP) { /* nobody has the port open */
             struct timespec pause = {0, 1000000};
             nanosleep(&pause, NULL);
         }
         openpatch_poll(&op);
         if (speaks) { speaks = 0; openpatch_note(&op, 1, "supply at 4.1 V\x1b[31m"); }
-        if ((int32_t)(now_us(NULL) - due_us) >= 0) {
+        if ((int32_t)(now_us() - due_us) >= 0) {
             uint8_t module;
-            const uint32_t us = now_us(NULL);
+            const uint32_t us = now_us();
             due_us = op.period_us > us - due_us ? due_us + op.period_us : us + op.period_us;
-            for (module = 0; module < op.n_modules && !hangs; module++) sample(&op, module, us, model);
+            for (module = 0; module < d.n_modules && !hangs; module++) sample(&op, module, us, model);
         }
     }
 }

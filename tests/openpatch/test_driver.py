@@ -8,6 +8,7 @@ import random
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -101,12 +102,14 @@ def test_no_module_is_torn_and_no_sample_lost(firmware: Path) -> None:
     with Microcontroller(firmware, "hand") as patch, driven(patch, rate_hz=100) as (_, reader):
         read_until(reader, is_fresh)
         shown: list[int] = []
+        overlooked = -reader.lost
         for count, frame in enumerate(reader.in_order(timeout_s=30)):
             sample = samples_of(frame)[0]
             shown += [sample] if sample not in shown else []
             if count >= 100:
                 break
-        assert shown == [(shown[0] + n) % 251 for n in range(len(shown))]
+        overlooked += reader.lost  # by this program, if the machine did not let it run
+        assert sum((after - before) % 251 - 1 for before, after in pairwise(shown)) <= overlooked
         assert len(shown) > 50
         assert reader.patch_counters(frame)[0]["sequence_lost"] == 0
 

@@ -16,7 +16,7 @@ from tests.openpatch.microcontroller import HERE, program
 
 PAGE = Path(__file__).parents[2] / "docs/protocols/patch-serial.md"
 LANGUAGES = ("c99", "c++11", "sanitized")
-SAID = wire.Said()
+SAID = wire.Said(modules=[(0, 1), (0, 1)])  # as the header says it: each by itself
 
 
 def vectors() -> list[tuple[str, str]]:
@@ -80,7 +80,7 @@ def test_the_vectors_are_what_the_text_says() -> None:
     assert wire.frame(3, struct.pack("<BI", 15, crc)) in host
     assert wire.frame(0x80, struct.pack("<BHIB4H", 0, 0, 500_000, 0, 1, 0, 0xFFFF, 300)) in patch
     assert wire.frame(0x80, struct.pack("<BHIB4H4B", 0, 1, 500_000, 0, 1, 0, 0xFFFF, 300, 0, 0, 8, 0)) in patch
-    assert wire.frame(0x80, struct.pack("<BHIB4H", 1, 0, 500_000, 32, 0, 0, 0, 0)) in patch
+    assert wire.frame(0x80, struct.pack("<BHIB4H", 1, 0, 500_000, 32, 0x101, 0, 0xFFFF, 300)) in patch
     assert wire.frame(0x61, struct.pack("<IIII", 1500, 4, 0, 0)) in patch
 
 
@@ -138,6 +138,18 @@ def test_a_message_without_room_is_dropped_whole_and_counted(firmware: Path) -> 
     assert said[3] == b""
     assert said[5] == wire.frame(0x80, struct.pack("<BHIB4H", 0, 1, 0, 0, 1, 0, 0xFFFF, 300))
     assert said[6] == wire.frame(0x48, struct.pack("<BBIIII", 2, 0, 0, 1, 1, 0))
+
+
+def test_a_module_that_is_off_says_so_once_in_every_stream(firmware: Path) -> None:
+    off, on, stop = request(6, 2, 1, 0), request(6, 3, 0xFF, 1), request(4, 4)
+    said = run(
+        firmware, ["poll", off, start(), *["send 1 8"] * 2, stop, "send 1 0", start(), "send 1 0", on, "send 1 8"]
+    )
+
+    def sample(sequence: int, status: int) -> bytes:
+        return wire.frame(0x80, struct.pack("<BHIB4H", 1, sequence, 0, status, 0x101, 0, 0xFFFF, 300))
+
+    assert [said[n] for n in (3, 4, 6, 8, 10)] == [sample(0, 32), b"", b"", sample(1, 32), sample(2, 8)]
 
 
 def test_the_clock_may_wrap(firmware: Path) -> None:

@@ -15,7 +15,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import NoOptions, Notice
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Stamp, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -36,6 +36,7 @@ class Speaking(CanAdapter[NoOptions]):
     def __init__(self, options: NoOptions) -> None:
         super().__init__(options)
         self.revived: list[str] = []
+        self.probed: list[str] = []
         self.failures = 0
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
@@ -45,6 +46,7 @@ class Speaking(CanAdapter[NoOptions]):
                 tell(self.patches[(frame.identifier & 0xF) - 1], list(Notice)[frame.payload[0]])
 
     async def probe(self, link: Link, patch: Patch) -> bool:
+        self.probed.append(patch.name)
         return True
 
     async def revive(self, link: Link, patch: Patch) -> None:
@@ -60,6 +62,7 @@ class Devices:
 
     def __init__(self) -> None:
         self.mute: set[int] = set()
+        self.data: Callable[[int], bytes] = lambda key: bytes((key, key))
         self.says: list[tuple[int, bytes]] = []
         self._due_ns = 0
 
@@ -73,7 +76,7 @@ class Devices:
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + 20 * MS
-        data = [(0x180 | key, bytes((key, key))) for key in (1, 2) if key not in self.mute]
+        data = [(0x180 | key, self.data(key)) for key in (1, 2) if key not in self.mute]
         frames, self.says = [*self.says, *data], []
         return [WireFrame(now_ns, *frame) for frame in frames]
 
@@ -286,7 +289,45 @@ def test_nobody_is_probed_while_the_devices_of_a_bus_are_being_set_up(devices: D
         running.do(lambda: devices.mute.add(1))
         stale = read_until(reader, states(STALE, LIVE))
         read_until(reader, lambda f: f.sequence > stale.sequence + 50)  # several times as long as a patch may be silent
-        assert adapter.revived == []
+        assert adapter.probed == []
         running.do(busy.release)
         read_until(reader, states(LIVE, LIVE))
         assert adapter.revived == ["one"]
+
+
+def test_sequence_numbers_of_a_patch_that_was_set_up_anew_begin_anew(devices: Devices) -> None:
+    class Counting(Speaking):
+        layout = Layout(
+            [
+                Frame(
+                    "data",
+                    [Identifier(0x180, mask=0x7F0)],
+                    (3,),
+                    Values(1, "u1", 2),
+                    patch=Bits(0, 4),
+                    stamp=Stamp(0, "u1"),
+                )
+            ]
+        )
+
+    numbers = {1: 100, 2: 100}
+
+    def data(key: int) -> bytes:
+        numbers[key] += 1
+        return bytes((numbers[key] % 256, key, key))
+
+    devices.data = data
+    adapter, bus = Counting(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        read_until(reader, statuses(GOOD, GOOD))
+
+        def restart() -> None:
+            numbers[1] += 50  # from wherever it begins anew
+            devices.mute.add(1)
+
+        running.do(restart)
+        Stage(running, devices, adapter).say(1, Notice.RESTARTED)
+        wait_until(lambda: adapter.revived == ["one"])
+        read_until(reader, states(LIVE, LIVE))
+        counters = reader.patch_counters(reader.read())[0]
+        assert (counters["sequence_lost"], counters["sequence_back"]) == (0, 0)

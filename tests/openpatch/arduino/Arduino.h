@@ -15,13 +15,11 @@ static inline int analogRead(uint8_t input) { return 100 * (input + 1); }
 
 struct HardwareSerial {
     void begin(unsigned long) {}
-    int available() {
-        struct pollfd wait = {0, POLLIN, 0};
-        return poll(&wait, 1, 1) == 1 && (wait.revents & POLLIN);
-    }
     int read() {
         uint8_t byte;
-        return ::read(0, &byte, 1) == 1 ? byte : -1;
+        struct pollfd wait = {0, POLLIN, 0};
+        const bool has_come = poll(&wait, 1, 1) == 1 && (wait.revents & POLLIN);
+        return has_come && ::read(0, &byte, 1) == 1 ? byte : -1;
     }
     size_t write(const uint8_t *bytes, size_t n) {
         for (size_t done = 0; done < n;) {

@@ -1,0 +1,247 @@
+"""docs/reference/json.md says what is printed: no key is missing there, and none stands there that is never printed."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.cli._command import exit_status
+from skinware.cli.info import command as info
+from skinware.cli.top import command as top
+from skinware.realtime import now_ns
+from skinware_drivers.cli.config import command as config
+from skinware_drivers.cli.dump import command as dump
+from skinware_drivers.cli.emulation import Emulation, JsonReport
+from skinware_drivers.cli.find import command as find
+from skinware_drivers.cli.import_ import command as import_
+from skinware_drivers.finding import adapters, interfaces, ports
+from skinware_drivers.finding.adapters import CanAdapterFound, Detection
+from skinware_drivers.finding.interfaces import CanInterface
+from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
+from skinware_drivers.virtual.roboskin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from tests.commands import running
+from tests.finding.fakes import see_only
+from tests.icub.conftest import WRAPPER, device
+from tests.icub.test_positions import TRIANGLE, positions
+from tests.virtual.test_emulate import HostBus
+
+PAGE = Path(__file__).parents[2] / "docs/reference/json.md"
+VIRTUAL = "virtual?boards=7"
+PLAIN: dict[str, Callable[[Any], bool]] = {
+    "string": lambda value: isinstance(value, str),
+    "integer": lambda value: isinstance(value, int) and not isinstance(value, bool),
+    "number": lambda value: isinstance(value, int | float) and not isinstance(value, bool),
+    "boolean": lambda value: isinstance(value, bool),
+    "object": lambda value: isinstance(value, dict),
+    "null": lambda value: value is None,
+    "any": lambda _value: True,
+}
+Rows = dict[str, str]
+
+
+def sections() -> dict[str, Rows]:
+    """Type of every key, under the heading where it stands."""
+    found: dict[str, Rows] = {}
+    rows: Rows = {}
+    for line in PAGE.read_text().splitlines():
+        if line.startswith("#"):
+            rows = found.setdefault(line.strip("# "), {})
+        elif line.startswith("| `"):
+            keys, kind, _unit, _meaning = (cell.strip() for cell in line.strip("|").split("|"))
+            for key in re.findall(r"`([^`]+)`", keys):
+                assert key not in rows, f"{key} stands there twice"
+                rows[key] = kind
+    return {heading: rows for heading, rows in found.items() if rows}
+
+
+SECTIONS = sections()
+PARTS = {heading.lower(): rows for heading, rows in SECTIONS.items() if "`" not in heading}
+
+
+def expanded(rows: Rows) -> dict[str, list[str]]:
+    """Full path and plain types of every key; keys of the parts that a row links to come below it."""
+    found: dict[str, list[str]] = {}
+    for key, told in rows.items():
+        types = []
+        for one in told.split(" or "):
+            part = re.fullmatch(r"\[(.+)\]\(#(.+)\)", one)
+            types.append("object" if part else one)
+            if part:
+                assert part[2] == part[1].replace(" ", "-")
+                found |= {f"{key}.{below}": types for below, types in expanded(PARTS[part[1]]).items()}
+        found[key] = types
+    return found
+
+
+def values(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every value with its path; objects and lists as well as what is in them."""
+    if path:
+        yield path, data
+    if isinstance(data, dict):
+        for key, value in data.items():
+            yield from values(value, f"{path}.{key}" if path else key)
+    elif isinstance(data, list):
+        for value in data:
+            yield from values(value, f"{path}[]")
+
+
+def _pattern(key: str, kinds: list[str]) -> re.Pattern[str]:
+    """What paths a key of the page stands for; ``any`` is what it is, whatever is in it."""
+    return re.compile(re.escape(key).replace("NAME", r"[^\[\]]+") + r"([.\[].*)?" * (kinds == ["any"]))
+
+
+def check(heading: str, *printed: Any, open_ended: bool = False) -> None:
+    """Compare what was printed with the page, both ways.
+
+    Args:
+        heading: where it stands.
+        printed: enough to show every key.
+        open_ended: there may be integers under other keys (the page says so).
+    """
+    rows = expanded(SECTIONS[heading])
+    patterns = {key: _pattern(key, kinds) for key, kinds in rows.items()}
+    inner = {key[: at.start()] for key in rows for at in re.finditer(r"\.|\[\]", key)}  # only lead to others
+    seen, wrong = set(), []
+    for path, value in (pair for one in printed for pair in values(one)):
+        keys = [key for key, pattern in patterns.items() if pattern.fullmatch(path)]
+        seen.update(keys)
+        if keys and not any(PLAIN[kind](value) for key in keys for kind in rows[key]):
+            wrong.append(f"{path} is {value!r}, not {rows[keys[0]]}")
+        elif not (
+            keys or (path in inner and isinstance(value, dict | list)) or (open_ended and PLAIN["integer"](value))
+        ):
+            wrong.append(f"{path} is not on the page")
+    assert wrong == []
+    assert sorted(rows.keys() - seen) == [], "on the page, and not printed"
+
+
+Print = Callable[..., list[Any]]
+
+
+@pytest.fixture
+def printing(capsys: pytest.CaptureFixture[str]) -> Print:
+    """Runs a command and gives what it prints."""
+
+    def run(command: click.Command, *arguments: str) -> list[Any]:
+        assert exit_status(command, [*arguments, "--json"]) == 0, capsys.readouterr().err
+        return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+    return run
+
+
+def test_a_driver_and_those_that_look_at_it(printing: Print, namespace: Namespace) -> None:
+    with (
+        running("skin-driver", "--bus", VIRTUAL) as driver,
+        ServiceWriter("pose", {"angle": ("f4", (2,)), "at": ([("x", "i4")], ())}, namespace=namespace) as service,
+    ):
+        check("`ready`", driver.wait_for("ready"))
+        service.begin()
+        service.commit(now_ns())
+        with DriverReader("roboskin") as reader, ServiceReader[Frame]("pose") as other:
+            reader.read(timeout_s=60)
+            other.read()
+            (namespace.path / "broken.ring").write_bytes(b"x")
+            (told,) = printing(info)
+            check("`skin-info`", told)
+            (namespace.path / "broken.ring").unlink()
+        (rows,) = printing(info, "roboskin", "--sensors")
+        check("`skin-info NAME --sensors`", rows)
+        check(
+            "`skin-dump`",
+            *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--physical"),
+            *printing(dump, "roboskin", "-n", "1"),
+        )
+        check("`skin-top`", *printing(top, "--plain", "-T", "2"))
+        check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
+        status = driver.wait_for("status")
+        check("`status`, `stopped`", status, driver.stop())
+
+
+def test_bare_frames(printing: Print) -> None:
+    check("`skin-dump --raw`", *printing(dump, "--raw", f"{VIRTUAL}&streaming=yes", "-n", "3"))
+
+
+def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    see_only(namespace, tmp_path, monkeypatch)
+    can0 = CanInterface(
+        "can0", "can", "peak_usb", False, "down", True, 10, 500_000, 2_000_000, 0.8, "BUS-OFF", 0, {"rx": 1}, {"off": 1}
+    )
+    usb = UsbIdentity("0403", "6001", "A50285BI", "FTDI", "FT232R", "1-1.2", "00")
+    tty = SerialPort("/dev/ttyUSB0", "ftdi_sio", usb, ("/dev/skin/A5",), False, "dialout", False, (User(1, "init"),))
+    monkeypatch.setattr(interfaces, "can_interfaces", lambda: [can0])
+    monkeypatch.setattr(ports, "serial_ports", lambda: [tty])
+    monkeypatch.setattr(
+        adapters, "detect_adapters", lambda _timeout_s: Detection([CanAdapterFound("kvaser:0", {"x": "y"})], "")
+    )
+    machine = printing(find, "--probe", "--listen", "0.1")
+    monkeypatch.setattr(interfaces, "can_interfaces", list)
+    heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--listen", "1")
+    no_interface = printing(find, "--listen", "0.1")
+    # what is heard on an interface of the kernel, and who has it, is told as it is for other buses
+    owner = {"name": "a", "namespace": "b", "driver_type": "c", "pid": 1, "buses": ["can0"]}
+    machine[0]["can"]["interfaces"][0] |= {**heard[0]["buses"][0], "used_by": owner}
+    machine[0]["ports"][0]["used_by"] = owner
+    heard[0]["buses"][0]["used_by"] = owner
+    for probe in (heard[0]["buses"][0]["probe"], machine[0]["ports"][0]["probe"]):
+        probe |= {"asked": ["roboskin"], "answers": {"roboskin": "yes"}, "problems": {"xela": "no"}}
+    check("`skin-find`", *machine, *heard, *no_interface)
+    check("`skin-find --udev`", *printing(find, "--udev"))
+
+
+def test_robots_files(printing: Print, tmp_path: Path) -> None:
+    (tmp_path / "skin.xml").write_text(device())
+    (tmp_path / "wrapper.xml").write_text(WRAPPER)
+    (tmp_path / "torso.txt").write_text(positions([TRIANGLE] * 32))
+    text = printing(import_, "icub", str(tmp_path))
+    check("`skin-import icub`", *text, *printing(import_, "icub", str(tmp_path), "-o", str(tmp_path / "out")))
+
+
+class _Stop:
+    """Sets the bus down for a while, and ends the emulation."""
+
+    def __init__(self, bus: HostBus) -> None:
+        self.bus, self.turns, self.stopped = bus, 0, False
+
+    def fileno(self) -> int:
+        return -1
+
+    def wait(self, _descriptors: list[int], _timeout_s: float | None) -> None:
+        self.turns += 1
+        self.bus.time_ns += 100_000_000
+        self.bus.up = not 20 < self.turns < 30
+        self.stopped = self.turns > 100
+
+
+def test_an_emulation() -> None:
+    out = io.StringIO()
+    bus = HostBus()
+    stop = _Stop(bus)
+    options = RoboskinOptions(boards=(7,), streaming=True)
+    emulation = Emulation(bus, EmulatedRoboskin(options), JsonReport(out), clock=lambda: bus.time_ns, poll=stop.wait)
+    emulation.run(stop, bus_name="host", driver="roboskin", options=options)
+    printed = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert {one["event"] for one in printed} == {"ready", "status", "bus_down", "bus_up", "stopped"}
+    check("`skin-emulate`", *printed, open_ended=True)
+
+
+def test_a_difference_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SECTIONS, "made", {"a": "integer", "b[].c": "string or null"})
+    check("made", {"a": 1, "b": [{"c": None}]})
+    for printed in ({"a": 1, "b": []}, {"a": "1", "b": [{"c": ""}]}, {"a": 1, "b": [{"c": ""}], "d": 1}):
+        with pytest.raises(AssertionError):
+            check("made", printed)
+
+
+def test_every_table_of_the_page_is_compared() -> None:
+    compared = set(re.findall(r'check\(\s*"(.+?)"', Path(__file__).read_text())) - {"made"}
+    assert compared == {heading for heading in SECTIONS if "`" in heading}
+    assert all(PARTS.values())

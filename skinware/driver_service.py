@@ -1,8 +1,8 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
 Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
-``bus_since_ns``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``, ``patch_age_counts``. Static columns:
-the structure's tables, ``driver_type`` and the names of the counters.
+``bus_since_ns``, ``bus_load``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``, ``patch_age_counts``.
+Static columns: the structure's tables, ``driver_type`` and the names of the counters.
 """
 
 from __future__ import annotations
@@ -71,6 +71,14 @@ class DriverFrame(Frame):
     def bus_since_ns(self) -> npt.NDArray[np.int64]:
         """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
         return self._told("bus_since_ns", (len(self.structure.buses),), np.int64)
+
+    @property
+    def bus_load(self) -> npt.NDArray[np.uint16]:
+        """(n_buses,) uint16, share of the bus' time in use over the last second, in thousandths, at least 1.
+
+        0: not known, or the driver does not tell; 0xFFFF: not known because of the bus' filters.
+        """
+        return self._told("bus_load", (len(self.structure.buses),), np.uint16)
 
     @property
     def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
@@ -225,6 +233,7 @@ class DriverWriter:
             "bus_state": ("u1", len(structure.buses)),
             "bus_reason": ("u1", len(structure.buses)),
             "bus_since_ns": ("<i8", len(structure.buses)),
+            "bus_load": ("<u2", len(structure.buses)),
             "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
             "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
             "patch_interval_counts": ("<u8", structure.n_patches * BUCKETS),
@@ -292,7 +301,7 @@ class DriverReader(ServiceReader[DriverFrame]):
                 "patch_state": structure.n_patches,
                 "bus_state": len(structure.buses),
             }
-            optional = {"bus_reason": len(structure.buses), "bus_since_ns": len(structure.buses)}
+            optional = dict.fromkeys(("bus_reason", "bus_since_ns", "bus_load"), len(structure.buses))
             optional |= dict.fromkeys(("patch_interval_counts", "patch_age_counts"), structure.n_patches * BUCKETS)
             expected |= {name: count for name, count in optional.items() if name in columns}
             for name, count in expected.items():

@@ -87,23 +87,12 @@ MAGNETIC_FIELD_X = SensorType("magnetic_field_x", 12, "T")
 MAGNETIC_FIELD_Y = SensorType("magnetic_field_y", 13, "T")
 MAGNETIC_FIELD_Z = SensorType("magnetic_field_z", 14, "T")
 
+ACCELERATION = (ACCELERATION_X, ACCELERATION_Y, ACCELERATION_Z)
+ANGULAR_RATE = (ANGULAR_RATE_X, ANGULAR_RATE_Y, ANGULAR_RATE_Z)
+MAGNETIC_FIELD = (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)
+
 CATALOGUE: dict[str, SensorType] = {
     t.name: t
-    for t in (
-        PRESSURE,
-        SHEAR_X,
-        SHEAR_Y,
-        PROXIMITY,
-        TEMPERATURE,
-        ACCELERATION_X,
-        ACCELERATION_Y,
-        ACCELERATION_Z,
-        ANGULAR_RATE_X,
-        ANGULAR_RATE_Y,
-        ANGULAR_RATE_Z,
-        MAGNETIC_FIELD_X,
-        MAGNETIC_FIELD_Y,
-        MAGNETIC_FIELD_Z,
-    )
+    for t in (PRESSURE, SHEAR_X, SHEAR_Y, PROXIMITY, TEMPERATURE, *ACCELERATION, *ANGULAR_RATE, *MAGNETIC_FIELD)
 }
 """The types of vendor 0, by name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from skinware.memory import _futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.structure import Index, Structure
+
+log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
@@ -171,6 +174,8 @@ class Skin:
     A driver joins with its first frame, and leaves when it stops or dies. The change happens between two snapshots,
     never within one. Not for several threads at once.
 
+    A callback that raises is logged, and everything else goes on.
+
     Args:
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         on_attach: called with a driver's name and structure when it joins, before the first snapshot that has it.
@@ -299,13 +304,13 @@ class Skin:
     def _tell(self, before: SkinLayout, after: SkinLayout) -> None:
         old, new = (dict(zip(layout.drivers, layout.structures, strict=True)) for layout in (before, after))
         for name, structure in old.items():
-            if name not in new and self._on_detach is not None:
-                self._on_detach(name, structure)
+            if name not in new:
+                _call(self._on_detach, name, structure)
         for name, structure in new.items():
-            if name not in old and self._on_attach is not None:
-                self._on_attach(name, structure)
-            elif name in old and old[name] is not structure and self._on_structure is not None:
-                self._on_structure(name, structure)
+            if name not in old:
+                _call(self._on_attach, name, structure)
+            elif old[name] is not structure:
+                _call(self._on_structure, name, structure)
 
     def _attach(self, name: str) -> DriverReader | None:
         try:
@@ -356,6 +361,15 @@ class Skin:
 
     def __repr__(self) -> str:
         return f"<Skin of namespace {self.namespace.name!r}: {', '.join(self._readers) or 'no driver'}>"
+
+
+def _call(told: Told | None, name: str, structure: Structure) -> None:
+    if told is None:
+        return
+    try:
+        told(name, structure)
+    except Exception:
+        log.exception("what was to be called about driver %r failed; the skin goes on", name)
 
 
 def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:

@@ -81,3 +81,14 @@ class BusReason(enum.IntEnum):
     """The controller hears broken frames: another bit rate, missing termination, bad wires."""
     REMOVED = 12
     """The driver was told to do without this bus."""
+
+
+LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF
+"""In place of a bus' load: its bit rate is not known; or its filters leave frames out, which nobody counts."""
+
+
+def load_report(load: int) -> dict[str, float | str | None]:
+    """A bus' load as programs are told: ``load``, 0 to 1, and if that is not known, in ``load_unknown`` why."""
+    if load in (LOAD_UNKNOWN, LOAD_FILTERED):
+        return {"load": None, "load_unknown": "filter" if load == LOAD_FILTERED else "bit_rate"}
+    return {"load": load / 1000, "load_unknown": None}

@@ -108,7 +108,7 @@ class Adapter(HasOptions[OptionsT], ABC):
 
     medium: ClassVar[str]
     Options: ClassVar[type[msgspec.Struct]] = NoOptions
-    types: Sequence[SensorType]
+    types: Sequence[SensorType] = ()
     dtype: npt.DTypeLike = np.uint8
     layout: Layout
     patches: Sequence[Patch] = ()

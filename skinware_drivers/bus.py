@@ -119,8 +119,8 @@ class Bus(ABC):
         opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
         counters: what happened on it so far.
         narrows: frames that nobody wants can be left out, see ``narrow``.
-        bit_rate: of the wire, bit/s; 0 where it is not known.
-        wire_bits: about how many bits the frames seen so far took on the wire; counted where the bit rate is known.
+        bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
+        wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
         fullest: largest share of the receive buffer in use after a take, since somebody set it to 0.
 
     Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
@@ -155,7 +155,7 @@ class Bus(ABC):
         self.counters: BusCounters = BusCounters()
         self.narrows = False
         self.bit_rate = 0
-        self.wire_bits = 0
+        self.wire_bits: float = 0.0
         self.fullest: float = 0.0
 
     @abstractmethod

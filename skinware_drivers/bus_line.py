@@ -96,12 +96,11 @@ class BusLine:
 
     def lose(self, error: BusNotAvailable) -> None:
         """Close it because it went away; ``reopen`` waits for it."""
-        self._become(BusState.DOWN if error.is_down else BusState.GONE, error.reason)
-        self._news.tell(f"{error}; waiting for it to come back")
         with contextlib.suppress(OSError):
             self._epoll.unregister(self.bus.fileno())
         self.bus.close()
         self.lost.set()
+        self._is_away(error)
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
@@ -111,12 +110,12 @@ class BusLine:
             try:
                 await self._open_again()
             except (BusNotAvailable, ConfigurationError, OSError) as error:
-                self._still_away(error)
+                self._is_away(error)
             else:
-                self._news.tell(f"bus {self.name} is back")
                 return
 
     async def _open_again(self) -> None:
+        was_there = self.opened_ns
         if self.bus.opens_slowly:  # the other buses go on meanwhile
             opening = asyncio.ensure_future(asyncio.to_thread(self.bus.open))
             try:
@@ -126,14 +125,15 @@ class BusLine:
         else:
             self.bus.open()
         self._is_open()
+        self._news.tell(f"bus {self.name} is {'back' if was_there else 'there'}")
 
-    def _still_away(self, error: Exception) -> None:
+    def _is_away(self, error: Exception) -> None:
         if isinstance(error, BusNotAvailable):
             state, reason = (BusState.DOWN if error.is_down else BusState.GONE), error.reason
         else:
             state, reason = BusState.GONE, BusReason.FAILED
         if self._become(state, reason):
-            self._news.tell(f"{error}; waiting for it to come back")
+            self._news.tell(f"{error}; waiting for it to {'come back' if self.opened_ns else 'appear'}")
 
     @property
     def is_in_order(self) -> bool:
@@ -233,10 +233,16 @@ class BusLine:
                 self.started = True
                 return
 
-    def begin_lost(self) -> None:
-        """Wait for a bus that nobody has opened yet as for one that was lost; nothing hangs on it so far."""
+    def begin_lost(self, error: BusNotAvailable | None = None) -> None:
+        """Wait for a bus that nobody has opened yet as for one that was lost; nothing hangs on it so far.
+
+        Args:
+            error: why it could not be opened; None: nobody has tried.
+        """
         self.patches = ()
         self.lost.set()
+        if error is not None:
+            self._is_away(error)
 
     def remove(self) -> None:
         """Let go of the bus for good."""

@@ -17,8 +17,10 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -28,8 +30,10 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
 from skinware_drivers.options import nearest_name, options_from_strings
+from skinware_drivers.toml_lines import Keys, line_of
 
 T = TypeVar("T", bound=msgspec.Struct)
+_KEYS_IN_ERROR = re.compile(r"\.(\w+)|\[(\d+)\]")
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,6 +51,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole file.
 
     Attributes:
+        wait: for a bus to appear, if there is none at the start.
         publish: when frames are published: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
@@ -55,6 +60,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     driver: str = ""
     name: str = ""
     listen_only: bool = False
+    wait: bool = False
     publish: Literal["", "cycle", "rate", "request"] = ""
     realtime: str | None = None
     cpus: tuple[int, ...] = ()
@@ -66,43 +72,82 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Profile.from_text("normal" if self.realtime is None else self.realtime, cpus=self.cpus)
 
 
-def read_config(path: Path) -> DriverConfig:
-    """Read a configuration file.
-
-    Raises:
-        ConfigurationError: not there, not TOML, or a key or value that is wrong; the message says where.
-    """
-    try:
-        with path.open("rb") as file:
-            data = tomllib.load(file)
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigurationError(f"{path}: not TOML: {error}") from None
-    check_keys(DriverConfig, data, str(path))
-    for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
-        check_keys(BusConfig, bus, f"{path}: bus {number + 1}")
-    return convert(DriverConfig, data, str(path))
-
-
-def options_of_bus(struct: type[T], settings: DriverConfig, bus_name: str, given: Mapping[str, str] | None = None) -> T:
-    """A driver's options for one bus: what is given as text beats the bus' own, they beat the file's common ones.
+class ConfigFile:
+    """A configuration file, or none; its mistakes are told with file, line and key.
 
     Args:
-        struct: the driver's ``Options``.
-        settings: the file.
-        bus_name: as it stands in the file.
-        given: ``key=value`` texts, say of a command line.
+        path: of the file; None: everything has its default.
+
+    Attributes:
+        settings: what it says.
 
     Raises:
-        ConfigurationError: an unknown option or a wrong value.
+        ConfigurationError: not there, not TOML, or a key or value that is wrong.
     """
-    of_bus = next((bus.options for bus in settings.bus if bus.name == bus_name), {})
-    values = {**settings.options, **of_bus}
-    if given:
-        as_given = options_from_strings(struct, given)
-        values.update({key: getattr(as_given, key) for key in given})
-    return convert(struct, values, f"options of {bus_name}")
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._text = ""
+        self.settings = DriverConfig()
+        if path is None:
+            return
+        try:
+            self._text = path.read_text(encoding="utf-8")
+            data = tomllib.loads(self._text)
+        except OSError as error:
+            raise ConfigurationError(f"{path}: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigurationError(f"{path}: not TOML: {error}") from None
+        try:
+            _check_keys(DriverConfig, data)
+            for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
+                _check_keys(BusConfig, bus, ("bus", number))
+            self.settings = _convert(DriverConfig, data)
+        except _Wrong as wrong:
+            raise ConfigurationError(f"{self._place(wrong.keys)}: {wrong}") from None
+
+    def options_of_bus(self, struct: type[T], bus_name: str, given: Mapping[str, str] | None = None) -> T:
+        """A driver's options for one bus: what is given as text beats the bus' own, they beat the common ones.
+
+        Args:
+            struct: the driver's ``Options``.
+            bus_name: as it stands in the file.
+            given: ``key=value`` texts, say of a command line.
+
+        Raises:
+            ConfigurationError: an unknown option or a wrong value.
+        """
+        number, of_bus = next(
+            ((i, bus.options) for i, bus in enumerate(self.settings.bus) if bus.name == bus_name), (0, {})
+        )
+        values = {**self.settings.options, **of_bus}
+        as_given = options_from_strings(struct, given) if given else None
+        values.update({key: getattr(as_given, key) for key in given or ()})
+        try:
+            return _convert(struct, values)
+        except _Wrong as wrong:
+            key = next(iter(wrong.keys), None)
+            if key in of_bus or (key is None and of_bus):
+                place = self._place(("bus", number, "options", *wrong.keys))
+            elif key in self.settings.options or (key is None and self.settings.options):
+                place = self._place(("options", *wrong.keys))
+            else:
+                raise ConfigurationError(f"options of {bus_name}: {wrong}") from None
+            raise ConfigurationError(f"{place}: options of {bus_name}: {wrong}") from None
+
+    @contextmanager
+    def blamed_for(self, bus_name: str) -> Iterator[None]:
+        """Name the bus' line in this file in what is raised meanwhile, if the bus is of this file."""
+        try:
+            yield
+        except ConfigurationError as error:
+            numbers = [number for number, bus in enumerate(self.settings.bus) if bus.name == bus_name]
+            if not numbers:
+                raise
+            raise ConfigurationError(f"{self._place(('bus', numbers[0], 'name'))}: {error}") from None
+
+    def _place(self, keys: Keys) -> str:
+        return f"{self._path}:{line_of(self._text, keys)}"
 
 
 def convert(struct: type[T], data: Mapping[str, Any], where: str) -> T:
@@ -111,24 +156,36 @@ def convert(struct: type[T], data: Mapping[str, Any], where: str) -> T:
     Raises:
         ConfigurationError: an unknown key or a wrong value; the message begins with ``where``.
     """
-    check_keys(struct, data, where)
+    try:
+        return _convert(struct, data)
+    except _Wrong as wrong:
+        raise ConfigurationError(f"{where}: {wrong}") from None
+
+
+class _Wrong(Exception):
+    """What is wrong, and with which key."""
+
+    def __init__(self, text: str, keys: Keys) -> None:
+        super().__init__(text)
+        self.keys = keys
+
+
+def _convert(struct: type[T], data: Mapping[str, Any]) -> T:
+    _check_keys(struct, data)
     try:
         return msgspec.convert(data, struct)
     except ConfigurationError as error:
-        raise ConfigurationError(f"{where}: {error}") from None
+        raise _Wrong(str(error), ()) from None
     except msgspec.ValidationError as error:
-        if isinstance(error.__cause__, ConfigurationError):
-            raise ConfigurationError(f"{where}: {error.__cause__}") from None
-        raise ConfigurationError(f"{where}: {str(error).replace('`', '')}") from None
+        text = str(error).replace("`", "")
+        keys = tuple(int(number) if number else key for key, number in _KEYS_IN_ERROR.findall(text.rpartition("$")[2]))
+        raise _Wrong(str(error.__cause__) if isinstance(error.__cause__, ConfigurationError) else text, keys) from None
 
 
-def check_keys(struct: type[msgspec.Struct], data: object, where: str) -> None:
-    """Refuse keys that a struct does not have.
-
-    Raises:
-        ConfigurationError: one of them, with the nearest right name.
-    """
+def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = ()) -> None:
+    """Refuse keys that a struct does not have, with the nearest right name."""
     known = [field.encode_name for field in msgspec.structs.fields(struct)]
     for key in data if isinstance(data, Mapping) else ():
         if key not in known:
-            raise ConfigurationError(f"{where}: unknown key {key!r}{nearest_name(key, known)}")
+            of_bus = f"bus {place[1] + 1}: " if len(place) > 1 and isinstance(place[1], int) else ""
+            raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, known)}", (*place, key))

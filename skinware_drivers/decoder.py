@@ -88,10 +88,10 @@ class Decoder:
         self._addresses = Addresses(self._frames, kinds_of_bus, tables)
         self._kinds = [FrameKind(frame, tables) for frame in self._frames]
         # frames whose payload may name the module; if the identifier does, to no avail, it is just unknown
-        by_payload = np.array([kind.module_by_byte is not None for kind in self._kinds])
+        by_payload = np.array([kind.module_by_byte is not None for kind in self._kinds], bool)
         self._payload_names: Flags = self._addresses.sets @ by_payload
         self._compile_assemblies(first_of)
-        longest = max(max(frame.length) for frame in self._frames)
+        longest = max((max(frame.length) for frame in self._frames), default=0)
         self._length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
         for kind, frame in enumerate(self._frames):
             self._length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
@@ -181,7 +181,7 @@ class Decoder:
         in_cycles = {number for members in members_of for number in members}
         alone = [number for number in range(len(self._frames)) if number not in in_cycles]
         groups = [[number] for number in alone] + [members for members in members_of if members]
-        width = max(sum(len(self._kinds[number].channels) for number in group) for group in groups)
+        width = max((sum(len(self._kinds[number].channels) for number in group) for group in groups), default=0)
         made = [Assembly([self._kinds[n] for n in group], self.tables, width) for group in groups]
         self._alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
@@ -210,7 +210,7 @@ class Decoder:
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
         conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self._frames]
-        if not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
+        if not conditions or not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
             return None
         if len({(c[0].offset) for c in conditions}) > 1 or len({c[0].value for c in conditions}) < len(conditions):
             return None

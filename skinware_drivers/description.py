@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -78,6 +78,23 @@ class SkinTables:
     patch_key: dict[tuple[int, int], int] = field(repr=False)
     module_key: dict[tuple[int, int], int] = field(repr=False)
     channel_to_sensor: npt.NDArray[np.int64] = field(repr=False)
+
+    def with_buses(self, names: Sequence[str]) -> SkinTables:
+        """The same sensors on buses of other names, or on some of more buses."""
+        old = self.structure
+        structure = Structure(
+            types=old.types,
+            buses=names,
+            patch_name=old.patch_name,
+            patch_bus=old.patch_bus,
+            module_patch=old.module_patch,
+            module_kind=old.module_kind,
+            sensor_uid=old.sensor_uid,
+            sensor_type=old.sensor_type,
+            sensor_module=old.sensor_module,
+            dtype=old.dtype,
+        )
+        return replace(self, structure=structure)
 
 
 def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorType]:

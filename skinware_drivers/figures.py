@@ -8,7 +8,7 @@ from typing import Any
 from skinware.driver_service import DriverWriter
 from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
-from skinware.status import PatchState
+from skinware.status import PatchState, load_report
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.generation import Generation
 from skinware_drivers.limits import MachineLimits
@@ -36,7 +36,7 @@ def figures(
         counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
         patches.append(
             {
-                "name": bytes(structure.patch_name[patch]).decode(),
+                "name": generation.name_of(patch),
                 "bus": lines[int(structure.patch_bus[patch])].name,
                 "state": PatchState(int(publisher.patch_state[patch])).name.lower(),
                 "age_ms": round((time_ns - last_ns) / 1e6, 3) if last_ns else None,
@@ -56,7 +56,7 @@ def _bus(line: BusLine) -> dict[str, Any]:
     state_age_s = round((now_ns() - line.since_ns) / 1e9, 3)
     reason = line.reason.name.lower() if line.reason else None
     state = {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
-    return {**state, "load": None if line.limits.load is None else round(line.limits.load, 3)}
+    return {**state, **load_report(line.limits.permille)}
 
 
 def _bounds(counts: list[int]) -> dict[str, int | None]:

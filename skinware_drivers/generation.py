@@ -60,6 +60,7 @@ class Generation:
         self.batch = make_batch(self.lines, self.decoder.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patch_state.copy()
+        self.publisher.bus_limits = [line.limits for line in self.lines]
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         for line in self.lines:
             if line.patches:
@@ -111,14 +112,12 @@ class Generation:
         """Name of a patch, for people."""
         return bytes(self.tables.structure.patch_name[patch]).decode()
 
-    def patches_in(self, line: BusLine, state: PatchState) -> list[tuple[int, Patch]]:
-        """Numbers and descriptions of the patches of a bus that are in a state."""
+    def patches_in(self, line: BusLine, *states: PatchState) -> list[Patch]:
+        """The patches of a bus that are in one of these states."""
         if not line.patches:
             return []
-        of_bus = self.tables.structure.patch_bus == line.ordinal
-        first = int(np.argmax(of_bus))
-        found: list[int] = np.flatnonzero(of_bus & (self.publisher.patch_state == state)).tolist()
-        return [(number, line.patches[number - first]) for number in found]
+        state = self.publisher.patch_state[self.tables.structure.patch_bus == line.ordinal]
+        return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
     def log_patches(self) -> None:
         """Tell each change of a patch's state once."""

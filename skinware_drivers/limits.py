@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN
 from skinware_drivers.bus import Bus
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -28,7 +29,7 @@ class BusLimits:
         clock: CLOCK_MONOTONIC ns.
 
     Attributes:
-        load: share of the wire's time in use, over the last second; None where the bit rate is not known.
+        load: share of the wire's time in use, over the last second; None where that is not known.
     """
 
     def __init__(self, name: str, bus: Bus, clock: Callable[[], int] = now_ns) -> None:
@@ -52,12 +53,19 @@ class BusLimits:
         self.load = bits * NS_PER_S / (bus.bit_rate * passed_ns) if bus.bit_rate else None
         fill, bus.fullest = bus.fullest, 0.0
         if self.load is not None and self.load > HIGH_LOAD:
-            self._tell("load", f"about {self.load:.0%} of {bus.bit_rate} bit/s are in use: what has low priority waits")
+            self._tell("load", f"about {self.load:.0%} of its time is in use: what has low priority waits")
         if fill > HIGH_FILL:
             self._tell("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time")
         if bus.counters.lost > self._lost:
             lost = bus.counters.lost - self._lost
             self._tell("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+
+    @property
+    def permille(self) -> int:
+        """The load in thousandths, at least 1; or why it is not known, as in :mod:`skinware.status`."""
+        if self.load is None:
+            return LOAD_FILTERED if self._bus.narrows else LOAD_UNKNOWN
+        return max(1, round(1000 * self.load))
 
     def _tell(self, what: str, text: str) -> None:
         if what not in self._told:

@@ -52,12 +52,14 @@ class PatchCare:
     async def check_data(self) -> None:
         """Wait for the first data of every patch, and name those that send none."""
         timer = Periodic(_DATA_CHECKS_HZ)
+        silent = self._patches_in(PatchState.EXPECTED)
         for _ in range(round(_DATA_CHECKS_HZ * max(_DATA_TIMEOUT_S, 5 * self._line.adapter.period_s))):
-            if not self._line.lost.is_set() and not self._patches_in(PatchState.EXPECTED):
-                break
+            if not self._line.lost.is_set() and not silent:
+                return
             await asyncio.sleep((timer.deadline_ns - now_ns()) / NS_PER_S)
             timer.advance(now_ns())
-        for _, patch in self._patches_in(PatchState.EXPECTED):
+            silent = self._patches_in(PatchState.EXPECTED)
+        for patch in silent:
             log.warning("%s: %s sends no data", self._line.name, patch.name)
 
     async def recover_silent(self) -> None:
@@ -68,10 +70,10 @@ class PatchCare:
         silence_ns = generation.publisher.silence_ns
         if now_ns() - max(line.opened_ns, generation.begun_ns) < 2 * silence_ns:
             return  # nobody listened, the boards may send: to set them up again would move their baseline
-        silent = [*self._patches_in(PatchState.STALE), *self._patches_in(PatchState.EXPECTED)]
+        states = [PatchState.STALE, PatchState.EXPECTED]
         if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
-            silent += self._patches_in(PatchState.RESTARTED)
-        for _, patch in silent:
+            states.append(PatchState.RESTARTED)
+        for patch in generation.patches_in(line, *states):
             try:
                 if not await line.adapter.probe(line.link, patch):
                     continue
@@ -153,6 +155,6 @@ class PatchCare:
         self._line.suspects.discard(patch.key)
         return None
 
-    def _patches_in(self, state: PatchState) -> list[tuple[int, Patch]]:
+    def _patches_in(self, state: PatchState) -> list[Patch]:
         generation = self._generation()
         return [] if generation is None else generation.patches_in(self._line, state)

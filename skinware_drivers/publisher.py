@@ -15,6 +15,7 @@ from skinware_drivers.adapter import Watch
 from skinware_drivers.bursts import Bursts
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoder import Decoder
+from skinware_drivers.limits import BusLimits
 from skinware_drivers.patch_timing import PatchTiming
 from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 
@@ -97,6 +98,7 @@ class Publisher:
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
         self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
         self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
+        self.bus_limits: Sequence[BusLimits] = ()
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -175,6 +177,8 @@ class Publisher:
         columns["bus_state"][:] = self.bus_state
         columns["bus_reason"][:] = self.bus_reason
         columns["bus_since_ns"][:] = self.bus_since_ns
+        if self.bus_limits:
+            columns["bus_load"][:] = [limits.permille for limits in self.bus_limits]
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)

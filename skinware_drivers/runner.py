@@ -12,13 +12,14 @@ from typing import Any, Literal
 import numpy as np
 
 from skinware.driver_service import DriverWriter
-from skinware.errors import BusError, ConfigurationError, StructureError
+from skinware.errors import BusError, BusNotAvailable, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus_changes import BusChanges
 from skinware_drivers.bus_line import BusLine
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
@@ -47,10 +48,18 @@ class Runner:
         lines: name, adapter and (unopened) bus of every bus, in order.
         name: the driver's name in the namespace.
         listen_only: send nothing; ``configure``, ``start`` and ``stop`` are not called.
+        wait_for_buses: for one to appear, if there is none at the start.
         publish: ``cycle`` (when every living patch has delivered), ``rate`` (at the adapter's rate), ``request`` (by
             cycle, but only what a program has asked for); default: what the adapter says.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         on_ready: called once, when frames are being published.
+
+    Attributes:
+        lines: the buses; those that were removed keep their places.
+        buses: adds and removes buses while it runs.
+        writer: the driver's end in shared memory, once there is a structure.
+        generation: what is in service, once there is a structure.
+        ready: frames are being published.
     """
 
     def __init__(
@@ -60,6 +69,7 @@ class Runner:
         *,
         name: str,
         listen_only: bool = False,
+        wait_for_buses: bool = False,
         publish: PublishMode | None = None,
         namespace: Namespace | None = None,
         slots: int = DEFAULT_SLOTS,
@@ -72,10 +82,12 @@ class Runner:
         self.lines: list[BusLine] = [
             BusLine(bus_name, i, adapter, bus, self._epoll) for i, (bus_name, adapter, bus) in enumerate(lines)
         ]
+        self.buses = BusChanges(self.lines, self._epoll, self._put_in, self._take_out, self._build)
         self.writer: DriverWriter | None = None
         self.generation: Generation | None = None
         self.ready: bool = False
         self._listen_only = listen_only
+        self._wait_for_buses = wait_for_buses
         self._publish = publish
         self._desk: RequestDesk | None = None
         self._namespace = namespace or Namespace()
@@ -99,18 +111,17 @@ class Runner:
     # -- life -----------------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until ``stop``.
+        """Run until ``stop``. A bus that is not there is waited for while the others go on.
 
         Raises:
-            BusNotAvailable: a bus could not be opened at the start (later, it is waited for).
+            BusNotAvailable: at the start, not one bus is there, or this user may not open one.
             NameInUse: a living driver has this name.
             NamespaceError: the namespace cannot be used.
         """
         loop = asyncio.get_running_loop()
         self._namespace.create(self._group)
         try:
-            for line in self.lines:
-                line.open()
+            self._open_buses()
             self._intake.start()
             self._serving = {line: self._beside(self._serve(line)) for line in self.lines}
             await self._stopping.wait()
@@ -123,6 +134,20 @@ class Runner:
             await asyncio.gather(*tasks, return_exceptions=True)
             await self._shut_down(loop)
 
+    def _open_buses(self) -> None:
+        absent: list[tuple[BusLine, BusNotAvailable]] = []
+        for line in self.lines:
+            try:
+                line.open()
+            except BusNotAvailable as error:
+                if error.reason == BusReason.REFUSED:
+                    raise
+                absent.append((line, error))
+        if len(absent) == len(self.lines) and not self._wait_for_buses:
+            raise absent[0][1]
+        for line, why in absent:
+            line.begin_lost(why)
+
     def stop(self) -> None:
         """Ask ``run`` to come back; safe in a signal handler of the loop."""
         self._stopping.set()
@@ -131,52 +156,22 @@ class Runner:
         """Take in what has appeared on the buses since the start, as a new generation."""
         self._join_requested.set()
 
-    @property
-    def bus_names(self) -> list[str]:
-        """Names of its buses, without those that were removed."""
-        return [line.name for line in self.lines if line.reason != BusReason.REMOVED]
-
-    async def add_bus(self, name: str, adapter: AnyAdapter, bus: Bus) -> None:
-        """Take in one more bus while the others go on; users see a new generation. It need not be there yet.
-
-        A bus that was removed gets its old place back. The others keep theirs, and with them the uids of their sensors.
-
-        Raises:
-            ConfigurationError: there is a bus of this name, or its sensor types contradict those of the others.
-        """
+    async def _put_in(self, line: BusLine) -> None:
+        """Begin with a bus that joins: users see a new generation."""
         async with self._built:
-            known = next((line for line in self.lines if line.name == name), None)
-            if known is not None and known.reason != BusReason.REMOVED:
-                raise ConfigurationError(f"bus {name} is in use already")
-            line = BusLine(name, len(self.lines) if known is None else known.ordinal, adapter, bus, self._epoll)
             line.begin_lost()
             self.lines[line.ordinal : line.ordinal + 1] = [line]
             self._rebuild(anew=True)  # nothing of it may arrive before there is a place for it
-            if self.generation is not None and len(self.generation.tables.structure.buses) < len(self.lines):
-                del self.lines[line.ordinal]
-                raise ConfigurationError(f"bus {name} does not fit the others (what was logged says why)")
         self._serving[line] = self._beside(self._serve(line))
 
-    async def remove_bus(self, name: str) -> None:
-        """Stop the devices on a bus and go on without it; users see a new generation.
-
-        Its place stays, empty, so that the sensors of the other buses keep their uids.
-
-        Raises:
-            ConfigurationError: there is no such bus, or it is the last one with sensors.
-        """
-        line = next((line for line in self.lines if line.name == name and line.reason != BusReason.REMOVED), None)
-        if line is None:
-            raise ConfigurationError(f"there is no bus {name}")
-        if not any(other.patches for other in self.lines if other is not line):
-            raise ConfigurationError(f"bus {name} is the last one with sensors; stop the driver instead")
+    async def _take_out(self, line: BusLine) -> None:
+        """Stop what is on a bus, and close it. The sensors stay in the structure until that is built again."""
         task = self._serving.pop(line)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         await line.stop()
         async with self._built:
             line.remove()
-            self._rebuild()
 
     async def _shut_down(self, loop: asyncio.AbstractEventLoop) -> None:
         if self._desk is not None and self.writer is not None:
@@ -263,9 +258,13 @@ class Runner:
 
     def _rebuild(self, *, anew: bool = False) -> None:
         """With ``_built`` held. ``anew``: also if nothing has changed but the bus behind a name."""
-        if any(line.patches is None for line in self.lines) or not any(line.patches for line in self.lines):
+        if any(line.patches is None for line in self.lines):
             return
-        adapters = [line.adapter for line in self.lines]
+        adapters = [line.adapter for line in self.lines if line.patches]
+        if not adapters:
+            if anew and self.generation is not None:  # the sensors stay, without data
+                self._go_over_to(self.generation.tables.with_buses([line.name for line in self.lines]))
+            return
         try:
             tables = assemble(
                 [(line.name, line.patches or ()) for line in self.lines],
@@ -273,7 +272,7 @@ class Runner:
                 np.result_type(*(adapter.dtype for adapter in adapters)),
             )
         except StructureError as error:
-            log.error("what was found makes no skin: %s", error)
+            log.error("what was found makes no skin: %s", str(error))
             return
         known = self.generation
         is_known = known is not None and (known.tables.structure, known.decoder.layouts) == (

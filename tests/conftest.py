@@ -6,9 +6,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from skinware.memory.namespace import Namespace
-from skinware_drivers.testing.waiting import wait_until
-
-__all__ = ["wait_until"]
 
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])

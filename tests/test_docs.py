@@ -19,7 +19,7 @@ import pytest
 
 import skinware
 from skinware import realtime, threads
-from skinware_drivers.config import options_of_bus, read_config
+from skinware_drivers.config import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from tests.commands import PATIENCE_S, running
 
@@ -131,10 +131,10 @@ def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
     for text in fenced(page, "toml"):
         if not {"project", "group"} & tomllib.loads(text).keys():
             file.write_text(re.sub(r"^cpus = .*", "", text, flags=re.MULTILINE))  # that this machine may not have
-            settings = read_config(file)
-            driver = load_driver(settings.driver or DEFAULT_DRIVER)
-            for bus in settings.bus:
-                options_of_bus(driver.Options, settings, bus.name)
+            read = ConfigFile(file)
+            driver = load_driver(read.settings.driver or DEFAULT_DRIVER)
+            for bus in read.settings.bus:
+                read.options_of_bus(driver.Options, bus.name)
 
 
 def commands_of(page: Path) -> list[list[str]]:

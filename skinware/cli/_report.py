@@ -24,6 +24,7 @@ from skinware.memory.ring import Frame
 from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
+from skinware.status import load_report
 
 FrameT = TypeVar("FrameT", bound=Frame)
 
@@ -177,6 +178,7 @@ def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, An
             "state": bus_state_name(int(frame.bus_state[bus])),
             "reason": bus_reason_name(int(frame.bus_reason[bus])),
             "state_age_s": round((time_ns - since_ns) / NS_PER_S, 3) if since_ns else None,
+            **load_report(int(frame.bus_load[bus])),
         }
         entries.append(_with_counters(own, counters))
     return entries

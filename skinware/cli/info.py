@@ -17,10 +17,9 @@ if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
 
 _WATCH_PERIOD_S = 1.0
-_OF_A_BUS = {"reason": "reason", "for": "state_age_s"}
-"""What is shown of a bus where it is told: the column's title and the key in the report."""
 _OF_A_PATCH = {"99 % apart": "interval", "99 % aged": "age"}
-"""Likewise: bounds of the time between two updates of a module, and of an update's age when it was published."""
+"""What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
+and of an update's age when it was published."""
 _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
@@ -82,7 +81,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
-    told = {title: key for title, key in _OF_A_BUS.items() if any(bus.get(key) is not None for bus in driver["buses"])}
+    told = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
     timed = _OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
     timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     lines = [
@@ -92,7 +91,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         *_counter_table(
             driver["buses"],
             ("bus", "state", *told),
-            lambda bus: (bus["name"], _state(driver, bus), *(_told_text(bus[key]) for key in told.values())),
+            lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in told.values())),
             {"frames", "lost"},
         ),
         "",
@@ -159,11 +158,26 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     return part["state"] if driver["state"] == "live" else f"was {part['state']}"
 
 
-def _told_text(value: str | float | None) -> str:
-    """A reason, or for how long it has been so."""
-    if value is None:
-        return NO_VALUE
-    return value.replace("_", "-") if isinstance(value, str) else age_text(value * 1e9)
+def _reason(bus: dict[str, Any]) -> str | None:
+    reason = bus.get("reason")
+    return reason and reason.replace("_", "-")
+
+
+def _duration(bus: dict[str, Any]) -> str | None:
+    """For how long its state has been so."""
+    age_s = bus.get("state_age_s")
+    return None if age_s is None else age_text(age_s * 1e9)
+
+
+def _load(bus: dict[str, Any]) -> str | None:
+    """How much of the bus' time is in use."""
+    if bus.get("load_unknown") == "filter":
+        return "unknown (filter)"
+    return None if bus.get("load") is None else f"{100 * bus['load']:.0f} %"
+
+
+_OF_A_BUS = {"reason": _reason, "for": _duration, "load": _load}
+"""What is shown of a bus where it is told, by the column's title."""
 
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:
@@ -183,7 +197,8 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
-_OWN_KEYS = {"name", "state", "reason", "state_age_s", "bus", "age_ms", "modules", "sensors", "fresh"}
+_OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown"}
+_OWN_KEYS |= {"bus", "age_ms", "modules", "sensors", "fresh"}
 _OWN_KEYS |= set(_OF_A_PATCH.values())
 
 

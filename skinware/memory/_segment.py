@@ -62,7 +62,8 @@ class Segment:
 
     def static_columns(self) -> dict[str, npt.NDArray[Any]]:
         """Views of the static columns, by name."""
-        return {c.name: self.view(c.offset, c.dtype, c.count) for c in self.layout.static}
+        tables = self.schema.tables
+        return {c.name: self.view(c.offset, tables.get(c.name, c.dtype), c.count) for c in self.layout.static}
 
     def view(self, offset: int, dtype: np.dtype[Any], count: int) -> npt.NDArray[Any]:
         """A typed view of a range of the file."""
@@ -131,7 +132,7 @@ def create(
         raise ConfigurationError(f"the table name {STATIC_NAME!r} is taken: give yours another name")
     if len(kind.encode()) > _layout.KIND_BYTES:
         raise ConfigurationError(f"kind {kind!r}: at most {_layout.KIND_BYTES} bytes")
-    static = {**static, **schema.for_file()}
+    static = {**static, **schema.for_file(static)}
     layout = _layout.plan(static, schema.for_layout(), slots)
     final = namespace.ring_path(name)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"

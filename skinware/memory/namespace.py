@@ -63,7 +63,7 @@ class Namespace:
             group: give the folder to this group, whose members may then read.
 
         Raises:
-            ConfigurationError: unknown group.
+            ConfigurationError: unknown group, or the folder is there and has another one.
             NamespaceError: the folder belongs to somebody else or cannot be made.
         """
         group_id = _group_id(group)
@@ -78,6 +78,12 @@ class Namespace:
             raise NamespaceError(
                 f"namespace {self.name!r} ({self.path}) belongs to {_user_name(owner)}: drivers must run as that"
                 " user, or in another namespace (SKINWARE_NAMESPACE)"
+            )
+        present = self.path.stat().st_gid
+        if group is not None and present != group_id:
+            raise ConfigurationError(
+                f"namespace {self.name!r} ({self.path}) is one of {_group_name(present)}, not of group {group}:"
+                " leave the group out, take another namespace, or stop what runs there and remove that folder"
             )
 
     def exists(self) -> bool:
@@ -183,6 +189,13 @@ def _group_id(group: str | None) -> int:
         return grp.getgrnam(group).gr_gid
     except KeyError:
         raise ConfigurationError(f"there is no group {group!r} on this machine (see: getent group)") from None
+
+
+def _group_name(group_id: int) -> str:
+    try:
+        return f"group {grp.getgrgid(group_id).gr_name}"
+    except KeyError:
+        return f"group {group_id}"
 
 
 def _user_id(user: str | int | None) -> int | None:

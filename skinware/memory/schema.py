@@ -1,9 +1,9 @@
 """What the columns of a service look like to its users: dtypes with fields, shapes, units; told by the service itself.
 
 The file's column table knows plain numbers and bytes only. What goes beyond it stands in a static column ``schema``,
-as JSON: ``{"description": TEXT, "columns": {NAME: {"dtype": D, "shape": [...], "unit": TEXT, "description": TEXT}}}``,
-with D a dtype code (``"<f8"``) or a list of ``[name, D]`` or ``[name, D, shape]`` for a structure, as numpy's ``.npy``
-format has it.
+as JSON: ``{"description": TEXT, "columns": {NAME: {"dtype": D, "shape": [...], "unit": TEXT, "description": TEXT}},
+"tables": {NAME: D}}``, the tables being static columns whose rows are structures, with D a dtype code (``"<f8"``) or a
+list of ``[name, D]`` or ``[name, D, shape]`` for a structure, as numpy's ``.npy`` format has it.
 """
 
 from __future__ import annotations
@@ -52,10 +52,12 @@ class Schema:
     Attributes:
         columns: by name.
         description: of the service, for people.
+        tables: dtypes of those static tables whose rows are structures, by name; only of a service that is read.
     """
 
     columns: Mapping[str, Column] = field(default_factory=dict)
     description: str = ""
+    tables: Mapping[str, np.dtype[Any]] = field(default_factory=dict)
 
     @staticmethod
     def of(columns: Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]], description: str) -> Schema:
@@ -79,9 +81,14 @@ class Schema:
         """(dtype, count) of every column, as the column table has it."""
         return {name: (_table_dtype(c.dtype), math.prod(c.shape)) for name, c in self.columns.items()}
 
-    def for_file(self) -> dict[str, npt.NDArray[Any]]:
-        """The static column that says what the column table cannot; none if it can say everything."""
-        if not self.description and all(
+    def for_file(self, static: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+        """The static column that says what the column table cannot; none if it can say everything.
+
+        Args:
+            static: the other static columns.
+        """
+        tables = {name: _descr(table.dtype) for name, table in static.items() if table.dtype.names is not None}
+        if not (self.description or tables) and all(
             c.dtype == _table_dtype(c.dtype) and len(c.shape) == 1 and not c.unit and not c.description
             for c in self.columns.values()
         ):
@@ -90,7 +97,7 @@ class Schema:
             name: {"dtype": _descr(c.dtype), "shape": c.shape, "unit": c.unit, "description": c.description}
             for name, c in self.columns.items()
         }
-        text = msgspec.json.encode({"description": self.description, "columns": columns})
+        text = msgspec.json.encode({"description": self.description, "columns": columns, "tables": tables})
         if len(text) > _MAX_BYTES:
             raise ConfigurationError(f"the schema takes {len(text)} bytes; at most {_MAX_BYTES}: shorten its texts")
         return {STATIC_NAME: np.frombuffer(text, np.uint8)}
@@ -106,6 +113,7 @@ class _ColumnText(msgspec.Struct):
 class _SchemaText(msgspec.Struct):
     columns: dict[str, _ColumnText]
     description: str = ""
+    tables: dict[str, Any] = {}
 
 
 def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
@@ -123,6 +131,7 @@ def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str)
             name: Column(np.lib.format.descr_to_dtype(_tuples(c.dtype)), c.shape, c.unit, c.description)
             for name, c in text.columns.items()
         }
+        tables = {name: np.lib.format.descr_to_dtype(_tuples(descr)) for name, descr in text.tables.items()}
     except Exception as error:  # noqa: BLE001, whatever numpy makes of nonsense
         raise BadServiceFile(f"{path}: its schema cannot be read ({error}); not attached") from None
     for name, column in told.items():
@@ -134,7 +143,11 @@ def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str)
             or column.dtype.itemsize * math.prod(column.shape) != plain.dtype.itemsize * math.prod(plain.shape)
         ):
             raise BadServiceFile(f"{path}: its schema contradicts its column table at {name!r}; not attached")
-    return Schema({**columns, **told}, text.description)
+    plain_tables = {c.name: c.dtype for c in layout.static}
+    for name, dtype in tables.items():
+        if name not in plain_tables or dtype.hasobject or dtype.itemsize != plain_tables[name].itemsize:
+            raise BadServiceFile(f"{path}: its schema contradicts its column table at {name!r}; not attached")
+    return Schema({**columns, **told}, text.description, tables)
 
 
 def _shape(given: int | tuple[int, ...]) -> tuple[int, ...]:

@@ -39,7 +39,7 @@ class ServiceWriter:
         kind: says what the columns mean (``data``, ``driver``).
         slots: frames that the ring holds, 2 to 64.
         rate_hz: nominal rate, told to readers; None for no fixed rate.
-        group: group whose members may read, if the namespace is made now.
+        group: group whose members may read; a namespace that is there already must have it.
         description: of the service, for people.
         operations: what programs may ask for beside a frame: name to function, called in the writer's own loop
             (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.

@@ -14,7 +14,7 @@ _RTM_NEWLINK, _RTM_GETLINK = 16, 18
 _NLM_F_REQUEST = 1
 _IFLA_IFNAME, _IFLA_LINKINFO = 3, 18
 _IFLA_INFO_DATA = 2
-_IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS = 1, 4, 6
+_IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS, _IFLA_CAN_DATA_BITTIMING = 1, 4, 6, 9
 _HEADER, _INTERFACE = struct.Struct("=IHHII"), struct.Struct("=BxHiII")
 _ANSWER_BYTES = 1 << 16
 
@@ -27,11 +27,13 @@ class Controller:
         bit_rate: of the arbitration phase, bit/s; 0 where not set.
         state: 0 error-active, 1 error-warning, 2 error-passive, 3 bus-off, 4 stopped, 5 sleeping; None: not told.
         restart_ms: pause before it comes back from bus-off by itself; 0: it does not.
+        data_bit_rate: of the data phase of CAN FD, bit/s; 0 where not set.
     """
 
     bit_rate: int = 0
     state: int | None = None
     restart_ms: int = 0
+    data_bit_rate: int = 0
 
 
 def read_controller(interface: str) -> Controller | None:
@@ -61,6 +63,7 @@ def parse_answer(answer: bytes) -> Controller | None:
         _number(told.get(_IFLA_CAN_BITTIMING)) or 0,
         _number(told.get(_IFLA_CAN_STATE)),
         _number(told.get(_IFLA_CAN_RESTART_MS)) or 0,
+        _number(told.get(_IFLA_CAN_DATA_BITTIMING)) or 0,
     )
 
 

@@ -19,20 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from skinware.sensor_types import (
-    ACCELERATION_X,
-    ACCELERATION_Y,
-    ACCELERATION_Z,
-    ANGULAR_RATE_X,
-    ANGULAR_RATE_Y,
-    ANGULAR_RATE_Z,
-    MAGNETIC_FIELD_X,
-    MAGNETIC_FIELD_Y,
-    MAGNETIC_FIELD_Z,
-    PRESSURE,
-    TEMPERATURE,
-    SensorType,
-)
+from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.can.roboskin_options import CHANNELS, Inertial, InertialSensor, RoboskinOptions
 from skinware_drivers.description import Module, Patch, Sensor
@@ -52,16 +39,13 @@ _IDENTIFIER = Bits(shift=0, width=11)
 _IMU_SENSOR = Bits(shift=0, width=8, byte=1)
 _IMU_CODES = {"imu_accelerometer": 0, "imu_magnetometer": 1, "imu_gyroscope": 2}
 
-_ACCELERATION = (ACCELERATION_X, ACCELERATION_Y, ACCELERATION_Z)
-_ANGULAR_RATE = (ANGULAR_RATE_X, ANGULAR_RATE_Y, ANGULAR_RATE_Z)
-_MAGNETIC_FIELD = (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)
 _KINDS: dict[InertialSensor, tuple[str, tuple[SensorType, SensorType, SensorType]]] = {
-    "accelerometer": ("accelerometer", _ACCELERATION),
-    "external_accelerometer": ("accelerometer", _ACCELERATION),
-    "imu_accelerometer": ("accelerometer", _ACCELERATION),
-    "gyroscope": ("gyroscope", _ANGULAR_RATE),
-    "imu_gyroscope": ("gyroscope", _ANGULAR_RATE),
-    "imu_magnetometer": ("magnetometer", _MAGNETIC_FIELD),
+    "accelerometer": ("accelerometer", ACCELERATION),
+    "external_accelerometer": ("accelerometer", ACCELERATION),
+    "imu_accelerometer": ("accelerometer", ACCELERATION),
+    "gyroscope": ("gyroscope", ANGULAR_RATE),
+    "imu_gyroscope": ("gyroscope", ANGULAR_RATE),
+    "imu_magnetometer": ("magnetometer", MAGNETIC_FIELD),
 }
 _G = 9.80665
 _SCALES = {

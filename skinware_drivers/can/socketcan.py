@@ -23,11 +23,12 @@ import numpy.typing as npt
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.recvmmsg import Rows, rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
+from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.options import options_from_strings
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
@@ -41,7 +42,6 @@ _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
 _MEMINFO_USED, _MEMINFO_SIZE, _MEMINFO_DROPS = 0, 1, 8
-_FRAME_BITS, _MORE_OF_EXTENDED = 47, 20  # of a frame without payload and stuff bits, with the pause after it
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 MOST_FILTERS = 512
@@ -99,6 +99,7 @@ class SocketCanBus(Bus):
         self._health = ControllerHealth()
         self._is_bound = False
         self._restarts_itself = True
+        self._speed_up = 1.0
 
     def open(self) -> None:
         """Open and bind the socket.
@@ -113,7 +114,9 @@ class SocketCanBus(Bus):
                 raise BusNotAvailable(
                     "this kernel has no CAN: load it (modprobe can-raw), or use a bus that needs none (--bus virtual)"
                 ) from None
-            raise BusNotAvailable(f"bus {self.channel}: cannot open a CAN socket ({error.strerror})") from None
+            raise BusNotAvailable(
+                f"bus {self.channel}: cannot open a CAN socket ({error.strerror})", reason=BusReason.REFUSED
+            ) from None
         try:
             # also where the layout has none: that there are FD frames on the bus explains why no others are heard
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
@@ -217,7 +220,7 @@ class SocketCanBus(Bus):
         self.counters.frames += kept
         self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         if self.bit_rate:
-            self.wire_bits += _wire_bits(batch.wire[first : first + kept])
+            self.wire_bits += wire_bits(batch.wire[first : first + kept], self._speed_up)
         self._read_memory()
         return kept
 
@@ -256,8 +259,9 @@ class SocketCanBus(Bus):
         if controller is None:
             return
         self._restarts_itself = controller.restart_ms > 0
-        # of FD frames a part is faster, and of filtered ones nothing is known: then there is no telling the load
-        self.bit_rate: int = 0 if self.payload_size > 8 or self.narrows else controller.bit_rate
+        self.bit_rate = 0 if self.narrows else controller.bit_rate  # of filtered frames nothing is known
+        if controller.bit_rate and controller.data_bit_rate:
+            self._speed_up = controller.data_bit_rate / controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
 
@@ -307,13 +311,6 @@ class SocketCanBus(Bus):
             words = array.array("I", data)
             self.counters.lost = self._lost_before + words[_MEMINFO_DROPS]
             self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
-
-
-def _wire_bits(wire: npt.NDArray[np.void]) -> int:
-    """About how many bits classic frames take on the wire, one stuff bit in ten bits included."""
-    extended = np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG))
-    bits = _FRAME_BITS * len(wire) + _MORE_OF_EXTENDED * extended + 8 * int(wire["length"].sum(dtype=np.int64))
-    return int(bits * 11) // 10
 
 
 def _set_filters(sock: socket.socket, filters: Sequence[Filter]) -> None:

@@ -188,11 +188,11 @@ def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
     """Name and object of the driver for a bus that has none running."""
-    from skinware_drivers.config import DriverConfig, options_of_bus, read_config
+    from skinware_drivers.config import ConfigFile
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
-    settings = read_config(config) if config else DriverConfig()
-    driver_type = driver_name or settings.driver or DEFAULT_DRIVER
+    file = ConfigFile(config)
+    driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
     given = {}
     for text in options:
@@ -200,7 +200,7 @@ def _adapter(
         if not equals:
             raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
         given[key] = value
-    return driver_type, driver(options_of_bus(driver.Options, settings, bus_name, given))
+    return driver_type, driver(file.options_of_bus(driver.Options, bus_name, given))
 
 
 def _ask_back(what: str, description: str, yes: bool) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
-    from skinware_drivers.config import DriverConfig
+    from skinware_drivers.config import ConfigFile, DriverConfig
     from skinware_drivers.runner import PublishMode, Runner
 
 
@@ -44,7 +44,7 @@ class DriverCommand(click.Command):
         config = _value_of("--config", args)
         name = _value_of("--driver", args)
         if not name and config:
-            name = _read(config).driver
+            name = _read(Path(config)).settings.driver
         own = {parameter.name for parameter in self.params}
         for option in describe_options(load_driver(name or DEFAULT_DRIVER).Options):
             if option.name not in own:
@@ -88,13 +88,14 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of all this.")
 @click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
+@click.option("--wait", is_flag=True, help="Wait for a bus that is not there yet, also if there is no other.")
 @click.option(
     "--publish",
     type=click.Choice(["cycle", "rate", "request"]),
     help="When every patch has delivered, at the driver's rate, or what programs ask for.  [default: as the driver]",
 )
 @click.option("--slots", type=int, default=8, show_default=True, help="Frames that slow users may lag behind, 2-64.")
-@click.option("--group", metavar="GROUP", help="Group whose members may read, if the namespace is new.")
+@click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
 @click.option(
@@ -114,6 +115,7 @@ def command(
     name: str | None,
     config: Path | None,
     listen_only: bool,
+    wait: bool,
     publish: PublishMode | None,
     slots: int,
     group: str | None,
@@ -126,18 +128,23 @@ def command(
 ) -> None:
     """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
+    With several buses it starts with those that are there, and the others join when they appear.
+
     SIGHUP makes a listener take in what it has heard since it started, and reads the buses of the --config file
-    again: those that were added or taken out come or go, the others go on.
+    again: those that were added or taken out come or go, those whose options were changed are opened anew, the others
+    go on.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.config import DriverConfig, options_of_bus
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
     from skinware_drivers.runner import Runner
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="skin-driver: %(message)s", stream=sys.stderr
     )
-    settings = _read(str(config)) if config else DriverConfig()
+    file = _read(config)
+    settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
     driver_type = driver_name or settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
@@ -149,23 +156,31 @@ def command(
     _check_own_options(buses, settings)
     given = {key: text for key, text in driver_options.items() if text is not None}
 
-    def line_of(bus_name: str, settings: DriverConfig) -> tuple[str, AnyAdapter, Bus]:
-        adapter = driver(options_of_bus(driver.Options, settings, bus_name, given))
-        adapter.check()
-        bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
-        return bus_name, adapter, bus
+    def adapter_of(bus_name: str, file: ConfigFile) -> AnyAdapter:
+        options = file.options_of_bus(driver.Options, bus_name, given)
+        with file.blamed_for(bus_name):
+            adapter = driver(options)
+            adapter.check()
+        return adapter
+
+    def bus_of(bus_name: str, adapter: AnyAdapter, file: ConfigFile) -> Bus:
+        with file.blamed_for(bus_name):
+            return make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
 
     async def read_buses_again() -> None:
         if config is not None and not buses:  # what the command line names is not the file's to change
-            new = _read(str(config))
-            _refuse_twice([bus.name for bus in new.bus])
-            await _go_over_to(runner, [bus.name for bus in new.bus], lambda name: line_of(name, new))
+            new = _read(config)
+            _refuse_twice([bus.name for bus in new.settings.bus])
+            wanted = {bus.name: adapter_of(bus.name, new) for bus in new.settings.bus}
+            await runner.buses.change_to(wanted, lambda name, adapter: bus_of(name, adapter, new))
 
+    adapters = [adapter_of(bus_name, file) for bus_name in bus_names]
     runner = Runner(
         driver_type,
-        [line_of(bus_name, settings) for bus_name in bus_names],
+        [(name, adapter, bus_of(name, adapter, file)) for name, adapter in zip(bus_names, adapters, strict=True)],
         name=name or settings.name or driver_type,
         listen_only=listen_only,
+        wait_for_buses=wait or settings.wait,
         publish=publish or settings.publish or None,
         namespace=Namespace(namespace),
         slots=slots,
@@ -175,19 +190,6 @@ def command(
     if profile is not None:
         profile.apply()
     asyncio.run(_run(runner, as_json, read_buses_again))
-
-
-async def _go_over_to(
-    runner: Runner, names: Sequence[str], line_of: Callable[[str], tuple[str, AnyAdapter, Bus]]
-) -> None:
-    """Add and remove buses until the driver has these."""
-    present = runner.bus_names
-    for name in names:
-        if name not in present:
-            await runner.add_bus(*line_of(name))
-    for name in present:
-        if name not in names:
-            await runner.remove_bus(name)
 
 
 async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -284,10 +286,10 @@ def _refuse_twice(bus_names: Sequence[str]) -> None:
         seen.append(bus)
 
 
-def _read(path: str) -> DriverConfig:
-    from skinware_drivers.config import read_config
+def _read(path: Path | None) -> ConfigFile:
+    from skinware_drivers.config import ConfigFile
 
-    return read_config(Path(path))
+    return ConfigFile(path)
 
 
 def _value_of(flag: str, args: list[str]) -> str | None:

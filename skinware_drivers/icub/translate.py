@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,8 @@ from skinware_drivers.icub.body import Body, Place, places_text
 from skinware_drivers.icub.notes import Notes
 from skinware_drivers.icub.part import ETHERNET, Part
 
+_OF_A_BOARD = ("period_ms", "skin_type", "no_load")
+_OF_A_BUS = (*_OF_A_BOARD, "shift", "cdc_offset")
 _TICK_MS = 0.0032
 _OWN_TIMER, _COMPENSATED, _NOT_COMPENSATED_TYPE, _AREA_SHIFTS = 3, 0x08, 2, 0x22
 _USUAL_OLD_PERIOD_MS = 50
@@ -108,11 +110,7 @@ def service_name(name: str, taken: set[str]) -> str:
 
 
 def _options(part: Part, patch: int) -> RoboskinOptions:
-    special = [
-        SpecialBoards(s.boards, period_ms=s.period_ms, skin_type=s.skin_type, no_load=s.no_load)
-        for s in part.board_sets
-        if s.patch == patch
-    ]
+    special = [SpecialBoards(s.boards, **_taken(s, _OF_A_BOARD)) for s in part.board_sets if s.patch == patch]
     modules = [
         Kind(s.board, s.triangles, enabled=s.enabled, shift=s.shift, cdc_offset=s.cdc_offset)
         for s in part.triangle_sets
@@ -120,11 +118,7 @@ def _options(part: Part, patch: int) -> RoboskinOptions:
     ]
     return RoboskinOptions(
         boards=part.boards[patch],
-        period_ms=part.period_ms,
-        skin_type=part.skin_type,
-        no_load=part.no_load,
-        shift=part.shift,
-        cdc_offset=part.cdc_offset,
+        **_taken(part, _OF_A_BUS),
         enabled=part.enabled,
         special_boards=tuple(special),
         modules=tuple(modules),
@@ -141,22 +135,23 @@ def _old_options(part: Part, patch: int, notes: Notes) -> RoboskinOptions:
             text = f"board {board} has another 4E_Shift or 4C_CDCOffset; those of board {boards[0]} are taken for all"
             _note(notes, "odd", part, text)
     special = tuple(
-        SpecialBoards((board,), period_ms=s.period_ms, skin_type=s.skin_type, no_load=s.no_load)
-        for board, s in each.items()
-        if (s.period_ms, s.skin_type, s.no_load) != (first.period_ms, first.skin_type, first.no_load)
+        SpecialBoards((board,), **_taken(settings, _OF_A_BOARD))
+        for board, settings in each.items()
+        if _taken(settings, _OF_A_BOARD) != _taken(first, _OF_A_BOARD)
     )
     modules = tuple(Kind(board, s.off, enabled=False) for board, s in each.items() if s.off)
     return RoboskinOptions(
         boards=boards,
-        period_ms=first.period_ms,
-        skin_type=first.skin_type,
-        no_load=first.no_load,
-        shift=first.shift,
-        cdc_offset=first.cdc_offset,
+        **_taken(first, _OF_A_BUS),
         old_style=True,
         special_boards=special,
         modules=modules,
     )
+
+
+def _taken(source: object, names: Sequence[str]) -> dict[str, Any]:
+    """Options that have the same names in ``source``."""
+    return {name: getattr(source, name) for name in names}
 
 
 class _OldSettings:

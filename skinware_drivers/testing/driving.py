@@ -20,7 +20,7 @@ from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
-_LONGEST_S = 30.0
+_LONGEST_S = 60.0
 
 
 class Driving:
@@ -38,14 +38,18 @@ class Driving:
         name: str,
         listen_only: bool,
         publish: PublishMode | None = None,
+        wait_for_buses: bool = False,
+        bus_names: Sequence[str] = (),
     ) -> None:
         self.ready: threading.Event = threading.Event()
         self.failure: BaseException | None = None
         self.runner: Runner | None = None
-        self._lines = [(f"bus{i}", adapter, bus) for i, (adapter, bus) in enumerate(lines)]
+        names = bus_names or [f"bus{i}" for i in range(len(lines))]
+        self._lines = [(name, adapter, bus) for name, (adapter, bus) in zip(names, lines, strict=True)]
         self._name = name
         self._listen_only = listen_only
         self._publish = publish
+        self._wait_for_buses = wait_for_buses
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)  # one that hangs must not hang pytest
 
@@ -58,6 +62,7 @@ class Driving:
                 name=self._name,
                 listen_only=self._listen_only,
                 publish=self._publish,
+                wait_for_buses=self._wait_for_buses,
                 slots=64,
                 on_ready=self.ready.set,
             )
@@ -114,6 +119,8 @@ def driving_lines(
     listen_only: bool = False,
     wait: bool = True,
     publish: PublishMode | None = None,
+    wait_for_buses: bool = False,
+    bus_names: Sequence[str] = (),
 ) -> Iterator[Driving]:
     """A driver on any buses, as long as the ``with`` lasts.
 
@@ -123,8 +130,10 @@ def driving_lines(
         listen_only: send nothing.
         wait: until it publishes.
         publish: see :class:`skinware_drivers.runner.Runner`.
+        wait_for_buses: likewise.
+        bus_names: of each bus; default: bus0, bus1 ...
     """
-    running = Driving(lines, name, listen_only, publish)
+    running = Driving(lines, name, listen_only, publish, wait_for_buses, bus_names)
     running.start()
     try:
         if wait:

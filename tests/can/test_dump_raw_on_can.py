@@ -15,8 +15,8 @@ from skinware.cli._command import exit_status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.dump import command
+from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
-from tests.conftest import wait_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 

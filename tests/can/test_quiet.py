@@ -8,10 +8,10 @@ import pytest
 
 from skinware import BusState, DriverReader, PatchState
 from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 from tests.can.rig import TIP_IDENTIFIER, can_frame, sender, skin
 from tests.commands import running
-from tests.conftest import wait_until
 from tests.sdk.driving import read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]

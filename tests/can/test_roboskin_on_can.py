@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from skinware import BusState, DriverReader, PatchState, Status
+from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 from tests.commands import run, running
-from tests.conftest import wait_until
 from tests.sdk.driving import read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(400)]

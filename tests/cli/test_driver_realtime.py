@@ -122,5 +122,6 @@ def test_wrong_text_in_a_file_names_the_file(tmp_path: Path, text: str, words: s
     result = run("skin-driver", "--config", str(path))
     assert result.returncode == 2
     assert len(result.stderr.splitlines()) == 1
-    assert result.stderr.startswith(f"skin-driver: {path}: ")
+    line = path.read_text().splitlines().index(text) + 1
+    assert result.stderr.startswith(f"skin-driver: {path}:{line}: ")
     assert words in result.stderr

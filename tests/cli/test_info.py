@@ -18,10 +18,11 @@ from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
 from skinware.realtime import now_ns
 from skinware.service import Columns
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
-UNTOLD = {"reason": None, "state_age_s": None}
+UNTOLD = {"reason": None, "state_age_s": None, "load": None, "load_unknown": "bit_rate"}
 """What a driver need not tell of a bus."""
 
 
@@ -102,6 +103,20 @@ def test_why_a_bus_is_as_it_is_and_for_how_long(capsys: pytest.CaptureFixture[st
     assert re.search(r"^  bus   state  reason +for  frames", out, re.MULTILINE)
     assert re.search(r"^  can0  down   bus-off  1\d\.\d s ", out, re.MULTILINE)
     assert re.search(r"^  can1  live   99 +-  ", out, re.MULTILINE)
+
+
+def test_how_much_of_a_bus_is_in_use_or_why_that_is_not_known(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(3, 4, buses=3)) as skin:
+        skin.bus_load[:] = 873, LOAD_FILTERED, LOAD_UNKNOWN
+        skin.publish()
+        buses = told(capsys)["drivers"][0]["buses"]
+        out = text(capsys)
+    assert [bus["load"] for bus in buses] == [0.873, None, None]
+    assert [bus["load_unknown"] for bus in buses] == [None, "filter", "bit_rate"]
+    assert re.search(r"^  bus   state +load +frames", out, re.MULTILINE)
+    assert re.search(r"^  can0  live +87 % ", out, re.MULTILINE)
+    assert re.search(r"^  can1  live +unknown \(filter\) ", out, re.MULTILINE)
+    assert re.search(r"^  can2  live +-  ", out, re.MULTILINE)
 
 
 def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,7 @@ from skinware.memory import _layout
 from skinware.memory._locks import _FLOCK
 from skinware.memory.announcement import _SIZE, living_readers, sweep
 from skinware.service._server import short_path
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.users import (
     ANSWERS,
     FRAMES,

@@ -29,8 +29,8 @@ from skinware.errors import BadServiceFile
 from skinware.memory import _layout
 from skinware.memory.namespace import ROOT
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
+from skinware_drivers.testing.waiting import wait_until
 from tests.compiling import LANGUAGES, compiled
-from tests.conftest import wait_until
 
 SPAWN = multiprocessing.get_context("spawn")
 SOURCE = Path(__file__).with_name("c_reader.c")

@@ -16,7 +16,7 @@ import pytest
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import RequestError
 from skinware.memory.announcement import living_readers
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.workers import PATIENCE_S, Board, Bomb, Crew, seeded
 
 KILLS = int(os.environ.get("SKINWARE_TEST_KILLS") or 500)

@@ -15,7 +15,7 @@ from skinware import Frame, ServiceReader, ServiceWriter
 from skinware.errors import Overrun
 from skinware.memory.ring import COPY_ATTEMPTS
 from skinware.service import Columns
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.workers import PATIENCE_S, Board, Crew
 
 COLUMNS: Columns = {"values": ("<u8", 509), "small": ("<u2", (7, 11)), "one": ("u1", 1)}

@@ -11,7 +11,7 @@ import pytest
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.memory import _futex
 from skinware.memory.announcement import living_readers
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 COLUMNS = {"values": ("<u2", 8), "times": ("<i8", 3)}
 

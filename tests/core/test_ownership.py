@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import grp
 import os
 import shutil
 import signal
@@ -11,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.errors import Closed, NameInUse, PeerGone, ServiceTimeout
+from skinware.errors import Closed, ConfigurationError, NameInUse, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
 from tests.core.workers import PATIENCE_S, Board, Bomb, Crew
 
@@ -145,3 +146,16 @@ def test_a_forked_child_changes_nothing(namespace: Namespace) -> None:
         assert len(list(living_readers(namespace))) == 1
         writer.commit(2)
         assert reader.read().sequence == 2
+
+
+def test_a_namespace_that_is_there_is_not_given_to_another_group(namespace: Namespace) -> None:
+    namespace.create()
+    own = namespace.path.stat().st_gid
+    known = {group.gr_gid: group.gr_name for group in grp.getgrall()}
+    another = next(name for group, name in known.items() if group != own)
+    with pytest.raises(ConfigurationError, match=f"is one of .*, not of group {another}: "):
+        namespace.create(another)
+    with pytest.raises(ConfigurationError, match="not of group"):
+        ServiceWriter("x", {"values": ("u1", 1)}, group=another)
+    namespace.create(known[own])
+    assert namespace.services() == []

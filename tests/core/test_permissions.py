@@ -17,7 +17,7 @@ from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import SkinwareError
 from skinware.memory._locks import _FLOCK
 from skinware.memory.announcement import living_readers
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.users import (
     COLUMNS,
     FRAMES,

@@ -26,7 +26,7 @@ from skinware.errors import (
 )
 from skinware.realtime import now_ns
 from skinware.service._server import RequestServer, short_path
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 SMALL = {"values": ("<i8", 4)}
 _context = multiprocessing.get_context("spawn")

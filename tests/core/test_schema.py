@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.memory.schema import STATIC_NAME, Schema
+from skinware.memory._layout import plan
+from skinware.memory.schema import STATIC_NAME, Schema, from_file
 from skinware.service import Columns
 
 POSE = np.dtype([("position", "<f8", (3,)), ("quaternion", "<f4", (4,)), ("valid", "u1")])
@@ -56,6 +58,29 @@ def test_a_plain_service_describes_itself_too() -> None:
     with ServiceWriter("x", {"values": ("<u2", 7)}), ServiceReader[Frame]("x") as reader:
         assert STATIC_NAME not in reader.static()
         assert reader.schema == Schema({"values": Column(np.dtype("<u2"), (7,))})
+
+
+def test_tables_of_structures_keep_their_dtype() -> None:
+    poses = np.zeros(3, POSE)
+    poses["valid"] = 1, 0, 1
+    numbers = np.arange(5, dtype="<i4")
+    with ServiceWriter("x", {"values": ("<u2", 7)}, static={"poses": poses, "numbers": numbers}) as writer:
+        with ServiceReader[Frame]("x") as reader:
+            assert reader.static()["poses"].dtype == POSE
+            assert reader.static()["poses"]["valid"].tolist() == [1, 0, 1]
+            assert reader.static()["numbers"].tolist() == [0, 1, 2, 3, 4]
+            assert reader.schema.tables == {"poses": POSE}
+            writer.restructure({"values": ("<u2", 7)}, static={"poses": poses[:1]})
+            reader.reattach()
+            assert (reader.static()["poses"] == poses[:1]).all()
+
+
+@pytest.mark.parametrize("descr", ["<u8", [["a", "<u2"]], "O", "nonsense", [["a", "|O", [2]]]])
+def test_a_schema_that_contradicts_a_table_is_refused(descr: object) -> None:
+    layout = plan({"poses": np.zeros(2, POSE), "schema": np.zeros(4, np.uint8)}, {})
+    text = msgspec.json.encode({"columns": {}, "tables": {"poses": descr}})
+    with pytest.raises(BadServiceFile, match="schema"):
+        from_file(layout, {STATIC_NAME: np.frombuffer(text, np.uint8)}, "x.ring")
 
 
 plain = st.one_of(
@@ -108,7 +133,7 @@ def test_what_cannot_be_shared_is_refused(column: object, words: str) -> None:
 def test_a_schema_that_contradicts_the_file_is_refused(namespace: Namespace) -> None:
     with ServiceWriter("x", {"a": Column(POSE, (2, 3), description="room for what is written over it")}):
         data = namespace.ring_path("x").read_bytes()
-    at, end = data.index(b'{"description"'), data.index(b"}}}") + 3
+    at, end = data.index(b'{"description"'), data.index(b'"tables":{}}') + len('"tables":{}}')
     text = json.loads(data[at:end])
     column = text["columns"]["a"]
     column["description"] = ""

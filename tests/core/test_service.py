@@ -25,7 +25,7 @@ from skinware.memory.announcement import living_readers
 from skinware.memory.ring import RingReader, RingWriter
 from skinware.memory.schema import Schema
 from skinware.realtime import now_ns
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 SPAWN = multiprocessing.get_context("spawn")
 Columns = dict[str, tuple[str, int]]

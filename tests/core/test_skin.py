@@ -12,8 +12,8 @@ from skinware import DriverWriter, Skin, Snapshot, Structure
 from skinware.errors import Closed, ServiceNotFound, ServiceTimeout, StructureError
 from skinware.realtime import now_ns
 from skinware.threads import SkinReplica
+from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, kill
-from tests.conftest import wait_until
 
 
 class Told:
@@ -35,6 +35,27 @@ def publish(writer: DriverWriter, value: int) -> None:
     columns["values"][:] = value
     columns["status"][:] = 0
     writer.commit(now_ns())
+
+
+def test_a_callback_that_raises_costs_no_other(caplog: pytest.LogCaptureFixture) -> None:
+    told: list[str] = []
+
+    def tell(name: str, _structure: Structure) -> None:
+        told.append(name)
+        raise RuntimeError(f"no window for {name}")
+
+    skin = Skin(on_attach=tell, on_detach=tell)
+    with skin, DriverWriter("a", fake_structure(1, 2)) as a, DriverWriter("b", fake_structure(1, 2)) as b:
+        publish(a, 1)
+        publish(b, 2)
+        wait_until(lambda: skin.layout.drivers == ("a", "b"))
+        assert skin.read().values("pressure").tolist() == [1] * 20 + [2] * 20
+        b.close()
+        wait_until(lambda: skin.layout.drivers == ("a",))
+    assert told == ["a", "b", "b"]
+    assert caplog.text.count("failed; the skin goes on") == 3
+    assert "no window for b" in caplog.text
+    caplog.clear()  # what was logged holds the structure, and so the shared memory
 
 
 def test_drivers_come_change_and_go() -> None:

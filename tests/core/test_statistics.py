@@ -12,7 +12,7 @@ from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.memory.announcement import living_readers
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
 from skinware.realtime import now_ns
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 SMALL = {"values": ("<i8", 4)}
 MS = 1_000_000

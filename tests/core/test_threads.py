@@ -13,7 +13,7 @@ from skinware.errors import NameInUse, Paused
 from skinware.memory.announcement import living_readers
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 SMALL = {"values": ("<i8", 4)}
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from skinware import ServiceWriter
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.core.workers import PATIENCE_S, Board, Crew
 
 OWNER, MEMBER, STRANGER = 61001, 61002, 61003

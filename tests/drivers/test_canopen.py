@@ -21,10 +21,10 @@ from skinware_drivers.can.pdo_map import Entry, PdoMap, Tpdo, default_tpdos
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.registry import make_bus
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
 from skinware_drivers.virtual.events import CommandReceived, ErrorReported
-from tests.conftest import wait_until
 from tests.drivers.bench import Bench, Case, play
 from tests.sdk.driving import Driving, driving_lines, read_until
 

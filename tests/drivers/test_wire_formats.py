@@ -16,9 +16,9 @@ from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver, CyskinCpmOptions
 from skinware_drivers.can.xela import XelaDriver, XelaOptions
 from skinware_drivers.decoder import Decoder
 from skinware_drivers.description import assemble
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from tests.conftest import wait_until
 from tests.sdk.driving import driving_lines
 
 

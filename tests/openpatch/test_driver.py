@@ -18,7 +18,7 @@ import pytest
 from skinware import DriverFrame, DriverReader, PatchState, Skin, Status
 from skinware.errors import RequestFailed
 from skinware.realtime import now_ns
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.openpatch.microcontroller import HERE, WATCHDOG, Microcontroller, program
 from tests.sdk.driving import Driving, driving_lines, read_until
 

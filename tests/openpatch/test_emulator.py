@@ -19,8 +19,8 @@ from skinware_drivers.cli.emulate import emulate
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
-from tests.conftest import wait_until
 from tests.openpatch import wire
 from tests.sdk.driving import driving_lines, read_until
 

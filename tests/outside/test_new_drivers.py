@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.outside.stranger import ROOT, Stranger
 
 pytestmark = pytest.mark.timeout(400)

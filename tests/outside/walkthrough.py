@@ -26,7 +26,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 PATIENCE_S = 300.0
 _CLOSE = "<!-- close terminals -->"

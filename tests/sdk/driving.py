@@ -9,7 +9,9 @@ from typing import Any
 
 import msgspec
 
-from skinware.errors import BusNotAvailable, BusSendError
+from skinware.driver_service import DriverReader
+from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
+from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
@@ -117,6 +119,7 @@ class TroubledBus(VirtualCanBus):
     Attributes:
         before_send: called before every send; may raise, or change the bus.
         down: the interface is down: it cannot be opened, and nothing can be sent.
+        refused: this user may not open it.
         opened_at_s: when somebody tried to open it, CLOCK_MONOTONIC s.
     """
 
@@ -124,10 +127,13 @@ class TroubledBus(VirtualCanBus):
         super().__init__(*arguments, **more)
         self.before_send: Callable[[int, bytes], object] = lambda _identifier, _payload: None
         self.down = False
+        self.refused = False
         self.opened_at_s: list[float] = []
 
     def open(self) -> None:
         self.opened_at_s.append(time.monotonic())
+        if self.refused:
+            raise BusNotAvailable("not permitted", reason=BusReason.REFUSED)
         if self.down:
             raise BusNotAvailable("the bus is down", is_down=True)
         super().open()
@@ -147,6 +153,15 @@ def troubled(log: list[msgspec.Struct] | None = None, **options: Any) -> Trouble
     return TroubledBus.with_hardware(EmulatedRoboskin(EmulatorOptions(**options), log=log))
 
 
+def follow(reader: DriverReader, condition: Callable[[Any], bool]) -> Any:
+    """The first frame that fulfils a condition, over as many generations as it takes."""
+    while True:
+        try:
+            return read_until(reader, condition)
+        except StructureChanged:
+            reader.reattach()
+
+
 @contextmanager
 def driving(
     *buses: VirtualCanBus,
@@ -154,10 +169,13 @@ def driving(
     wait: bool = True,
     driver: type[RoboskinDriver] = RoboskinDriver,
     publish: PublishMode | None = None,
+    wait_for_buses: bool = False,
     **options: Any,
 ) -> Iterator[Driving]:
     lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
-    with driving_lines(lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish) as running:
+    with driving_lines(
+        lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
+    ) as running:
         yield running
 
 
@@ -171,6 +189,7 @@ __all__ = [
     "driving",
     "driving_lines",
     "emulated",
+    "follow",
     "hardware_of",
     "read_until",
     "troubled",

@@ -23,7 +23,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.cli.driver import command
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 IFF_UP = 1
 CAN_RAW = 101

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from skinware import BusState, DriverReader, Namespace, PatchState, Status
-from skinware.errors import BusNotAvailable, BusSendError
+from skinware.errors import BusSendError
 from skinware_drivers import bus_line
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")
@@ -108,23 +108,6 @@ def test_a_bus_that_goes_down_while_boards_are_set_up(caplog: pytest.LogCaptureF
             read_until(reader, lambda f: not f.status.any())
     assert sent(log)[-4:] == [*SET_UP, (0x207, "0701")]  # from the beginning
     assert "trying again" in caplog.text
-
-
-def test_a_bus_that_is_down_at_the_start_is_an_error() -> None:
-    bus = troubled(boards=(7,))
-    bus.down = True
-    with pytest.raises(BusNotAvailable, match="the bus is down"), driving(bus):
-        pass
-    assert len(bus.opened_at_s) == 1
-
-
-def test_a_bus_that_is_not_there_at_the_start_leaves_the_others_closed(namespace: Namespace) -> None:
-    first, second = emulated(boards=(7,)), troubled(boards=(7,))
-    second.down = True
-    with pytest.raises(BusNotAvailable), driving(first, second):
-        pass
-    assert first.fileno() == -1
-    assert namespace.services() == []
 
 
 # Frames that cannot be sent

@@ -136,6 +136,9 @@ def test_a_controller_is_read_from_the_kernels_message() -> None:
     whole = link_message(attribute(1, timing), attribute(4, state), attribute(6, restart))
     assert parse_answer(whole) == Controller(500_000, 3, 100)
     assert parse_answer(link_message(attribute(4, state))) == Controller(0, 3, 0)
+    data_timing = struct.pack("=8I", 5_000_000, 750, 25, 1, 1, 1, 1, 1)
+    of_fd = link_message(attribute(1, timing), attribute(4, state), attribute(9, data_timing))
+    assert parse_answer(of_fd) == Controller(500_000, 3, 0, 5_000_000)
     assert parse_answer(link_message()) is None  # a vcan
     assert parse_answer(link_message(attribute(4, state), kind=2)) is None  # an error
     assert parse_answer(b"") is None

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skinware.status import load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
-from skinware_drivers.can.socketcan import _wire_bits
+from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
 from tests.sdk.driving import emulated
 from tests.sdk.test_bus_states import Clock
@@ -50,7 +51,8 @@ def test_each_limit_is_told_once(watched: tuple[Bus, BusLimits, Clock], caplog: 
             limits.look()
             limits.look()  # within the same second: nothing new
     load, fill, lost = warnings(caplog)
-    assert load.startswith("bus can0: about 91% of 1000000 bit/s are in use")
+    assert load.startswith("bus can0: about 91% of its time is in use")
+    assert load_report(limits.permille) == {"load": 0.91, "load_unknown": None}
     assert fill.startswith("bus can0: the receive buffer was 70% full")
     assert lost.startswith("bus can0: 3 frames were lost")
     assert bus.fullest == 0.0
@@ -65,7 +67,16 @@ def test_where_the_bit_rate_is_not_known_no_load_is_made_up(
     clock.pass_s(1)
     limits.look()
     assert limits.load is None
+    assert load_report(limits.permille) == {"load": None, "load_unknown": "bit_rate"}
     assert warnings(caplog) == []
+
+
+def test_of_a_bus_with_filters_the_load_is_not_known(watched: tuple[Bus, BusLimits, Clock]) -> None:
+    bus, limits, clock = watched
+    bus.bit_rate, bus.narrows = 0, True
+    clock.pass_s(1)
+    limits.look()
+    assert load_report(limits.permille) == {"load": None, "load_unknown": "filter"}
 
 
 def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:
@@ -73,13 +84,41 @@ def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:
     batch.append(0, 0, 0x123, b"")
     batch.append(0, 0, 0x123, bytes(8))
     batch.append(0, 0, EXTENDED_FLAG | 0x123, bytes(8))
-    bits = [_wire_bits(batch.wire[row : row + 1]) for row in range(3)]
+    bits = [wire_bits(batch.wire[row : row + 1]) for row in range(3)]
     for told, least, most in zip(bits, (47, 111, 131), (55, 135, 160), strict=True):
         assert least <= told <= most
-    assert _wire_bits(batch.wire[:3]) == pytest.approx(sum(bits), abs=3)
-    assert _wire_bits(batch.wire[:0]) == 0
+    assert wire_bits(batch.wire[:3]) == pytest.approx(sum(bits))
+    assert wire_bits(batch.wire[:0]) == 0
     many = np.repeat(batch.wire[1:2], 8_000)
-    assert 0.8 < _wire_bits(many) / 1_000_000 < 1.0  # 8000 frames/s are a full bus of 1 Mbit/s
+    assert 0.8 < wire_bits(many) / 1_000_000 < 1.0  # 8000 frames/s are a full bus of 1 Mbit/s
+    wide = FrameBatch(3, 64)
+    wide.append(0, 0, 0x123, b"")
+    wide.append(0, 0, 0x123, bytes(8))
+    wide.append(0, 0, EXTENDED_FLAG | 0x123, bytes(8))
+    assert wire_bits(wide.wire, 8.0) == pytest.approx(sum(bits))  # classic frames among FD frames
+
+
+SWITCHED, IS_FD = 0x01, 0x04
+
+
+@pytest.mark.parametrize(
+    ("identifier", "length", "flags", "least", "most"),
+    [  # ISO 11898-1:2015 without and with all stuff bits that there can be, counted by hand; 8 times as fast
+        (0x123, 64, IS_FD | SWITCHED, 30 + 549 / 8, 33 + 678 / 8),
+        (0x123, 64, SWITCHED, 30 + 549 / 8, 33 + 678 / 8),  # an older kernel
+        (0x123, 64, 0, 30 + 549, 33 + 678),
+        (0x123, 8, IS_FD | SWITCHED, 30 + 96 / 8, 33 + 113 / 8),
+        (0x123, 16, IS_FD, 30 + 160, 33 + 193),
+        (EXTENDED_FLAG | 0x123, 64, IS_FD | SWITCHED, 49 + 549 / 8, 57 + 678 / 8),
+    ],
+)
+def test_fd_frames_take_the_time_of_both_bit_rates(
+    identifier: int, length: int, flags: int, least: float, most: float
+) -> None:
+    batch = FrameBatch(1, 64)
+    batch.append(0, 0, identifier, bytes(length))
+    batch.wire["flags"][0] = flags
+    assert least <= wire_bits(batch.wire[:1], 8.0) <= most
 
 
 def stat(*dropped: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Sequence
 
@@ -14,12 +15,12 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import NoOptions, Notice
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Stamp, Values
 from skinware_drivers.link import Link, Match
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from tests.conftest import wait_until
-from tests.sdk.driving import Driving, driving_lines, read_until
+from tests.sdk.driving import Driving, driving_lines, follow, read_until
 
 MS = 1_000_000
 
@@ -35,6 +36,7 @@ class Speaking(CanAdapter[NoOptions]):
     def __init__(self, options: NoOptions) -> None:
         super().__init__(options)
         self.revived: list[str] = []
+        self.probed: list[str] = []
         self.failures = 0
 
     async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
@@ -44,6 +46,7 @@ class Speaking(CanAdapter[NoOptions]):
                 tell(self.patches[(frame.identifier & 0xF) - 1], list(Notice)[frame.payload[0]])
 
     async def probe(self, link: Link, patch: Patch) -> bool:
+        self.probed.append(patch.name)
         return True
 
     async def revive(self, link: Link, patch: Patch) -> None:
@@ -59,6 +62,7 @@ class Devices:
 
     def __init__(self) -> None:
         self.mute: set[int] = set()
+        self.data: Callable[[int], bytes] = lambda key: bytes((key, key))
         self.says: list[tuple[int, bytes]] = []
         self._due_ns = 0
 
@@ -72,7 +76,7 @@ class Devices:
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + 20 * MS
-        data = [(0x180 | key, bytes((key, key))) for key in (1, 2) if key not in self.mute]
+        data = [(0x180 | key, self.data(key)) for key in (1, 2) if key not in self.mute]
         frames, self.says = [*self.says, *data], []
         return [WireFrame(now_ns, *frame) for frame in frames]
 
@@ -114,6 +118,7 @@ def statuses(one: Sequence[int], two: Sequence[int]) -> Callable[..., bool]:
 LIVE, STALE = PatchState.LIVE, PatchState.STALE
 SUSPECT = [int(Status.SUSPECT)] * 2
 GOOD = [0, 0]
+NEW = int(Status.NEVER_SEEN | Status.SUSPECT)
 
 
 def test_a_patch_that_restarted_is_set_up_at_once_and_alone(devices: Devices, caplog: pytest.LogCaptureFixture) -> None:
@@ -139,13 +144,22 @@ def test_a_set_up_that_fails_is_tried_again_for_ever(devices: Devices) -> None:
         read_until(reader, states(LIVE, LIVE))
 
 
-def test_a_lost_patch_is_stale_until_its_next_data(devices: Devices) -> None:
-    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices, listen_only=True)
+class Slow(Speaking):
+    """Its patches may be silent for minutes."""
+
+    period_s = 100.0  # far more than a test takes
+
+
+@pytest.mark.parametrize("notice", [Notice.LOST, Notice.RESTARTED])
+def test_a_lost_patch_is_stale_until_its_next_data_and_a_listener_revives_none(
+    devices: Devices, notice: Notice
+) -> None:
+    adapter, bus = Slow(NoOptions()), VirtualCanBus.with_hardware(devices, listen_only=True)
     with driving_lines([(adapter, bus)], "speaking", listen_only=True) as running:
         with DriverReader("speaking") as reader:
             stage = Stage(running, devices, adapter)
             read_until(reader, states(LIVE, LIVE))
-            stage.say(1, Notice.LOST, mute=True)
+            stage.say(1, notice, mute=True)
             read_until(reader, states(STALE, LIVE))
             running.do(devices.mute.clear)
             read_until(reader, states(LIVE, LIVE))
@@ -196,5 +210,121 @@ def test_an_adapter_that_fails_while_it_attends_ends_the_driver(devices: Devices
             raise ZeroDivisionError("a bug")
 
     lines = [(Broken(NoOptions()), VirtualCanBus.with_hardware(devices))]
-    with pytest.raises(ZeroDivisionError, match="a bug"), driving_lines(lines, "speaking", wait=False) as running:
+    ended_by_itself: list[bool] = []
+
+    def see_it_end(running: Driving) -> None:
         wait_until(lambda: running.failure is not None)
+        ended_by_itself.append(True)
+
+    with pytest.raises(ZeroDivisionError, match="a bug"), driving_lines(lines, "speaking", wait=False) as running:
+        see_it_end(running)
+    assert ended_by_itself
+
+
+def test_a_patch_that_changed_is_asked_anew_until_what_it_says_makes_sense(
+    devices: Devices, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Changing(Speaking):
+        async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
+            return answers.pop(0)()
+
+    def nothing() -> Sequence[Patch]:
+        raise HandshakeTimeout("no answer")
+
+    one, two = Speaking.patches
+    three = Patch("three", [Module(taxels(2, first_uid=4))], key=3)
+    answers: list[Callable[[], Sequence[Patch]]] = [nothing, lambda: (one, one), lambda: (one, two, three)]
+    adapter, bus = Changing(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with (
+        caplog.at_level(logging.WARNING),
+        driving_lines([(adapter, bus)], "speaking") as running,
+        DriverReader("speaking") as reader,
+    ):
+        stage = Stage(running, devices, adapter)
+        first = read_until(reader, statuses(GOOD, GOOD))
+        stage.say(1, Notice.CHANGED)
+        wait_until(lambda: "bus0: nothing joined: no answer" in caplog.text)
+        stage.say(1, Notice.CHANGED)
+        wait_until(lambda: "what was found makes no skin: " in caplog.text)
+        same = read_until(reader, lambda f: f.patch_state.tolist() == [LIVE, LIVE] and f.sequence > first.sequence + 3)
+        assert same.generation == first.generation
+        stage.say(2, Notice.SUSPECT)
+        read_until(reader, statuses(GOOD, SUSPECT))
+        stage.say(1, Notice.CHANGED)
+        joined = follow(reader, lambda f: f.structure.n_patches == 3 and not f.status[:2].any() and f.status[2] != NEW)
+        assert joined.status[2:4].tolist() == SUSPECT  # it still is
+        assert [bytes(name) for name in joined.structure.patch_name] == [b"one", b"two", b"three"]
+
+
+def test_an_adapter_whose_bus_fails_while_it_attends_attends_again(devices: Devices) -> None:
+    class Shaky(Speaking):
+        failures_to_attend = 2
+        attends = False
+
+        async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+            if self.failures_to_attend:
+                self.failures_to_attend -= 1
+                raise HandshakeTimeout("no answer")
+            self.attends = True
+            await super().attend(link, tell)
+
+    adapter, bus = Shaky(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        wait_until(lambda: adapter.attends)
+        Stage(running, devices, adapter).say(1, Notice.SUSPECT)
+        read_until(reader, statuses(SUSPECT, GOOD))
+
+
+def test_nobody_is_probed_while_the_devices_of_a_bus_are_being_set_up(devices: Devices) -> None:
+    adapter, bus = Speaking(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        read_until(reader, statuses(GOOD, GOOD))
+        runner = running.runner
+        assert runner is not None
+        busy = runner.lines[0].busy
+        running.do(lambda: asyncio.ensure_future(busy.acquire()))
+        running.do(lambda: devices.mute.add(1))
+        stale = read_until(reader, states(STALE, LIVE))
+        read_until(reader, lambda f: f.sequence > stale.sequence + 50)  # several times as long as a patch may be silent
+        assert adapter.probed == []
+        running.do(busy.release)
+        read_until(reader, states(LIVE, LIVE))
+        assert adapter.revived == ["one"]
+
+
+def test_sequence_numbers_of_a_patch_that_was_set_up_anew_begin_anew(devices: Devices) -> None:
+    class Counting(Speaking):
+        layout = Layout(
+            [
+                Frame(
+                    "data",
+                    [Identifier(0x180, mask=0x7F0)],
+                    (3,),
+                    Values(1, "u1", 2),
+                    patch=Bits(0, 4),
+                    stamp=Stamp(0, "u1"),
+                )
+            ]
+        )
+
+    numbers = {1: 100, 2: 100}
+
+    def data(key: int) -> bytes:
+        numbers[key] += 1
+        return bytes((numbers[key] % 256, key, key))
+
+    devices.data = data
+    adapter, bus = Counting(NoOptions()), VirtualCanBus.with_hardware(devices)
+    with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:
+        read_until(reader, statuses(GOOD, GOOD))
+
+        def restart() -> None:
+            numbers[1] += 50  # from wherever it begins anew
+            devices.mute.add(1)
+
+        running.do(restart)
+        Stage(running, devices, adapter).say(1, Notice.RESTARTED)
+        wait_until(lambda: adapter.revived == ["one"])
+        read_until(reader, states(LIVE, LIVE))
+        counters = reader.patch_counters(reader.read())[0]
+        assert (counters["sequence_lost"], counters["sequence_back"]) == (0, 0)

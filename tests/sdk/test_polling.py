@@ -20,8 +20,8 @@ from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.polling import Poll, Poller
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import WireFrame
-from tests.conftest import wait_until
 from tests.sdk.driving import TroubledBus, driving_lines, read_until
 
 MS = 1_000_000

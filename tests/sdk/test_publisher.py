@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware import DriverReader, DriverWriter, Status
+from skinware import DriverReader, DriverWriter, PatchState, Status
 from skinware_drivers import publisher as publisher_module
 from skinware_drivers.adapter import Watch
 from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
@@ -80,6 +80,18 @@ def test_a_cycle_with_a_lost_module_is_published_before_the_next_one_is_shown(mo
     frames = [desk.reader._ring.copy(sequence) for sequence in (2, 3)]
     assert [set(f.values[:180].tolist()) for f in frames if f] == [{2}, {3}]
     assert [set(f.status[180:].tolist()) for f in frames if f] == [{int(Status.STALE)}, {0}]
+    desk.close()
+
+
+def test_a_board_that_sends_halves_only_is_not_live(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch)
+    for value in range(10):
+        desk.clock.now_ns += 50 * MS
+        desk.feed(desk.burst(value)[::2])
+    desk.publisher.publish()
+    assert desk.reader.read().patch_state.tolist() == [PatchState.EXPECTED]
+    desk.feed(desk.burst(1))
+    assert desk.reader.read().patch_state.tolist() == [PatchState.LIVE]
     desk.close()
 
 

@@ -20,7 +20,7 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can import recvmmsg, socketcan
 from skinware_drivers.can.socketcan import SocketCanBus
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35

@@ -27,7 +27,7 @@ from skinware_drivers.serial.checksums import CRC16_XMODEM
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.stuffing import COBS
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 
 FRAMING = Delimited(COBS, maximum_body=64, checksum=CRC16_XMODEM, identifier=Field(0))
 DATA, ASK, ANSWER = 1, 0x10, 0x11

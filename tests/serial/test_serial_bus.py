@@ -27,7 +27,7 @@ from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
 from skinware_drivers.serial.packets import Length, Packet
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import ASK, DATA, FRAMING, Usb, data_frame, is_readable, line, opened, receive
 
 PACKETS = Packet(

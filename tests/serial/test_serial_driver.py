@@ -21,7 +21,7 @@ from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import LengthTable, Packet
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import read_until
 from tests.serial.lines import (
     ANSWER,

@@ -10,7 +10,7 @@ import pytest
 
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.testing.conformance import DriverConformance
-from tests.conftest import wait_until
+from skinware_drivers.testing.waiting import wait_until
 from tests.testing import fingertips as f
 
 VALUES = "test_every_value_is_right_and_in_order"

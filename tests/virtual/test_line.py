@@ -14,12 +14,12 @@ from skinware.errors import BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import load_driver
 from skinware_drivers.serial.packets import Packet
+from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import line
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.emulator import CanFrame, Device, on_a_grid
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
-from tests.conftest import wait_until
 
 
 class Strip(SerialEmulator[SerialEmulatorOptions]):

@@ -15,12 +15,12 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.bus import Bus
+from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
-from skinware_drivers.skin_state import Updates
 
 _SUCH_AS = {
     "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",

@@ -1,4 +1,4 @@
-"""The vocabulary in which a driver says what its frames mean. Nothing here runs per frame: see ``decoder``.
+"""The vocabulary in which a driver says what its frames mean. Nothing here runs per frame: see ``decoding``.
 
 A layout is a list of :class:`Frame`. Each says *when* a frame on the wire is one of its kind, whose module it
 belongs to (*key*), and what its bytes are (*values*, *flags*, *sequence*). A :class:`Cycle` says which frames only

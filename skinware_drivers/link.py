@@ -15,7 +15,7 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import Bus, Filter, FrameBatch
-from skinware_drivers.filters import fewest, filters_of
+from skinware_drivers.decoding.filters import fewest, filters_of
 from skinware_drivers.layout import Layout
 
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05

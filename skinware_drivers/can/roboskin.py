@@ -49,11 +49,11 @@ from skinware_drivers.can.roboskin_options import (
     runs_text,
 )
 from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp
+from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
-from skinware_drivers.skin_state import Updates
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
     from skinware_drivers.config import ConfigFile, DriverConfig
-    from skinware_drivers.runner import PublishMode, Runner
+    from skinware_drivers.running.runner import PublishMode, Runner
 
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -138,7 +138,7 @@ def command(
     """
     from skinware.memory.namespace import Namespace
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
-    from skinware_drivers.runner import Runner
+    from skinware_drivers.running.runner import Runner
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="skin-driver: %(message)s", stream=sys.stderr

@@ -11,11 +11,11 @@ from skinware.errors import BusError, BusNotAvailable, ConfigurationError, Hands
 from skinware.realtime import now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_news import reason_text
 from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.guess import Guess, guess, likely, with_default_options
 from skinware_drivers.finding.traffic import IdentifierClass, Traffic
 from skinware_drivers.registry import make_bus
+from skinware_drivers.running.bus_news import reason_text
 
 _CAN_PAYLOAD = 64
 _IDENTIFY_S = 5.0

@@ -14,7 +14,7 @@ from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
-from skinware_drivers.runner import PublishMode, Runner
+from skinware_drivers.running.runner import PublishMode, Runner
 from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -129,7 +129,7 @@ def driving_lines(
         name: of the driver in the namespace.
         listen_only: send nothing.
         wait: until it publishes.
-        publish: see :class:`skinware_drivers.runner.Runner`.
+        publish: see :class:`skinware_drivers.running.runner.Runner`.
         wait_for_buses: likewise.
         bus_names: of each bus; default: bus0, bus1 ...
     """

@@ -18,7 +18,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.link import Link
-from skinware_drivers.runner import Runner
+from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import (

@@ -21,7 +21,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.serial.adapter import SerialAdapter
 

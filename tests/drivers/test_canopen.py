@@ -18,7 +18,7 @@ from skinware_drivers.adapter import Notice
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.canopen_patch import CanopenDriver, CanopenOptions, MappingChanged
 from skinware_drivers.can.pdo_map import Entry, PdoMap, Tpdo, default_tpdos
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import wait_until

@@ -9,7 +9,7 @@ from typing import Any
 
 from skinware.errors import HandshakeTimeout
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.serial.bus import SerialBus

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from skinware import Status
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
-from skinware_drivers.skin_state import BUS_COUNTERS
 from tests.openpatch import wire
 from tests.openpatch.scripted import data, decoded
 

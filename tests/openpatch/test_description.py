@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware.sensor_types import CATALOGUE
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.serial.openpatch_description import BadDescription, Greeting, Report, read_description
 from tests.openpatch import wire

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from skinware_drivers import bus_line
 from skinware_drivers.can import roboskin
+from skinware_drivers.running import bus_line
 
 HURRIED_WAIT_S = 0.06
 """What remains of the wait after set-up."""

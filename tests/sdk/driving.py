@@ -13,7 +13,7 @@ from skinware.driver_service import DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
-from skinware_drivers.runner import PublishMode
+from skinware_drivers.running.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus

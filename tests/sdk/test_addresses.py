@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
-from skinware_drivers.addresses import Addresses
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch, wire_dtype
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.addresses import Addresses
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, join_types, taxels
 from skinware_drivers.layout import MOST_FRAMES, Bits, Byte, Cycle, Frame, Identifier, Layout, Stamp, Values
-from skinware_drivers.skin_state import PATCH_COUNTERS
 
 TYPES = [PRESSURE.measured(unit="counts")]
 NODE = Bits(shift=8, width=8)

@@ -11,8 +11,8 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
-from skinware_drivers import bus_line, bus_news
-from skinware_drivers.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
+from skinware_drivers.running import bus_line, bus_news
+from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions

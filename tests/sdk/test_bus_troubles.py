@@ -11,10 +11,10 @@ import pytest
 
 from skinware import BusState, DriverReader, Namespace, PatchState, Status
 from skinware.errors import BusSendError
-from skinware_drivers import bus_line
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.link import Link
+from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
 

@@ -13,7 +13,8 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import (
     Bits,
@@ -30,7 +31,6 @@ from skinware_drivers.layout import (
     StatusBytes,
     Values,
 )
-from skinware_drivers.skin_state import PATCH_COUNTERS
 
 TYPES = [PRESSURE.measured(unit="counts")]
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)

@@ -11,7 +11,7 @@ import pytest
 from skinware.status import load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 from skinware_drivers.can.wire_time import wire_bits
-from skinware_drivers.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
+from skinware_drivers.running.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
 from tests.sdk.driving import emulated
 from tests.sdk.test_bus_states import Clock
 

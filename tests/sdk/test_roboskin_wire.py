@@ -14,9 +14,9 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import Kind, RoboskinDriver, RoboskinOptions
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import assemble
-from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 
 Wire = tuple[int, int, bytes]  # time_ns, identifier, payload
 MS = 1_000_000

@@ -13,8 +13,8 @@ import pytest
 
 from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
 from skinware.errors import NameInUse
-from skinware_drivers import generation
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.running import generation
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles

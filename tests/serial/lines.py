@@ -20,7 +20,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
-from skinware_drivers.runner import Runner
+from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import CRC16_XMODEM

@@ -30,9 +30,9 @@ from skinware import DriverReader, DriverWriter, Namespace
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
-from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 BOARDS = range(7, 14)
 CAN_FRAME = struct.Struct("=IB3x8s")

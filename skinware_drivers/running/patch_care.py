@@ -12,9 +12,9 @@ from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.status import PatchState
 from skinware_drivers.adapter import Notice
-from skinware_drivers.bus_line import BusLine
 from skinware_drivers.description import Patch
-from skinware_drivers.generation import Generation
+from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.generation import Generation
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -10,9 +10,9 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.service import Request, RequestServer
 from skinware.service.messages import ACQUIRE
-from skinware_drivers.bus_line import BusLine
 from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
+from skinware_drivers.running.bus_line import BusLine
 
 Changed = Callable[[BusLine, Sequence[Patch], bool], object]
 

@@ -19,21 +19,21 @@ from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.bus_changes import BusChanges
-from skinware_drivers.bus_line import BusLine
-from skinware_drivers.decoder import Decoder
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
-from skinware_drivers.desk import RequestDesk
-from skinware_drivers.figures import figures
-from skinware_drivers.generation import Generation, make_batch
-from skinware_drivers.intake import Intake
 from skinware_drivers.layout import Layout
-from skinware_drivers.limits import MachineLimits
 from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
-from skinware_drivers.patch_care import PatchCare
 from skinware_drivers.polling import Poller
-from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.bus_changes import BusChanges
+from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.desk import RequestDesk
+from skinware_drivers.running.figures import figures
+from skinware_drivers.running.generation import Generation, make_batch
+from skinware_drivers.running.intake import Intake
+from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.patch_care import PatchCare
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

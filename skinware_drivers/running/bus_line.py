@@ -13,10 +13,10 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.description import Patch
-from skinware_drivers.limits import BusLimits
 from skinware_drivers.link import Link
+from skinware_drivers.running.bus_news import WORDS, BusNews, reason_text
+from skinware_drivers.running.limits import BusLimits
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

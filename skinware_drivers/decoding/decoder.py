@@ -17,14 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
+from skinware_drivers.decoding.device_stamps import DeviceStamps
+from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
+from skinware_drivers.decoding.pairing import Pairing
+from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.device_stamps import DeviceStamps
-from skinware_drivers.frame_kind import Assembly, FrameKind
 from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
-from skinware_drivers.pairing import Pairing
-from skinware_drivers.skin_state import SkinState, Updates
 
 _NO_KIND = 255
 

@@ -12,12 +12,12 @@ from skinware.driver_service import DriverWriter
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
-from skinware_drivers.bursts import Bursts
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
-from skinware_drivers.decoder import Decoder
-from skinware_drivers.limits import BusLimits
-from skinware_drivers.patch_timing import PatchTiming
-from skinware_drivers.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
+from skinware_drivers.running.bursts import Bursts
+from skinware_drivers.running.limits import BusLimits
+from skinware_drivers.running.patch_timing import PatchTiming
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the frame's ``bus_counters``."""
@@ -31,7 +31,7 @@ _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
 
 class Desk(Protocol):
-    """Who waits for frames; see :class:`skinware_drivers.desk.RequestDesk`."""
+    """Who waits for frames; see :class:`skinware_drivers.running.desk.RequestDesk`."""
 
     @property
     def waited_for(self) -> bool: ...  # noqa: D102

@@ -9,10 +9,10 @@ from skinware.driver_service import DriverWriter
 from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
 from skinware.status import PatchState, load_report
-from skinware_drivers.bus_line import BusLine
-from skinware_drivers.generation import Generation
-from skinware_drivers.limits import MachineLimits
-from skinware_drivers.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.generation import Generation
+from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
 
 
 def figures(

@@ -11,8 +11,8 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_line import BusLine
 from skinware_drivers.description import join_types
+from skinware_drivers.running.bus_line import BusLine
 
 
 class BusChanges:

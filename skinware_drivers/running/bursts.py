@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.skin_state import SkinState, Updates
+from skinware_drivers.decoding.skin_state import SkinState, Updates
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]

@@ -10,7 +10,7 @@ from typing import Literal
 from skinware.errors import BusNotAvailable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.bus_line import BusLine
+from skinware_drivers.running.bus_line import BusLine
 
 _TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
 _REST, _LONGEST_REST_S = 4, 0.005  # after a take: so many times its duration, while more arrives (decision 0006)

@@ -25,6 +25,14 @@ ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
 
 
+_SUCH_AS = {
+    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
+    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
+    "virtual": ": virtual",
+}
+"""How the buses of a medium are written."""
+
+
 class Filter(NamedTuple):
     """Frames that are wanted: ``identifier & mask == value``, flags of the identifier included."""
 
@@ -157,6 +165,14 @@ class Bus(ABC):
         self.bit_rate = 0
         self.wire_bits: float = 0.0
         self.fullest: float = 0.0
+
+    def fits(self, medium: str) -> bool:
+        """Whether drivers of devices on this medium can use it."""
+        return self.medium in (None, medium)
+
+    def instead(self, medium: str) -> str:
+        """What to give instead to a driver that it does not fit, for people: the end of a sentence."""
+        return _SUCH_AS.get(medium, "")
 
     @abstractmethod
     def open(self) -> None:

@@ -6,14 +6,14 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, load_emulator
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, emulators_instead, load_emulator
 from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 DEFAULT_EMULATOR = "roboskin"
@@ -46,6 +46,8 @@ class VirtualCanBus(Bus):
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
+
+    medium: ClassVar[str] = "can"
 
     def __init__(
         self,
@@ -99,6 +101,14 @@ class VirtualCanBus(Bus):
     def name(self) -> str:
         """As a user writes it, for the hardware that is emulated."""
         return f"bus virtual:{self._emulated}"
+
+    def fits(self, medium: str) -> bool:
+        """Drivers of CAN devices, and of programs that make values."""
+        return medium in ("can", "virtual")
+
+    def instead(self, medium: str) -> str:
+        """Emulators of devices on that medium."""
+        return emulators_instead(medium) or super().instead(medium)
 
     def open(self) -> None:
         """Listen to the devices. They are powered up by the first time; what they sent meanwhile is gone.

@@ -135,8 +135,6 @@ def test_a_bus_that_goes_away_while_it_is_heard_does_no_harm() -> None:
 
 
 class Answers(RoboskinDriver):
-    medium = "serial"
-
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:
         assert not idle

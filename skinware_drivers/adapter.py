@@ -184,7 +184,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         return False
 
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set one patch up anew and start it; by default, whatever is on the bus.
+        """Set one patch up anew and start it; by default, whatever is on the bus, once for all that need it.
 
         To be overridden where patches can be set up one by one, or where the others would be disturbed.
         """

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import BusSendError
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 
@@ -31,6 +32,9 @@ _SUCH_AS = {
     "virtual": ": virtual",
 }
 """How the buses of a medium are written."""
+
+
+WayT = TypeVar("WayT")
 
 
 class Filter(NamedTuple):
@@ -204,6 +208,21 @@ class Bus(ABC):
         Raises:
             skinware.errors.BusSendError: down, queue full, or ``listen_only``.
         """
+
+    def may_send_by(self, way: WayT | None) -> WayT:
+        """The first thing in ``send``: refuse where nothing may be sent.
+
+        Args:
+            way: what hands frames to the wire, None while the bus is closed; given back.
+
+        Raises:
+            skinware.errors.BusSendError: closed, or ``listen_only``.
+        """
+        if self.listen_only:
+            raise BusSendError(f"{self.name} is opened to listen only")
+        if way is None:
+            raise BusSendError(f"{self.name} is not open")
+        return way
 
     @abstractmethod
     def close(self) -> None:

@@ -155,10 +155,11 @@ class VirtualCanBus(Bus):
         Raises:
             BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
         """
-        refusal = self._refusal(payload)
-        if refusal:
+        try:
+            self._check_sending(payload)
+        except BusSendError:
             self.counters.send_failures += 1
-            raise BusSendError(f"{self.name}: {refusal}")
+            raise
         self.hardware.receive(identifier, payload, self._clock())
         self.counters.sent += 1
         self._wake_when_due()
@@ -223,14 +224,10 @@ class VirtualCanBus(Bus):
         if self._timer is not None:
             self._timer.wake_at(time_ns)
 
-    def _refusal(self, payload: bytes) -> str:
-        if self.listen_only:
-            return "opened to listen only"
-        if self._timer is None or not self._present:
-            return "not open"
+    def _check_sending(self, payload: bytes) -> None:
+        self.may_send_by(self._timer if self._present else None)
         if len(payload) > self.payload_size:
-            return f"a payload of {len(payload)} bytes on a bus of {self.payload_size}-byte frames"
-        return ""
+            raise BusSendError(f"{self.name}: {len(payload)} bytes of payload, in frames of {self.payload_size}")
 
 
 @cache

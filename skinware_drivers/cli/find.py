@@ -125,7 +125,7 @@ def _chosen(
     for name in buses:
         interface, channel, _ = parse_bus_name(name)
         if interface in ("serial", "pty"):
-            port = next((port for port in serial_ports() if channel and same_bus(port.path, channel)), None)
+            port = next((port for port in serial_ports() if same_bus(port.path, channel or name)), None)
             if port is None:
                 raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
             chosen[1].append(port)

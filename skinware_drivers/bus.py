@@ -34,7 +34,7 @@ _SUCH_AS = {
 """How the buses of a medium are written."""
 
 
-WayT = TypeVar("WayT")
+_WayT = TypeVar("_WayT")
 
 
 class Filter(NamedTuple):
@@ -209,7 +209,7 @@ class Bus(ABC):
             skinware.errors.BusSendError: down, queue full, or ``listen_only``.
         """
 
-    def may_send_by(self, way: WayT | None) -> WayT:
+    def may_send_by(self, way: _WayT | None) -> _WayT:
         """The first thing in ``send``: refuse where nothing may be sent.
 
         Args:

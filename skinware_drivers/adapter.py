@@ -22,13 +22,6 @@ from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.options import HasOptions
 from skinware_drivers.polling import Poll
 
-_SUCH_AS = {
-    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
-    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
-    "virtual": ": virtual",
-}
-"""How the buses of a medium are written."""
-
 
 class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a driver that has none."""
@@ -148,11 +141,11 @@ class Adapter(HasOptions[OptionsT], ABC):
         Raises:
             ConfigurationError: it is another kind of bus.
         """
-        if bus.medium is not None and bus.medium != self.medium:
+        if not bus.fits(self.medium):
             names = {"can": "a CAN bus", "serial": "a serial line", "virtual": "a bus of this process"}
             raise ConfigurationError(
-                f"{bus.name} is {names.get(bus.medium, bus.medium)}; {type(self).__name__} needs"
-                f" {names.get(self.medium, self.medium)}{_SUCH_AS.get(self.medium, '')}"
+                f"{bus.name} is {names.get(str(bus.medium), bus.medium)}; {type(self).__name__} needs"
+                f" {names.get(self.medium, self.medium)}{bus.instead(self.medium)}"
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
@@ -191,7 +184,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         return False
 
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set one patch up anew and start it; by default, whatever is on the bus.
+        """Set one patch up anew and start it; by default, whatever is on the bus, once for all that need it.
 
         To be overridden where patches can be set up one by one, or where the others would be disturbed.
         """

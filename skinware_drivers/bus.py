@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import BusSendError
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 
@@ -23,6 +24,17 @@ REMOTE_FLAG = 0x4000_0000
 """Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
 ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
+
+
+_SUCH_AS = {
+    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
+    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
+    "virtual": ": virtual",
+}
+"""How the buses of a medium are written."""
+
+
+_WayT = TypeVar("_WayT")
 
 
 class Filter(NamedTuple):
@@ -158,6 +170,14 @@ class Bus(ABC):
         self.wire_bits: float = 0.0
         self.fullest: float = 0.0
 
+    def fits(self, medium: str) -> bool:
+        """Whether drivers of devices on this medium can use it."""
+        return self.medium in (None, medium)
+
+    def instead(self, medium: str) -> str:
+        """What to give instead to a driver that it does not fit, for people: the end of a sentence."""
+        return _SUCH_AS.get(medium, "")
+
     @abstractmethod
     def open(self) -> None:
         """Connect to the wire. Opening again after ``close`` is allowed; counters go on.
@@ -188,6 +208,21 @@ class Bus(ABC):
         Raises:
             skinware.errors.BusSendError: down, queue full, or ``listen_only``.
         """
+
+    def may_send_by(self, way: _WayT | None) -> _WayT:
+        """The first thing in ``send``: refuse where nothing may be sent.
+
+        Args:
+            way: what hands frames to the wire, None while the bus is closed; given back.
+
+        Raises:
+            skinware.errors.BusSendError: closed, or ``listen_only``.
+        """
+        if self.listen_only:
+            raise BusSendError(f"{self.name} is opened to listen only")
+        if way is None:
+            raise BusSendError(f"{self.name} is not open")
+        return way
 
     @abstractmethod
     def close(self) -> None:

@@ -18,6 +18,8 @@ from skinware.service.messages import OPERATIONS
 
 MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
 
+_TELLING_SPAN_NS = NS_PER_S // 2
+
 F = TypeVar("F", bound=Frame)
 
 
@@ -91,11 +93,16 @@ class Attachment(Generic[F]):
         return self._ring.missed_periods
 
     def rate_hz(self) -> float | None:
-        """How often the writer publishes, from the times of the frames that the ring holds; None for fewer than two."""
+        """How often the writer publishes, from the times of the frames that the ring holds.
+
+        None where they are too few to tell: after its start a writer may publish two frames at once and then wait.
+        """
         times = self._ring.publication_times_ns()
-        if len(times) < 2 or times[-1] == times[0]:
+        span_ns = times[-1] - times[0] if times else 0
+        is_full = len(times) >= self._ring.slot_count - 1  # the writer may be filling the last one
+        if not span_ns or (span_ns < _TELLING_SPAN_NS and not is_full):
             return None
-        return round((len(times) - 1) * NS_PER_S / (times[-1] - times[0]), 3)
+        return round((len(times) - 1) * NS_PER_S / span_ns, 3)
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns of the generation that is being read, read-only."""

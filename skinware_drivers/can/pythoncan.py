@@ -113,10 +113,7 @@ class PythonCanBus(Bus):
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
-        if self.listen_only:
-            raise BusSendError(f"bus {self.channel} is opened to listen only")
-        if self._bus is None:
-            raise BusSendError(f"bus {self.channel} is not open")
+        bus = self.may_send_by(self._bus)
         message = can.Message(
             arbitration_id=identifier & ~EXTENDED_FLAG,
             is_extended_id=bool(identifier & EXTENDED_FLAG),
@@ -124,7 +121,7 @@ class PythonCanBus(Bus):
             is_fd=len(payload) > 8,
         )
         try:
-            self._bus.send(message, timeout=0)
+            bus.send(message, timeout=0)
         except Exception as error:  # noqa: BLE001  (see the class)
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error})") from None

@@ -226,13 +226,10 @@ class SocketCanBus(Bus):
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
-        if self.listen_only:
-            raise BusSendError(f"bus {self.channel} is opened to listen only")
-        if self._socket is None:
-            raise BusSendError(f"bus {self.channel} is not open")
+        sock = self.may_send_by(self._socket)
         frame = _classic_frame(identifier, payload) if len(payload) <= 8 else self._fd_frame(identifier, payload)
         try:
-            self._socket.send(frame)
+            sock.send(frame)
         except OSError as error:
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error.strerror})") from None

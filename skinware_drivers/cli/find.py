@@ -92,12 +92,10 @@ async def look(
     drivers = known_drivers("can", driver_names)
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
-    buses_to_hear = [(one.name, one.bit_rate) for one in interfaces if one.up] + [(name, None) for name in others]
+    buses_to_hear = [one.name for one in interfaces if one.up] + others
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
     detection: Detection
-    detection, *listened = await asyncio.gather(
-        searching, *(listen(name, listen_s, drivers, bit_rate) for name, bit_rate in buses_to_hear)
-    )
+    detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
     heard: dict[str, HeardOnBus] = {one.bus: one for one in listened}
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
@@ -127,7 +125,7 @@ def _chosen(
     for name in buses:
         interface, channel, _ = parse_bus_name(name)
         if interface in ("serial", "pty"):
-            port = next((port for port in serial_ports() if channel and same_bus(port.path, channel)), None)
+            port = next((port for port in serial_ports() if same_bus(port.path, channel or name)), None)
             if port is None:
                 raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
             chosen[1].append(port)

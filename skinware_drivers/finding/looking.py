@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from skinware.errors import BusError, BusNotAvailable, ConfigurationError, HandshakeTimeout
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.finding.attended import attended
@@ -16,6 +16,7 @@ from skinware_drivers.finding.guess import Guess, guess, likely, with_default_op
 from skinware_drivers.finding.traffic import IdentifierClass, Traffic
 from skinware_drivers.registry import make_bus
 from skinware_drivers.running.bus_news import reason_text
+from skinware_drivers.running.limits import share_of_time
 
 _CAN_PAYLOAD = 64
 _IDENTIFY_S = 5.0
@@ -71,29 +72,24 @@ class Answer:
     refused: str = ""
 
 
-async def listen(
-    bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]], bit_rate: int | None = None
-) -> HeardOnBus:
+async def listen(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
     """Listen to a CAN bus. Nothing is sent.
 
     Args:
         bus_name: as for ``--bus``.
         duration_s: how long.
         drivers: those that may know the frames.
-        bit_rate: of the bus, bit/s, if it is known.
 
     Raises:
         ConfigurationError: that cannot be the name of a bus.
     """
     bus = make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
-    return await listen_on(bus, bus_name, duration_s, drivers, bit_rate)
+    return await listen_on(bus, bus_name, duration_s, drivers)
 
 
-async def listen_on(
-    bus: Bus, bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]], bit_rate: int | None = None
-) -> HeardOnBus:
+async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> HeardOnBus:
     """As :func:`listen`, on a bus that is made already."""
-    traffic = Traffic()
+    traffic, bits_before = Traffic(), bus.wire_bits
     try:
         async with attended(bus, traffic.take):
             await asyncio.sleep(duration_s)
@@ -105,7 +101,7 @@ async def listen_on(
         duration_s=duration_s,
         frames=traffic.frames,
         rate_hz=traffic.frames / duration_s if duration_s else 0.0,
-        load=traffic.load(bit_rate, duration_s) if bit_rate and duration_s else None,
+        load=share_of_time(bus, bus.wire_bits - bits_before, round(duration_s * NS_PER_S)) if duration_s else None,
         error_frames=bus.counters.errors,
         trouble=reason_text(reason) if reason else "",
         lost=bus.counters.lost,

@@ -1,4 +1,4 @@
-"""What is heard on a CAN bus: how much of what, and how full the bus is."""
+"""What is heard on a CAN bus: how much of what."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from skinware_drivers.link import Heard
 
 _MOST_KEPT = 1 << 17
 _CLASS_BITS = 8
-_CLASSIC_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -79,19 +78,3 @@ class Traffic:
         for row in rows:
             counts[Heard(*row)] = counts.get(Heard(*row), 0) + 1
         return counts
-
-    def load(self, bit_rate: int, duration_s: float) -> float | None:
-        """About how much of the bus' time the frames took, 0 to 1; None if there were FD frames, of two bit rates.
-
-        With half of the stuff bits that there can be at most (ISO 11898-1), so it is right within about a tenth.
-        """
-        wire = self.wire()
-        if not len(wire):
-            return 0.0
-        if int(wire["length"].max()) > _CLASSIC_BYTES:
-            return None
-        extended = (wire["identifier"] & EXTENDED_FLAG) != 0
-        data = 8 * wire["length"].astype(np.int64)
-        stuffed = np.where(extended, 54, 34) + data
-        bits = np.where(extended, 67, 47) + data + (stuffed - 1) // 8
-        return float(bits.mean()) * self.frames / (bit_rate * duration_s)

@@ -23,6 +23,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _STOP_TIMEOUT_S = 2.0
 _CHECK_PAUSE_NS = NS_PER_S // 2
+_NEVER_NS = 1 << 63
 
 
 class BusLine:
@@ -74,7 +75,8 @@ class BusLine:
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0
-        self._was_heard = False
+        self._speaks_from_ns = 0 if bus.listen_only else _NEVER_NS  # before, it only answers
+        self._has_spoken = False
 
     def open(self) -> None:
         """Open the bus.
@@ -156,6 +158,7 @@ class BusLine:
             self._become(BusState.LIVE, reason)
         if before != (self.state, self.reason):
             self._tell(*before)
+        self._has_spoken |= self.heard_ns > self._speaks_from_ns
         if self.state != BusState.LIVE or self.reason:
             self._check(time_ns)
 
@@ -179,17 +182,16 @@ class BusLine:
     def _tell(self, state: BusState, reason: BusReason) -> None:
         """What the change from this state and reason means."""
         if self.reason == BusReason.NOTHING_HEARD:
-            if state == BusState.LIVE:
+            if state == BusState.LIVE and self._has_spoken:
                 self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
         elif self.reason:
             if self.reason != reason:
                 self._news.tell(f"bus {self.name}: {WORDS[self.reason]}")
         elif reason == BusReason.NOTHING_HEARD:
-            if self._was_heard:
+            if self._has_spoken:
                 self._news.tell(f"bus {self.name}: frames come again")
         elif reason:
             self._news.tell(f"bus {self.name}: in order again (was {reason_text(reason)})")
-        self._was_heard |= self.state == BusState.LIVE
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
         """Ask what hangs on it, for as long as it takes.
@@ -231,6 +233,7 @@ class BusLine:
                 self._check(now_ns())
             else:
                 self.started = True
+                self._speaks_from_ns = now_ns()
                 return
 
     def begin_lost(self, error: BusNotAvailable | None = None) -> None:

@@ -20,6 +20,17 @@ SOFTNET = Path("/proc/net/softnet_stat")
 _LOOK_PAUSE_NS = NS_PER_S
 
 
+def share_of_time(bus: Bus, bits: float, passed_ns: int) -> float | None:
+    """Share of a wire's time that bits took, 0 to 1; None where its bit rate is not known.
+
+    Args:
+        bus: the bus.
+        bits: of its bit rate, as ``wire_bits`` counts them.
+        passed_ns: in what time, more than 0.
+    """
+    return bits * NS_PER_S / (bus.bit_rate * passed_ns) if bus.bit_rate else None
+
+
 class BusLimits:
     """Compares one bus with its limits once a second.
 
@@ -50,7 +61,7 @@ class BusLimits:
             return
         bus, self._looked_ns = self._bus, time_ns
         bits, self._bits = bus.wire_bits - self._bits, bus.wire_bits
-        self.load = bits * NS_PER_S / (bus.bit_rate * passed_ns) if bus.bit_rate else None
+        self.load = share_of_time(bus, bits, passed_ns)
         fill, bus.fullest = bus.fullest, 0.0
         if self.load is not None and self.load > HIGH_LOAD:
             self._tell("load", f"about {self.load:.0%} of its time is in use: what has low priority waits")

@@ -11,7 +11,7 @@ from typing import Any
 from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.status import PatchState
-from skinware_drivers.adapter import Notice
+from skinware_drivers.adapter import Adapter, Notice
 from skinware_drivers.description import Patch
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
@@ -48,6 +48,10 @@ class PatchCare:
         self._listen_only = listen_only
         self._join = join
         self._beside = beside
+        adapter = type(line.adapter)
+        self._revives_all = adapter.revive is Adapter.revive
+        self._asks_nobody = adapter.probe is Adapter.probe
+        self._begun_ns, self._error = 0, ""  # of the last set-up
 
     async def check_data(self) -> None:
         """Wait for the first data of every patch, and name those that send none."""
@@ -73,7 +77,10 @@ class PatchCare:
         states = [PatchState.STALE, PatchState.EXPECTED]
         if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
             states.append(PatchState.RESTARTED)
-        for patch in generation.patches_in(line, *states):
+        silent, asked_ns = generation.patches_in(line, *states), now_ns()
+        if self._asks_nobody and self._revives_all:
+            silent = silent[:1]  # the others are set up with it
+        for patch in silent:
             try:
                 if not await line.adapter.probe(line.link, patch):
                     continue
@@ -81,7 +88,7 @@ class PatchCare:
             except BusError as error:
                 log.debug("%s: %s", line.name, str(error))
                 continue
-            await self._revive(patch)
+            await self._revive(patch, asked_ns)
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
         """Hear what devices say of themselves, for ever.
@@ -122,38 +129,40 @@ class PatchCare:
         elif patch.key not in reviving or reviving[patch.key].done():
             log.warning("%s: %s has restarted", line.name, patch.name)
             generation.publisher.lose(number, PatchState.RESTARTED)
-            reviving[patch.key] = self._beside(self._revive(patch))
+            reviving[patch.key] = self._beside(self._revive(patch, now_ns()))
 
-    async def _revive(self, patch: Patch) -> None:
-        """Set one patch up anew."""
+    async def _revive(self, patch: Patch, asked_ns: int) -> None:
+        """Set one patch up anew; where that means the whole bus, once for all who asked before it began."""
         line = self._line
         async with line.busy:
             generation = self._generation()
             number = None if generation is None else generation.number_of(line, patch)
             if generation is None or number is None:
                 return
-            generation.publisher.lose(number, PatchState.RESTARTED)
             generation.decoder.forget(number)
-            error = await self._set_up(patch)
+            if not self._revives_all or self._begun_ns < asked_ns:
+                generation.publisher.lose(number, PatchState.RESTARTED)
+                await self._set_up(patch)
             generation = self._generation()  # it may be another one by now
             number = None if generation is None else generation.number_of(line, patch)
             if generation is None or number is None:
                 return
-            if error is None:
-                generation.watch.forget(number)
-            else:
-                log.debug("%s: %s", line.name, error)
+            if self._error:
+                log.debug("%s: %s", line.name, self._error)
                 generation.publisher.lose(number, PatchState.STALE)
+            else:
+                line.suspects.discard(patch.key)
+                generation.watch.forget(number)
 
-    async def _set_up(self, patch: Patch) -> str | None:
-        """Have the driver set one patch up; what went wrong, if anything."""
+    async def _set_up(self, patch: Patch) -> None:
+        """Have the driver set one patch up."""
+        self._begun_ns, self._error = now_ns(), ""
         try:
             await self._line.adapter.revive(self._line.link, patch)
         except BusError as error:
-            return str(error)
-        self._line.revived_ns = now_ns()
-        self._line.suspects.discard(patch.key)
-        return None
+            self._error = str(error) or type(error).__name__
+        else:
+            self._line.revived_ns = now_ns()
 
     def _patches_in(self, state: PatchState) -> list[Patch]:
         generation = self._generation()

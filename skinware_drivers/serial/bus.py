@@ -235,10 +235,7 @@ class SerialBus(Bus):
             self._reads.pop(0)
 
     def _send(self, identifier: int, payload: bytes) -> None:
-        if self.listen_only:
-            raise BusSendError(f"{self!r}: opened to listen only")
-        if self._port is None:
-            raise BusSendError(f"{self!r}: not open")
+        self.may_send_by(self._port)
         try:
             data = self._commands.encode(identifier, payload)
         except ValueError as error:

@@ -109,6 +109,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._disabled: set[int] = set()
         self._clock = DeviceClock(1e-6)
         self._clock_fails = False
+        self._has_sampled = False  # since it was last asked whether it does
         self._number = 0
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
@@ -172,6 +173,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         rows = np.flatnonzero((wire["identifier"] >= DATA) & (wire["length"] >= DATA_HEADER))
         if not len(rows):
             return
+        self._has_sampled = True
         stamps = np.ascontiguousarray(wire["payload"][rows, STAMP]).view("<u4")[:, 0]
         received_ns = time_ns[rows]
         sampled_ns = self._clock.convert(stamps, received_ns)
@@ -213,10 +215,17 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
                     self._say(link, logging.WARNING, "announcement", str(error))
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
-        """Whether the silent patch has restarted. One that says that it streams, and does not, has not."""
+        """Whether the silent patch has restarted. One that says that it streams, and does not, has not.
+
+        Its sampling hangs if nothing came since it was last asked, up to its answer: what it sampled before that has
+        been read by then, however late, and old samples are silence only because this machine is slow.
+        """
         greeting = await self._greet(link, tries=1)
+        has_sampled, self._has_sampled = self._has_sampled, False
         if greeting.crc != self._crc:
             self._changed(link)
+            return False
+        if greeting.streaming and has_sampled:
             return False
         if greeting.streaming:
             self._say(link, logging.WARNING, "sampling", "answers, but delivers no samples: its sampling hangs")

@@ -6,14 +6,14 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, load_emulator
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, emulators_instead, load_emulator
 from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 DEFAULT_EMULATOR = "roboskin"
@@ -46,6 +46,8 @@ class VirtualCanBus(Bus):
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
+
+    medium: ClassVar[str] = "can"
 
     def __init__(
         self,
@@ -100,6 +102,14 @@ class VirtualCanBus(Bus):
         """As a user writes it, for the hardware that is emulated."""
         return f"bus virtual:{self._emulated}"
 
+    def fits(self, medium: str) -> bool:
+        """Drivers of CAN devices, and of programs that make values."""
+        return medium in ("can", "virtual")
+
+    def instead(self, medium: str) -> str:
+        """Emulators of devices on that medium."""
+        return emulators_instead(medium) or super().instead(medium)
+
     def open(self) -> None:
         """Listen to the devices. They are powered up by the first time; what they sent meanwhile is gone.
 
@@ -145,10 +155,11 @@ class VirtualCanBus(Bus):
         Raises:
             BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
         """
-        refusal = self._refusal(payload)
-        if refusal:
+        try:
+            self._check_sending(payload)
+        except BusSendError:
             self.counters.send_failures += 1
-            raise BusSendError(f"{self.name}: {refusal}")
+            raise
         self.hardware.receive(identifier, payload, self._clock())
         self.counters.sent += 1
         self._wake_when_due()
@@ -213,14 +224,10 @@ class VirtualCanBus(Bus):
         if self._timer is not None:
             self._timer.wake_at(time_ns)
 
-    def _refusal(self, payload: bytes) -> str:
-        if self.listen_only:
-            return "opened to listen only"
-        if self._timer is None or not self._present:
-            return "not open"
+    def _check_sending(self, payload: bytes) -> None:
+        self.may_send_by(self._timer if self._present else None)
         if len(payload) > self.payload_size:
-            return f"a payload of {len(payload)} bytes on a bus of {self.payload_size}-byte frames"
-        return ""
+            raise BusSendError(f"{self.name}: {len(payload)} bytes of payload, in frames of {self.payload_size}")
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple, Protocol
 
@@ -79,6 +80,16 @@ def medium_of(emulator: HardwareFactory) -> str:
     return medium
 
 
+def emulators_instead(medium: str) -> str:
+    """The emulators that drivers of a medium can use instead, for people; empty if there are none."""
+    fitting = []
+    for name in sorted(entry_points(group=EMULATORS).names):
+        with contextlib.suppress(ConfigurationError):  # one that cannot be loaded is no help
+            if medium_of(load_emulator(name)) == medium:
+                fitting.append(f"virtual:{name}")
+    return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
+
+
 def load_emulator(name: str) -> HardwareFactory:
     """The emulator that is registered under ``name``.
 
@@ -95,4 +106,13 @@ def load_emulator(name: str) -> HardwareFactory:
     return emulator
 
 
-__all__ = ["EMULATORS", "EmulatedHardware", "EventLog", "HardwareFactory", "WireFrame", "load_emulator", "medium_of"]
+__all__ = [
+    "EMULATORS",
+    "EmulatedHardware",
+    "EventLog",
+    "HardwareFactory",
+    "WireFrame",
+    "emulators_instead",
+    "load_emulator",
+    "medium_of",
+]

@@ -12,7 +12,7 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, VirtualCanBus
-from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator, medium_of
+from skinware_drivers.virtual.hardware import EmulatedHardware, emulators_instead, load_emulator, medium_of
 from skinware_drivers.virtual.timer import MonotonicTimer
 
 _LONGEST_BACKLOG_NS = 1_000_000_000
@@ -43,6 +43,15 @@ class VirtualSerialBus(SerialBus):
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
         emulator = load_emulator(channel)
         self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus virtual:{self.channel}"
+
+    def instead(self, medium: str) -> str:
+        """Emulators of devices on that medium."""
+        return emulators_instead(medium) or super().instead(medium)
 
     @property
     def note(self) -> str:

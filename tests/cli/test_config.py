@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -178,3 +179,26 @@ def test_buses_are_the_same_under_all_their_names(tmp_path: Path) -> None:
     assert same_bus("slcan:/dev/ttyACM0?bitrate=1", "slcan:/dev/ttyACM0")
     assert same_bus("serial:?serial_number=A1&baudrate=9600", "serial:?serial_number=A1")
     assert not same_bus("serial:?serial_number=A1", "serial:?serial_number=B2")
+    assert same_bus("serial?serial_number=A1", "serial:?serial_number=A1")
+    assert not same_bus("serial?serial_number=A1", "serial?serial_number=B2")
+    assert not same_bus("udp_multicast:239.0.0.1?port=43113", "udp_multicast:239.0.0.1?port=43114")
+    assert same_bus("udp_multicast:239.0.0.1?port=43113&fd=true", "udp_multicast:239.0.0.1")
+    assert not same_bus("socketcand:can0?host=a&port=29536", "socketcand:can0?host=b&port=29536")
+
+
+def test_a_serial_line_is_where_its_device_is_plugged_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    plugged_in = [
+        SimpleNamespace(device="/dev/ttyUSB0", serial_number="A1", vid=0x0403, pid=0x6001, description=""),
+        SimpleNamespace(device="/dev/ttyUSB1", serial_number="B2", vid=0x0403, pid=0x6001, description=""),
+        SimpleNamespace(device="/dev/ttyACM0", serial_number=None, vid=0x0483, pid=0x5740, description=""),
+    ]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: plugged_in)
+    assert same_bus("/dev/ttyUSB0", "serial:?serial_number=A1")
+    assert same_bus("serial?serial_number=A1&baudrate=9600", "serial:/dev/ttyUSB0?baudrate=115200")
+    assert same_bus("serial?serial_number=A1&vid_pid=0403:6001", "serial?serial_number=A1")
+    assert same_bus("serial?vid_pid=0483:5740", "/dev/ttyACM0")
+    assert not same_bus("/dev/ttyUSB1", "serial:?serial_number=A1")
+    assert not same_bus("serial?serial_number=A1", "serial?serial_number=B2")
+    assert not same_bus("serial?vid_pid=0403:6001", "/dev/ttyUSB0")  # it may be the other one
+    assert not same_bus("serial?serial_number=C3", "/dev/ttyUSB0")
+    assert not same_bus("serial", "/dev/ttyUSB0")

@@ -42,7 +42,7 @@ def text(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
         skin.break_some()
-        skin.publish(3)
+        skin.publish(8)
         reader.read()
         report = told(capsys)
     assert report["namespace"] == namespace.name
@@ -56,7 +56,7 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
         {"name": "pressure", "sensors": 80, "unit": "counts"},
         {"name": "temperature", "sensors": 16, "unit": "degC"},
     ]
-    assert driver["sequence"] == 3
+    assert driver["sequence"] == 8
     assert driver["age_ms"] >= 0
     assert driver["rate_hz"] > 0
     assert driver["buses"] == [
@@ -67,9 +67,9 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
     assert (record["service"], record["pid"]) == ("torso", os.getpid())
     counts = {"frames", "lost", "overruns", "missed_periods", "rate_hz", "age_ms"}
     assert record.keys() == {"service", "pid", "program", "kind", "wall", "cpu", "age", "lateness"} | counts
-    assert driver["statistics"]["wall"]["count"] == 3
+    assert driver["statistics"]["wall"]["count"] == 8
     assert driver["statistics"]["wall"]["worst_ns"] >= driver["statistics"]["wall"]["mean_ns"] > 0
-    assert sum(driver["statistics"]["age"]["counts"]) == 3
+    assert sum(driver["statistics"]["age"]["counts"]) == 8
     assert driver["statistics"]["lateness"]["p99_ns"] is None  # it is not periodic
     assert (driver["state"], driver["driver_type"], driver["dtype"]) == ("live", "fake", "uint8")
     assert (driver["paused"], driver["missed_periods"]) == (False, 0)
@@ -149,9 +149,9 @@ def test_the_rate_is_that_of_the_frames_in_the_ring(capsys: pytest.CaptureFixtur
         assert told(capsys)["drivers"][0]["rate_hz"] is None  # one frame makes no rate
         frames = reader.in_order()
         first = next(frames)
-        skin.publish(4)
-        *_, last = islice(frames, 4)
-        rate_hz = 4 * 1e9 / (last.published_ns - first.published_ns)
+        skin.publish(6)
+        *_, last = islice(frames, 6)
+        rate_hz = 6 * 1e9 / (last.published_ns - first.published_ns)
         assert told(capsys)["drivers"][0]["rate_hz"] == pytest.approx(rate_hz, abs=0.001)
 
 
@@ -301,12 +301,12 @@ def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Nam
 def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
         skin.break_some()
-        skin.publish(3)
+        skin.publish(8)
         reader.read()
         out = text(capsys)
     lines = out.splitlines()
     assert re.fullmatch(r"namespace \S+: 1 driver, 0 services", lines[0])
-    assert re.fullmatch(r"driver torso: live, [\d.]+ Hz, newest data [\d.]+ ms old, frame 3, pid \d+", lines[2])
+    assert re.fullmatch(r"driver torso: live, [\d.]+ Hz, newest data [\d.]+ ms old, frame 8, pid \d+", lines[2])
     assert lines[3:5] == [
         "  fake driver: 2 patches, 8 modules, 96 sensors (uint8)",
         "  sensors: 80 pressure in counts, 16 temperature in degC",

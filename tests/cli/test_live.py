@@ -9,6 +9,8 @@ import pytest
 from skinware import Namespace, ServiceWriter
 from skinware.cli import _live
 from skinware.cli._live import LiveDriver, LiveDrivers
+from skinware.memory import ring
+from skinware.realtime import now_ns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 
 
@@ -82,6 +84,25 @@ def test_what_cannot_be_read_any_more_is_dropped() -> None:
             other.commit(0)
             assert not drivers.poll(driver)
             assert names(drivers) == []
+
+
+def test_two_frames_at_once_right_after_a_start_make_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeSkin("a") as skin, closing(LiveDrivers(Namespace())) as drivers:
+        clock_ns = now_ns()
+        monkeypatch.setattr(ring, "now_ns", lambda: clock_ns)
+        skin.publish()
+        clock_ns += 44_000
+        skin.publish()
+        (driver,) = drivers.look()
+        assert drivers.poll(driver)
+        assert driver.rate_hz is None
+        clock_ns += 999_956_000
+        skin.publish()
+        assert driver.rate_hz == 2.0
+        for _ in range(7):
+            clock_ns += 1_000_000
+            skin.publish()
+        assert driver.rate_hz == 1000.0  # a ring that is full is enough, however fast it was filled
 
 
 def test_the_rate_is_measured_over_two_seconds() -> None:

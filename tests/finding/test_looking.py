@@ -11,7 +11,7 @@ import pytest
 
 from skinware.errors import BusNotAvailable, HandshakeTimeout
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import Bus
+from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.can import roboskin_boards
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
@@ -41,7 +41,7 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def heard_on(bus: Bus, listen_s: float = 0.15) -> HeardOnBus:
     bus.listen_only = True
-    heard = asyncio.run(listen_on(bus, "bus", listen_s, DRIVERS, 1_000_000))
+    heard = asyncio.run(listen_on(bus, "bus", listen_s, DRIVERS))
     bus.listen_only = False
     return heard
 
@@ -64,9 +64,25 @@ def test_streaming_boards_are_heard_and_nothing_is_sent() -> None:
     heard = heard_on(bus)
     assert [(one.driver, one.patches) for one in heard.guesses] == [("roboskin", ("board 7", "board 8"))]
     assert heard.frames == heard.classes[0].frames > 0
-    assert heard.load is not None
-    assert 0 < heard.load < 1
+    assert heard.load is None  # of a bus without a bit rate
     assert (commands(log), bus.counters.sent, bus.fileno()) == ([], 0, -1)
+
+
+class Measured(VirtualCanBus):
+    """A bus with a bit rate, on which every batch of frames takes half a second."""
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        self.bit_rate = 1_000_000
+        self.wire_bits += 500_000
+        return super().receive(batch, ordinal)
+
+
+def test_the_load_is_as_the_bus_counts_it_while_it_is_heard() -> None:
+    bus = Measured.with_hardware(EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)))
+    bus.wire_bits = 1e15  # from before
+    heard = heard_on(bus)
+    assert heard.load is not None
+    assert heard.load * heard.duration_s == pytest.approx(0.5 * ((bus.wire_bits - 1e15) / 500_000), rel=1e-6)
 
 
 def test_live_boards_are_asked_one_by_one_and_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,8 +151,6 @@ def test_a_bus_that_goes_away_while_it_is_heard_does_no_harm() -> None:
 
 
 class Answers(RoboskinDriver):
-    medium = "serial"
-
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str | None:
         assert not idle

@@ -7,6 +7,7 @@ import errno
 import fcntl
 import os
 import pty
+import re
 import socket
 import struct
 import termios
@@ -23,6 +24,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can import socketcan
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.cli.driver import command
+from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import wait_until
 
 IFF_UP = 1
@@ -248,3 +250,12 @@ def test_an_slcan_adapter_that_sends_garbage_and_is_unplugged(adapter_port: tupl
     assert failure(bus).reason == BusReason.FAILED
     with pytest.raises(BusNotAvailable):
         bus.open()
+
+
+@pytest.mark.parametrize("name", ["can0", "can+virtual:x", "serial:/dev/ttyX", "virtual:xela", "virtual:anyskin"])
+def test_every_bus_refuses_to_send_in_the_same_words(name: str) -> None:
+    closed, listening = make_bus(name), make_bus(name, listen_only=True)
+    with pytest.raises(BusSendError, match=f"^{re.escape(closed.name)} is not open$"):
+        closed.send(1, b"")
+    with pytest.raises(BusSendError, match=f"^{re.escape(closed.name)} is opened to listen only$"):
+        listening.send(1, b"")

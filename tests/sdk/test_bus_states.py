@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import select
 import threading
+from collections.abc import Callable
+from contextlib import closing
 from typing import ClassVar
 
 import pytest
@@ -11,7 +15,12 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
+from skinware_drivers.adapter import NoOptions
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link
 from skinware_drivers.running import bus_line, bus_news
+from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
@@ -199,6 +208,54 @@ def test_a_bus_that_cannot_be_opened_again_for_an_odd_reason_is_tried_for_ever(
 
 
 # -- news ---------------------------------------------------------------------------------------------------------
+
+
+class Unhurried(CanAdapter[NoOptions]):
+    """Its devices answer, then say nothing for long while they are being set up."""
+
+    layout = Layout([Frame("data", [Identifier(0x180)], (2,), Values(0, "u1", 2))])
+
+    def __init__(self) -> None:
+        super().__init__(NoOptions())
+        self.while_set_up: Callable[[], object] = lambda: None
+
+    async def start(self, link: Link) -> None:
+        self.while_set_up()
+
+
+@pytest.mark.parametrize("listen_only", [False, True])
+def test_silence_counts_only_where_devices_send_of_themselves(
+    listen_only: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, adapter = Clock(), Unhurried()
+    monkeypatch.setattr(bus_line, "now_ns", clock)
+    with closing(select.epoll()) as epoll:
+        line = BusLine("can0", 0, adapter, emulated(boards=(7,), listen_only=listen_only), epoll)
+        line.open()
+
+        def hear() -> None:
+            clock.pass_s(0.01)
+            line.heard_ns = clock()
+            line.look(0)
+
+        def say_nothing() -> None:
+            clock.pass_s(10)
+            line.look(0)
+            assert line.state == BusState.SILENT
+
+        adapter.while_set_up = say_nothing
+        with caplog.at_level(logging.WARNING):
+            hear()  # an answer to the discovery, or what others made the devices send
+            if not listen_only:
+                asyncio.run(line.set_up())
+                say_nothing()  # they take their time
+            before = told(caplog, "bus can0")
+            hear()
+            say_nothing()
+            hear()
+        line.remove()
+    assert before == []
+    assert told(caplog, "bus can0") == ["bus can0: nothing is heard any more", "bus can0: frames come again"]
 
 
 class Clock:

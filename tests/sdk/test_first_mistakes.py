@@ -31,6 +31,14 @@ from skinware_drivers.registry import parse_bus_name
         (["--bus", "virtual", "--driver", "xela", "--boards", "a"], r"boards=a: give a whole number \(number 1"),
         (["--bus", "virtual&lose=0.1"], r"options begin with a question mark, as in virtual\?lose"),
         (["--bus", "port", "--driver", "anyskin"], r"port is a CAN bus; AnySkinDriver needs a serial line.*\./port"),
+        (
+            ["--bus", "virtual:xela", "--driver", "anyskin"],
+            r"bus virtual:xela is a CAN bus; AnySkinDriver needs a serial line; emulators that fit:.* virtual:anyskin,",
+        ),
+        (
+            ["--bus", "virtual:anyskin", "--driver", "xela"],
+            r"bus virtual:anyskin is a serial line; XelaDriver needs a CAN bus; emulators that fit:.* virtual:xela$",
+        ),
         (["--bus", "./port", "--driver", "xela"], r"\./port is a serial line; XelaDriver needs a CAN bus, as vcan0"),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
@@ -145,7 +146,7 @@ def command(
 
     SIGHUP makes a listener take in what it has heard since it started, and reads the buses of the --config file
     again: those that were added or taken out come or go, those whose options were changed are opened anew, the others
-    go on.
+    go on. It also comes when the terminal is closed: that ends the driver.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
@@ -215,7 +216,12 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         except ConfigurationError as error:
             log.error("buses stay as they are: %s", error)
 
+    had_terminal = _has_terminal()
+
     def on_hangup() -> None:
+        if had_terminal and not _has_terminal():
+            runner.stop()
+            return
         runner.join()
         task = loop.create_task(read_again())
         reading.add(task)
@@ -237,6 +243,15 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         if as_json:
             with contextlib.suppress(BrokenPipeError):
                 print_json({"event": "stopped", "name": runner.name, **runner.status()})
+
+
+def _has_terminal() -> bool:
+    """Whether this process hangs on a terminal, wherever its input and output go."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 async def _report(runner: Runner) -> None:

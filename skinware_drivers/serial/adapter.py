@@ -6,8 +6,6 @@ from typing import ClassVar
 
 from skinware_drivers.adapter import Adapter, OptionsT
 from skinware_drivers.bus import Bus
-from skinware_drivers.description import Patch
-from skinware_drivers.link import Link
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
@@ -45,11 +43,6 @@ class SerialAdapter(Adapter[OptionsT]):
         super().fit(bus)
         self._line = bus if isinstance(bus, SerialBus) else None
         self.change_framing(self.framing)
-
-    async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
-        """Set up and start the device anew; by default, as on most lines, there is only one, whatever its patches."""
-        await self.configure(link)
-        await self.start(link)
 
     def change_framing(self, framing: Framing) -> None:
         """Go over to another framing, for devices that tell in ``describe`` how long their frames are.

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -16,7 +17,14 @@ from tests.commands import BIN, PATIENCE_S
 @pytest.mark.parametrize("asked_before", [False, True])
 def test_a_driver_ends_with_its_terminal_and_only_then(namespace: Namespace, asked_before: bool) -> None:
     ours, terminal = os.openpty()
-    command = [BIN / "skin-driver", "--bus", "virtual?boards=7", "--namespace", namespace.name, "--json"]
+    command: list[str | Path] = [
+        BIN / "skin-driver",
+        "--bus",
+        "virtual?boards=7",
+        "--namespace",
+        namespace.name,
+        "--json",
+    ]
     try:
         with subprocess.Popen(
             ["setsid", "--ctty", *command], stdin=terminal, stdout=subprocess.PIPE, text=True

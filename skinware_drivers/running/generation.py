@@ -129,8 +129,10 @@ class Generation:
         now, before = self.publisher.patch_state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
+            if line.busy.locked():
+                continue  # its devices are being set up, and may be silent for it
             if now[patch] == PatchState.STALE:
                 log.warning("%s: %s fell silent", line.name, self.name_of(patch))
             elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
                 log.warning("%s: %s is live again", line.name, self.name_of(patch))
-        self._known_state = now.copy()
+            before[patch] = now[patch]

@@ -88,7 +88,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     have the smallest dtype that holds each bus' own.
 
     Attributes:
-        medium: kind of bus: ``can`` or ``serial``.
+        medium: kind of bus: ``can``, ``serial`` or ``virtual``.
         Options: struct of the options, as named in the brackets; becomes command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.

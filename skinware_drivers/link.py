@@ -233,9 +233,3 @@ def _any_match(matches: Sequence[Match], identifier: npt.NDArray[np.uint32]) -> 
     for match in matches:
         found |= (identifier & match.mask) == match.value
     return found
-
-
-def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:
-    """``rows`` of a batch, bus by bus."""
-    bus = batch.bus[rows]
-    return [rows[bus == ordinal] for ordinal in range(n_buses)]

@@ -136,10 +136,10 @@ def _style(code: int) -> Style:
 
 def scale_text(sensor_type: SensorType, low: float, high: float) -> Text:
     """The colours, from the value of the first one to that of the last one."""
-    text = Text(f"{low:.4g} ", no_wrap=True)
+    text = Text(f"{low:.5g} ", no_wrap=True)
     for left, right in zip(RAMP[0::2], RAMP[1::2], strict=True):
         text.append("▌", Style(color=_colour(left), bgcolor=_colour(right)))
-    text.append(f" {high:.4g} {sensor_type.unit}")
+    text.append(f" {high:.5g} {sensor_type.unit}")
     return text
 
 

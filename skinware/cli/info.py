@@ -140,7 +140,7 @@ def _statistics_lines(entry: dict[str, Any]) -> list[str]:
         return []
     wall, cpu = told["wall"], told["cpu"]
     worst, on_cpu = age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
-    lines = [f"a frame takes its writer {age_text(wall['mean_ns'])} (worst {worst}), {on_cpu} of a processor"]
+    lines = [f"a frame takes {age_text(wall['mean_ns'])} to fill (worst {worst}) and {on_cpu} of processor time in all"]
     lines.append(f"99 % of its frames hold data up to {_bound(told['age'])} old when published")
     if told["lateness"]["p99_ns"] is not None:
         lines.append(f"99 % of its periods begin up to {_bound(told['lateness'])} late")

@@ -32,7 +32,7 @@ _TAKE_PERIOD_S = 0.1
     "skin-top",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-top                    in the terminal (needs: pip install 'skinware[top]')",
+        "skin-top                    in the terminal (pip install 'skinware[top]')",
         "skin-top --type proximity   draw another type of sensors",
         "skin-top --plain -T 10      ten seconds of plain lines",
     ),

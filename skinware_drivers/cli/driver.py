@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
@@ -15,10 +16,12 @@ import click
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
 from skinware.cli._format import plural
 from skinware.errors import ConfigurationError
-from skinware_drivers.options import describe_options
+from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
+
+    import msgspec
 
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
@@ -34,23 +37,22 @@ _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
 """What stands in that file for this program."""
 
 
-class DriverCommand(click.Command):
+class DriverCommand(HardwareCommand):
     """A command that also takes the options of the driver it is asked to run."""
 
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Add the driver's own options before parsing."""
+    def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
+        """The options of the driver that the command line or the file names."""
         from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
-        config = _value_of("--config", args)
-        name = _value_of("--driver", args)
+        config = value_of("--config", args)
+        name = value_of("--driver", args)
         if not name and config:
             name = _read(Path(config)).settings.driver
-        own = {parameter.name for parameter in self.params}
-        for option in describe_options(load_driver(name or DEFAULT_DRIVER).Options):
-            if option.name not in own:
-                text = option.description + (f"  [default: {option.default}]" if option.default else "")
-                flag = "--" + option.name.replace("_", "-")
-                self.params.append(click.Option([flag, option.name], metavar=option.kind, help=text))
+        name = name or DEFAULT_DRIVER
+        return name, load_driver(name).Options
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse; say what to do with a word that is no option."""
         ctx.allow_extra_args = True
         left = super().parse_args(ctx, args)
         if left:
@@ -74,19 +76,31 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     cls=DriverCommand,
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-driver --bus vcan0                    ROBOSKIN boards on a CAN interface",
-        "skin-driver --bus virtual                  emulated ones, no hardware needed",
+        "skin-driver --bus virtual                  emulated boards, no hardware",
+        "skin-driver --bus can0                     ROBOSKIN boards on CAN",
         "skin-driver --bus can0 --boards 7,8,9,10   only these boards",
         "skin-driver --bus can0 --listen-only       send nothing",
-        "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, where this user may have it",
+        "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
+        "skin-driver --driver xela --help           the options of another driver",
     ),
 )
 @click.option(
-    "--bus", "buses", multiple=True, metavar="BUS", help="Bus: vcan0, virtual, slcan:/dev/ttyACM0 ...; several."
+    "--bus",
+    "buses",
+    multiple=True,
+    metavar="BUS",
+    help="Where the skin hangs: can0, /dev/ttyUSB0, virtual ...; once for each bus.",
 )
-@click.option("--driver", "driver_name", metavar="DRIVER", help="Driver.  [default: roboskin]")
+@click.option(
+    "--driver",
+    "driver_name",
+    metavar="DRIVER",
+    help="What hangs there: roboskin, xela, anyskin ...  [default: roboskin]",
+)
 @click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of all this.")
+@click.option(
+    "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of these, also bus by bus."
+)
 @click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
 @click.option("--wait", is_flag=True, help="Wait for a bus that is not there yet, also if there is no other.")
 @click.option(
@@ -132,7 +146,7 @@ def command(
 
     SIGHUP makes a listener take in what it has heard since it started, and reads the buses of the --config file
     again: those that were added or taken out come or go, those whose options were changed are opened anew, the others
-    go on.
+    go on. It also comes when the terminal is closed: that ends the driver.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
@@ -202,7 +216,12 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         except ConfigurationError as error:
             log.error("buses stay as they are: %s", error)
 
+    had_terminal = _has_terminal()
+
     def on_hangup() -> None:
+        if had_terminal and not _has_terminal():
+            runner.stop()
+            return
         runner.join()
         task = loop.create_task(read_again())
         reading.add(task)
@@ -224,6 +243,15 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         if as_json:
             with contextlib.suppress(BrokenPipeError):
                 print_json({"event": "stopped", "name": runner.name, **runner.status()})
+
+
+def _has_terminal() -> bool:
+    """Whether this process hangs on a terminal, wherever its input and output go."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 async def _report(runner: Runner) -> None:
@@ -290,16 +318,6 @@ def _read(path: Path | None) -> ConfigFile:
     from skinware_drivers.config import ConfigFile
 
     return ConfigFile(path)
-
-
-def _value_of(flag: str, args: list[str]) -> str | None:
-    """The value of a flag, looked at before the command line is parsed."""
-    for position, argument in enumerate(args):
-        if argument == flag and position + 1 < len(args):
-            return args[position + 1]
-        if argument.startswith(flag + "="):
-            return argument.partition("=")[2]
-    return None
 
 
 def main() -> None:

@@ -138,7 +138,7 @@ command: click.Command = click.Command(
         "skin-dump -n 3                              three frames",
         "skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s",
         "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
-        "skin-dump --raw can0 -n 1000 > can.log      CAN frames, for canplayer -I can.log",
+        "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
     ),
 )
 

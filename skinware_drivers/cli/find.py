@@ -22,7 +22,7 @@ _DETECTION_S = 10.0
     "skin-find",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-find                     everything: CAN interfaces, adapters, serial ports",
+        "skin-find                     CAN interfaces, adapters, serial ports",
         "skin-find can0 --probe        ask who is on can0",
         "skin-find --udev              names for the serial ports that stay",
         "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",

@@ -33,8 +33,8 @@ def command() -> None:
 @command.command(
     "icub",
     epilog=examples(
-        "skin-import icub iCubGenova02 -o skin             a whole robot: a configuration for each skin device",
-        "skin-import icub iCubGenova02 positions -o skin   with skinGui's positions: kinds of modules, and a geometry",
+        "skin-import icub iCubGenova02 -o skin             a whole robot",
+        "skin-import icub iCubGenova02 positions -o skin   with skinGui's positions",
         "skin-import icub torso.xml --bus 1=can0           one device, on stdout",
     ),
 )

@@ -24,7 +24,7 @@ _HOW_TO_RUN = {
     epilog=examples(
         "skin-new fingertip --transport can     a driver of a device on a CAN bus",
         "skin-new forearm --transport serial    of one on a serial line",
-        "skin-new dummy --transport virtual     of values that a program makes, such as a simulator",
+        "skin-new dummy --transport virtual     of values that a program makes",
     ),
 )
 @click.argument("name")

@@ -44,33 +44,6 @@ class BusChanges:
         self._rebuild = rebuild
         self._changing = asyncio.Lock()
 
-    async def add(self, name: str, adapter: AnyAdapter, bus: Bus) -> None:
-        """Take in one more bus. It need not be there yet.
-
-        Raises:
-            ConfigurationError: there is a bus of this name, or its sensor types contradict those of the others.
-        """
-        async with self._changing:
-            if any(line.name == name for line in self._present):
-                raise ConfigurationError(f"bus {name} is in use already")
-            line = BusLine(name, self._places([name])[0], adapter, bus, self._epoll)
-            self._check_types([line])
-            await self._put_in(line)
-
-    async def remove(self, name: str) -> None:
-        """Stop the devices on a bus and go on without it.
-
-        Raises:
-            ConfigurationError: there is no such bus, or it is the last one with sensors.
-        """
-        async with self._changing:
-            line = next((line for line in self._present if line.name == name), None)
-            if line is None:
-                raise ConfigurationError(f"there is no bus {name}")
-            self._check_rest([line])
-            await self._take_out(line)
-            await self._rebuild()
-
     async def change_to(self, wanted: Mapping[str, AnyAdapter], make_bus: Callable[[str, AnyAdapter], Bus]) -> None:
         """Have these buses from now on: add what is new, open anew what has other options, remove the rest.
 

@@ -262,7 +262,8 @@ class BusLine:
         if not self.started or self.bus.fileno() < 0:
             return
         try:
-            await asyncio.wait_for(self.adapter.stop(self.link), _STOP_TIMEOUT_S)
+            async with asyncio.timeout(_STOP_TIMEOUT_S):
+                await self.adapter.stop(self.link)
         except BusError as error:
             log.warning("%s: not stopped in good order: %s", self.name, str(error))
         except TimeoutError:

@@ -15,7 +15,6 @@ from skinware_drivers.adapter import Watch
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
-from skinware_drivers.link import split_by_bus
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.publisher import Publisher
 
@@ -30,6 +29,12 @@ def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
     payload_size = max(line.adapter.payload_size for line in lines)
     wanted = max(BATCH_FRAMES, _FRAMES_OF_A_BUS * len(lines))
     return FrameBatch(max(64, min(wanted, _BATCH_BYTES // payload_size)), payload_size, headroom)
+
+
+def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:
+    """``rows`` of a batch, bus by bus."""
+    bus = batch.bus[rows]
+    return [rows[bus == ordinal] for ordinal in range(n_buses)]
 
 
 @dataclass
@@ -124,8 +129,10 @@ class Generation:
         now, before = self.publisher.patch_state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
+            if line.busy.locked():
+                continue  # its devices are being set up, and may be silent for it
             if now[patch] == PatchState.STALE:
                 log.warning("%s: %s fell silent", line.name, self.name_of(patch))
             elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
                 log.warning("%s: %s is live again", line.name, self.name_of(patch))
-        self._known_state = now.copy()
+            before[patch] = now[patch]

@@ -22,14 +22,13 @@ from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
-from skinware_drivers.link import split_by_bus
 from skinware_drivers.operations import operations_of
 from skinware_drivers.polling import Poller
 from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
-from skinware_drivers.running.generation import Generation, make_batch
+from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
 from skinware_drivers.running.intake import Intake
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.patch_care import PatchCare

@@ -319,7 +319,8 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
     assert lines[10].split() == ["patch", "bus", "state", "fresh", "sensors", "age", "orphans", "updates"]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
     assert re.fullmatch(r"  board 8  can1  stale +0 of 48 +[\d.]+ ms +0 +0", lines[12])
-    takes = r"  a frame takes its writer [\d.]+ [mu]s \(worst [\d.]+ [mu]s\), [\d.]+ [mu]s of a processor"
+    figure = r"[\d.]+ [mu]s"
+    takes = rf"  a frame takes {figure} to fill \(worst {figure}\) and {figure} of processor time in all"
     assert re.fullmatch(takes, lines[14])
     assert re.fullmatch(r"  99 % of its frames hold data up to [\d.]+ [a-z]+ old when published", lines[15])
     assert lines[16].split()[:3] == ["reader", "how", "pid"]

@@ -87,7 +87,7 @@ def test_changed_lines() -> None:
 
 def test_the_scale_has_values_and_a_unit() -> None:
     scale = scale_text(PRESSURE.measured(unit="kPa"), -0.5, 1234.5)
-    assert scale.plain == "-0.5 ▌▌▌▌▌▌▌▌ 1234 kPa"  # two colours in each cell
+    assert scale.plain == "-0.5 ▌▌▌▌▌▌▌▌ 1234.5 kPa"  # two colours in each cell
 
 
 def test_only_marks_that_are_there_are_explained() -> None:

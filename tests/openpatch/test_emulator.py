@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 from skinware import DriverReader
+from skinware.cli._command import exit_status
 from skinware.realtime import now_ns
-from skinware_drivers.cli.emulate import emulate
+from skinware_drivers.cli.emulate import command
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
@@ -175,12 +175,13 @@ def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(
             assert reader.patch_counters(reader.read())[0]["sequence_lost"] == 0
 
 
-def test_it_lives_on_serial_lines_and_has_its_line_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_lives_on_serial_lines_and_has_its_line_for_itself(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("skinware_drivers.virtual.hardware.load_emulator", lambda name: EmulatedOpenPatch)
     for more, reason in (
         (["--bus", "vcan0"], "devices of openpatch hang on serial lines"),
         (["--bus", "pty", "--foreign-hz", "5"], "nothing else hangs on a serial line"),
     ):
-        result = CliRunner().invoke(emulate, ["--driver", "openpatch", *more])
-        assert result.exit_code == 2
-        assert reason in result.output
+        assert exit_status(command, ["--driver", "openpatch", *more]) == 2
+        assert reason in capsys.readouterr().err

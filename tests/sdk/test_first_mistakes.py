@@ -15,8 +15,8 @@ from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
+from skinware_drivers.cli import emulate
 from skinware_drivers.cli.driver import command
-from skinware_drivers.cli.emulate import emulate
 from skinware_drivers.options import load_entry_point
 from skinware_drivers.registry import parse_bus_name
 
@@ -51,8 +51,7 @@ def test_skin_driver_says_what_to_do(
 
 
 def test_an_emulator_on_a_bus_that_nobody_else_can_open_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        emulate(["--bus", "virtual", "--driver", "xela"])
+    assert exit_status(emulate.command, ["--bus", "virtual", "--driver", "xela"]) == 2
     assert "nobody else can open it; give vcan0 or pty:./port" in capsys.readouterr().err
 
 

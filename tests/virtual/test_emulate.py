@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
 
+from skinware.cli._command import exit_status
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers import registry
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.cli.emulate import emulate
+from skinware_drivers.cli.emulate import command
 from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch, wait_readable
 from skinware_drivers.options import describe_options
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
@@ -316,26 +316,21 @@ def host_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[HostBus]]:
         os.close(end)
 
 
-def invoke(*arguments: str) -> Result:
-    return CliRunner().invoke(emulate, arguments)
-
-
-def test_help_shows_every_option_of_the_emulator() -> None:
-    result = invoke("--help")
-    assert result.exit_code == 0
-    text = " ".join(result.output.split())
+def test_help_shows_every_option_of_the_emulator(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command, ["--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
     for option in describe_options(RoboskinOptions):
         assert f"--{option.name.replace('_', '-')}" in text
     assert "CAN addresses of the boards, 1-14. [default: 7,8,9,10]" in text
 
 
-def test_options_of_the_command_line_reach_the_emulator(host_buses: list[HostBus], tmp_path: Path) -> None:
+def test_options_of_the_command_line_reach_the_emulator(
+    host_buses: list[HostBus], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log = tmp_path / "log.jsonl"
-    result = invoke(
-        "--bus", "host", "--boards", "7-8", "--lose", "1", "--streaming", "--log", str(log), "--json", "-T", "0.2"
-    )  # fmt: skip
-    assert result.exit_code == 0
-    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    faults = ["--boards", "7-8", "--lose", "1", "--streaming", "--log", str(log)]
+    assert exit_status(command, ["--bus", "host", *faults, "--json", "-T", "0.2"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert lines[0]["options"]["boards"] == [7, 8]
     assert lines[0]["options"]["lose"] == 1.0
     assert lines[0]["options"]["streaming"] is True
@@ -344,10 +339,11 @@ def test_options_of_the_command_line_reach_the_emulator(host_buses: list[HostBus
     assert not host_buses[0].is_open
 
 
-def test_a_run_without_options_is_silent_and_ends_well(host_buses: list[HostBus]) -> None:
-    result = invoke("--bus", "host", "-T", "0")
-    assert result.exit_code == 0
-    assert result.stdout.startswith("emulating roboskin on host")
+def test_a_run_without_options_is_silent_and_ends_well(
+    host_buses: list[HostBus], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_status(command, ["--bus", "host", "-T", "0"]) == 0
+    assert capsys.readouterr().out.startswith("emulating roboskin on host")
     assert host_buses[0].payload_size == 8
 
 
@@ -365,10 +361,10 @@ def test_a_run_without_options_is_silent_and_ends_well(host_buses: list[HostBus]
         (("--bus", "host", "--log", "/nonexistent/x", "-T", "0"), 2, "cannot write the log"),
     ],
 )
-def test_exit_status(host_buses: list[HostBus], arguments: tuple[str, ...], status: int, message: str) -> None:
-    result = invoke(*arguments)
-    assert result.exit_code == status
-    assert message in result.stderr
+@pytest.mark.usefixtures("host_buses")
+def test_exit_status(arguments: tuple[str, ...], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command, arguments) == status
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -376,8 +372,8 @@ def test_a_signal_ends_the_command_with_status_0(number: signal.Signals, tmp_pat
     """The whole command in a process of its own, on a bus that needs no kernel support."""
     log = tmp_path / "log.jsonl"
     emulate = [sys.executable, "-m", "skinware_drivers.cli.emulate"]
-    command = [*emulate, "--driver", "anyskin", "--bus", "pty", "--json", "--log", str(log)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    arguments = ["--driver", "anyskin", "--bus", "pty", "--json", "--log", str(log)]
+    with subprocess.Popen([*emulate, *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["event"] == "ready"
         process.send_signal(number)

@@ -1,0 +1,79 @@
+"""Commands that take the options of the hardware they are asked for beside their own."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from skinware_drivers.options import Option
+
+_HARDWARE_OPTIONS = "skinware.hardware_options"
+_LONGEST_KIND = 24
+"""What is longer stands in the text, where it can be wrapped."""
+
+
+class HardwareCommand(click.Command):
+    """A command of which ``--driver`` says what further options it has; their values are the texts that were given."""
+
+    def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
+        """The driver that an unparsed command line names, and the options that it brings.
+
+        Raises:
+            ConfigurationError: there is no such driver.
+        """
+        raise NotImplementedError
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Find out whose options the command line may hold, then parse it."""
+        from skinware_drivers.options import describe_options
+
+        driver, options_class = self.options_class(args)
+        own = {parameter.name for parameter in self.params}
+        theirs = [_click_option(option) for option in describe_options(options_class) if option.name not in own]
+        ctx.meta[_HARDWARE_OPTIONS] = driver, theirs
+        return super().parse_args(ctx, args)
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """The command's own options, then those of the hardware."""
+        _, theirs = ctx.meta.get(_HARDWARE_OPTIONS, ("", []))
+        return [*super().get_params(ctx), *theirs]
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Print the two kinds of options apart."""
+        driver, theirs = ctx.meta.get(_HARDWARE_OPTIONS, ("", []))
+        for title, options in (("Options", super().get_params(ctx)), (f"Options of {driver}", theirs)):
+            records = [record for option in options if (record := option.get_help_record(ctx)) is not None]
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+
+def value_of(flag: str, args: list[str]) -> str | None:
+    """The value of a flag, looked at before the command line is parsed."""
+    for position, argument in enumerate(args):
+        if argument == flag and position + 1 < len(args):
+            return args[position + 1]
+        if argument.startswith(flag + "="):
+            return argument.partition("=")[2]
+    return None
+
+
+def _click_option(option: Option) -> click.Option:
+    kind, text = option.kind, f"{option.description[:1].upper()}{option.description[1:]}."
+    if len(kind) > _LONGEST_KIND:
+        words, comma, _ = kind.partition(",")
+        kind, text = f"NAME{comma and ',...'}", f"{text[:-1]} ({words.replace('|', ', ')})."
+    elif "|" in kind:
+        kind = f"[{kind}]"
+    if option.required:
+        text += "  [required]"
+    elif option.default:
+        text += f"  [default: {option.default}]"
+    flag = f"--{option.name.replace('_', '-')}"
+    if option.kind == "yes/no":  # alone, it means yes
+        return click.Option([flag, option.name], metavar="[yes|no]", is_flag=False, flag_value="yes", help=text)
+    return click.Option([flag, option.name], metavar=kind, help=text)

@@ -396,7 +396,7 @@ def test_a_node_of_the_canopen_package_on_python_cans_bus() -> None:
         with driving_lines([(adapter, bus)], "skin") as running, DriverReader("skin") as reader:
             frame = read_until(reader, lambda f: not f.status.any())
             assert frame.values.tolist() == [100 * number + at for number in (1, 2, 3, 4) for at in range(4)]
-            assert node.nmt.state == "OPERATIONAL"
+            wait_until(lambda: node.nmt.state == "OPERATIONAL")
             assert node.sdo[0x1017].raw == 100
             node.emcy.send(0x5000)
             read_until(reader, lambda f: bool((f.status == SUSPECT).all()))

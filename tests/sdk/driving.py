@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import msgspec
 
@@ -13,6 +14,7 @@ from skinware.driver_service import DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.running import publisher
 from skinware_drivers.running.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
@@ -21,6 +23,9 @@ from skinware_drivers.virtual.events import CommandReceived
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+
+SILENCE_NS = 600_000_000
+"""How long boards may be silent in tests: a busy machine lets the threads of a test wait for longer than 0.2 s."""
 
 
 def emulated(log: list[msgspec.Struct] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
@@ -173,9 +178,12 @@ def driving(
     **options: Any,
 ) -> Iterator[Driving]:
     lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
-    with driving_lines(
-        lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
-    ) as running:
+    with (
+        mock.patch.object(publisher, "_LEAST_SILENCE_NS", SILENCE_NS),
+        driving_lines(
+            lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
+        ) as running,
+    ):
         yield running
 
 

@@ -20,7 +20,7 @@ from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
-from tests.sdk.driving import LateBoards, Together, commands, driving, emulated, hardware_of, read_until
+from tests.sdk.driving import EveryFrame, LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 
 
 class Flood(VirtualCanBus):
@@ -110,9 +110,10 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
     log: list[msgspec.Struct] = []
     bus = emulated(log, boards=(7, 8), pattern="cycle", lose=0.01)
     shown: dict[int, set[int]] = {module: set() for module in range(32)}
-    with driving(bus, period_ms=20) as running, DriverReader("roboskin") as reader:
-        before_ns = np.zeros(32, np.int64)
-        for count, frame in enumerate(reader.in_order(timeout_s=30)):
+    with driving(bus, period_ms=20) as running, EveryFrame(running) as every:
+        wait_until(lambda: len(every.taken) > 200)
+        before_ns, reader = np.zeros(32, np.int64), every.reader
+        for frame in every.taken[:200]:
             values, status = frame.values.reshape(32, 12), frame.status.reshape(32, 12)
             is_new = frame.module_time_ns != before_ns
             before_ns = frame.module_time_ns.copy()
@@ -122,8 +123,6 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
                 cycles = set(values[module].tolist())
                 assert len(cycles) == 1, f"module {module} is torn: {values[module]}"
                 shown[module].add(int(values[module][0]))
-            if count >= 200:
-                break
         assert reader.lost == 0
         orphans = [counters["orphans"] for counters in reader.patch_counters(frame)]
         assert min(orphans) > 10
@@ -150,17 +149,17 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
 @pytest.mark.usefixtures("hurry")
 def test_jitter_costs_no_cycle_and_makes_nothing_stale() -> None:
     bus = emulated(boards=(7, 8), pattern="cycle", jitter_us=8_000)
-    with driving(bus, period_ms=20), DriverReader("roboskin") as reader:
-        start = read_until(reader, lambda f: not f.status.any())
+    with driving(bus, period_ms=20) as running, EveryFrame(running) as every:
+        wait_until(lambda: any(not frame.status.any() for frame in every.taken))
+        start = next(number for number, frame in enumerate(every.taken) if not frame.status.any())
+        wait_until(lambda: len(every.taken) > start + 50)
         shown: list[list[int]] = [[], []]
-        for frame in reader.in_order(timeout_s=30):
+        for frame in every.taken[start : start + 51]:
             for board, values in enumerate(frame.values.reshape(2, 192).tolist()):
                 assert len(set(values)) == 1, "a frame holds two bursts of a board"
                 assert len(set(frame.status[192 * board :][:192].tolist())) == 1, "part of a board is stale"
                 shown[board].append(values[0])
-            if frame.sequence >= start.sequence + 50:
-                break
-        assert reader.lost == 0
+        assert every.reader.lost == 0
     for cycles in shown:
         assert set((np.diff(cycles) % 256).tolist()) <= {0, 1}
         assert len(set(cycles)) >= 25

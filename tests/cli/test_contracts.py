@@ -48,7 +48,8 @@ def test_sigterm_ends_a_driver_in_good_order(namespace: Namespace) -> None:
 
 
 def test_skin_dump_and_skin_info_keep_their_contracts() -> None:
-    with running("skin-driver", *VIRTUAL, "--name", "torso", "--slots", "64") as driver:
+    untouched = ("--bus", "virtual?boards=7,8&pattern=idle")  # a deep touch is out of range, and not fresh
+    with running("skin-driver", *untouched, "--name", "torso", "--slots", "64") as driver:
         driver.wait_for("ready")
         dumped = run("skin-dump", "torso", "-n", "3", "--json")
         frames = [json.loads(line) for line in dumped.stdout.splitlines()]

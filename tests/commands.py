@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -53,15 +53,16 @@ class Running:
         """What it has written to stderr so far."""
         return "".join(self._errors)
 
-    def wait_for(self, event: str) -> dict[str, Any]:
-        """The next event of a kind."""
-        while True:
+    def wait_for(self, event: str, condition: Callable[[dict[str, Any]], bool] = lambda _found: True) -> dict[str, Any]:
+        """The next event of a kind that fulfils a condition."""
+        for _ in range(500):
             try:
                 found = self._events.get(timeout=PATIENCE_S)
             except queue.Empty:
                 raise AssertionError(f"no event {event!r}; stderr: {self.errors}") from None
-            if found["event"] == event:
+            if found["event"] == event and condition(found):
                 return found
+        raise AssertionError(f"no event {event!r} of 500 fulfils the condition {condition}")
 
     def stop(self, number: int = signal.SIGINT) -> dict[str, Any]:
         """Interrupt it; its last event, if it had the time to say one."""

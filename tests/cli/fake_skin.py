@@ -82,6 +82,7 @@ class FakeSkin:
             bus_counters=BUS_COUNTERS,
             patch_counters=PATCH_COUNTERS,
             namespace=namespace,
+            slots=64,
         )
 
     def publish(self, count: int = 1) -> None:

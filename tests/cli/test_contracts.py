@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,11 +17,16 @@ from tests.commands import BIN, run, running
 VIRTUAL = ("--bus", "virtual?boards=7,8")
 
 
+def all_live(status: dict[str, Any]) -> bool:
+    """Whether data of everything comes, as it always does unless the machine kept the program waiting."""
+    return all(part["state"] == "live" for part in (*status["buses"], *status["patches"]))
+
+
 def test_skin_driver_tells_what_it_does() -> None:
     with running("skin-driver", *VIRTUAL) as driver:
         ready = driver.wait_for("ready")
         assert (ready["driver"], ready["sensors"], ready["modules"], ready["patches"]) == ("roboskin", 384, 32, 2)
-        status = driver.wait_for("status")
+        status = driver.wait_for("status", all_live)
         (bus,) = status["buses"]
         assert (bus["name"], bus["state"], bus["lost"], bus["errors"]) == ("virtual?boards=7,8", "live", 0, 0)
         assert bus["frames"] > 0
@@ -42,7 +48,8 @@ def test_sigterm_ends_a_driver_in_good_order(namespace: Namespace) -> None:
 
 
 def test_skin_dump_and_skin_info_keep_their_contracts() -> None:
-    with running("skin-driver", *VIRTUAL, "--name", "torso") as driver:
+    untouched = ("--bus", "virtual?boards=7,8&pattern=idle")  # a deep touch is out of range, and not fresh
+    with running("skin-driver", *untouched, "--name", "torso", "--slots", "64") as driver:
         driver.wait_for("ready")
         dumped = run("skin-dump", "torso", "-n", "3", "--json")
         frames = [json.loads(line) for line in dumped.stdout.splitlines()]
@@ -181,8 +188,8 @@ def test_a_listener_takes_boards_in_on_a_hangup_signal(tmp_path: Path) -> None:
         assert driver.wait_for("ready")["patches"] == 1
         os.kill(driver.process.pid, signal.SIGHUP)
         for _ in range(2):
-            (bus,) = driver.wait_for("status")["buses"]
-            assert (bus["state"], bus["sent"], bus["send_failures"]) == ("live", 0, 0)
+            (bus,) = driver.wait_for("status", all_live)["buses"]
+            assert (bus["sent"], bus["send_failures"]) == (0, 0)
         assert driver.stop()["event"] == "stopped"
         assert driver.process.returncode == 0
 
@@ -211,6 +218,6 @@ def test_frames_of_another_python_can_program_are_decoded() -> None:
         with running("skin-driver", "--bus", bus, "--listen-only") as driver:
             ready = driver.wait_for("ready")
             assert (ready["patches"], ready["sensors"]) == (1, 192)
-            status = driver.wait_for("status")
+            status = driver.wait_for("status", all_live)
             assert status["buses"][0]["sent"] == 0
-            assert status["patches"][0]["state"] == "live"
+            assert len(status["patches"]) == 1

@@ -14,6 +14,7 @@ from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import (
     Closed,
     ConfigurationError,
+    Paused,
     PlatformError,
     ServiceError,
     ServiceTimeout,
@@ -298,13 +299,16 @@ def test_a_signal_ends_a_wait() -> None:
     def ring(_number: int, _frame: object) -> None:
         raise Alarm
 
+    def wait_until_it_rings(reader: ServiceReader[Frame]) -> None:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        reader.read(newer_than=reader.read(), timeout_s=60)
+
     before = signal.signal(signal.SIGALRM, ring)
     try:
         with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
             publish(writer, 1)
-            signal.setitimer(signal.ITIMER_REAL, 0.1)
             with pytest.raises(Alarm):
-                reader.read(newer_than=reader.read(), timeout_s=60)
+                wait_until_it_rings(reader)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
@@ -443,12 +447,21 @@ def test_requests_reach_a_writer_with_another_structure() -> None:
 
 def test_a_pause_in_the_middle_of_a_frame_does_not_publish_it() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        writer.request_server()
+
+        def resume_once_the_loop_has_come_round() -> None:
+            with ServiceReader[Frame]("x") as other, pytest.raises(Paused):
+                other.request(timeout_s=60)  # the loop hears it after the frame that was paused
+            writer.resume()
+
+        resuming = threading.Thread(target=resume_once_the_loop_has_come_round)
         for count, _ in enumerate(writer.periodic(500)):
             if count == 1:
                 writer.pause()
-                threading.Timer(0.05, writer.resume).start()
+                resuming.start()
             if count == 2:
                 break
+        resuming.join(30)
         assert writer.sequence == 1  # the first; the second was paused, the third is not yet published
         assert reader.read().sequence == 1
 

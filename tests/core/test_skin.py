@@ -172,7 +172,7 @@ def test_a_replica_is_whole_for_every_thread() -> None:
     for thread in [*drivers, *lookers]:
         thread.start()
     try:
-        wait_until(lambda: min(seen) > 300)
+        wait_until(lambda: min(seen) > 300, 100.0)
     finally:
         stop.set()
         for thread in [*drivers, *lookers]:

@@ -24,7 +24,7 @@ from skinware_drivers.testing.driving import EmulatedSkin, driving_lines
 from skinware_drivers.virtual.anyskin import EmulatedAnySkin, EmulatedAnySkinOptions
 from skinware_drivers.virtual.skintalk import EmulatedSkintalk, EmulatedSkintalkOptions
 from skinware_drivers.virtual.tactile_glove import EmulatedTactileGlove, EmulatedTactileGloveOptions
-from tests.sdk.driving import read_until
+from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.lines import line
 
 MS = 1_000_000
@@ -203,8 +203,10 @@ def test_a_bad_line_and_a_restart(emulated_skin: Callable[..., EmulatedSkin], dr
     """Lost, short, garbled and repeated frames, and a moment without power: all sensors are fresh again."""
     chance = 0.02 if driver is AnySkinDriver else 0.001  # of a frame, of which the others have many in a cycle
     faults = dict.fromkeys(("lose", "truncate", "corrupt", "repeat"), chance)
-    skin = emulated_skin(driver, emulator, restart=(1,), restart_after_s=1.5, boot_s=0.6, **faults)
+    devices = restarted_on_demand(emulator)
+    skin = emulated_skin(driver, devices, boot_s=0.6, **faults)
     read_until(skin.reader, is_fresh)
+    devices.restart_now = True
     read_until(skin.reader, lambda frame: PatchState.STALE in frame.patch_state)
     read_until(skin.reader, lambda frame: bool((frame.patch_state == PatchState.LIVE).all()) and is_fresh(frame))
 

@@ -22,7 +22,7 @@ from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
 from tests.openpatch import wire
-from tests.sdk.driving import driving_lines, read_until
+from tests.sdk.driving import driving_lines, read_until, restarted_on_demand
 
 MS = 1_000_000
 SAID = wire.Said(
@@ -162,13 +162,16 @@ def test_the_driver_reads_it_and_sets_it_up_again_after_a_restart(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     link = tmp_path / "port"
-    with running(emulated(pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1), link):
+    devices = restarted_on_demand(EmulatedOpenPatch)
+    options = EmulatedOpenPatchOptions(modules=2, serial_number="A", pattern="cycle", boot_s=0.1)
+    with running(devices(options), link):
         driver = OpenPatchDriver(OpenPatchOptions(rate_hz=50))
         bus = SerialBus(str(link), payload_size=driver.payload_size)
         with driving_lines([(driver, bus)], "openpatch"), DriverReader("openpatch", timeout_s=30) as reader:
             before = read_until(reader, lambda f: not f.status.any())
             assert len(set(before.values.tolist())) == 1
             assert before.structure.patch_name.tolist() == [b"emulated A"]
+            devices.restart_now = True
             wait_until(lambda: "emulated A has restarted" in caplog.text)
             since_ns = now_ns()
             read_until(reader, lambda f: bool((f.module_time_ns > since_ns).all()) and not f.status.any())

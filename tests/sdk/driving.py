@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
+from unittest import mock
 
 import msgspec
 
-from skinware.driver_service import DriverReader
+from skinware.driver_service import DriverFrame, DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.running import publisher
 from skinware_drivers.running.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
@@ -21,6 +23,9 @@ from skinware_drivers.virtual.events import CommandReceived
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+
+SILENCE_NS = 600_000_000
+"""How long boards may be silent in tests: a busy machine lets the threads of a test wait for longer than 0.2 s."""
 
 
 def emulated(log: list[msgspec.Struct] | None = None, *, listen_only: bool = False, **options: Any) -> VirtualCanBus:
@@ -36,6 +41,55 @@ def hardware_of(bus: VirtualCanBus) -> EmulatedRoboskin:
 def commands(log: list[msgspec.Struct]) -> list[tuple[int, int, str]]:
     """(time_ns, identifier, payload in hex) of what boards were told."""
     return [(e.time_ns, e.identifier, e.payload) for e in log if isinstance(e, CommandReceived)]
+
+
+def restarted_on_demand(emulator: Any) -> Any:
+    """The same devices, of which the first loses its power for a moment once ``restart_now`` is set.
+
+    How long a driver takes to come up, nobody knows beforehand: ``restart_after_s`` might be over by then.
+    """
+
+    class Restarted(emulator):  # type: ignore[misc]
+        restart_now = False
+
+        def emit(self, now_ns: int) -> list[WireFrame]:
+            if Restarted.restart_now:
+                Restarted.restart_now = False
+                self.restart(self.numbers[0], now_ns)
+            return list(super().emit(now_ns))
+
+    return Restarted
+
+
+class EveryFrame:
+    """Reads in the driver's own thread, in order, after each publication: no machine is too busy for that.
+
+    Attributes:
+        taken: the frames.
+        reader: what reads them.
+    """
+
+    def __init__(self, running: Driving, name: str = "roboskin") -> None:
+        assert running.runner is not None
+        assert running.runner.writer is not None
+        self.taken: list[DriverFrame] = []
+        self.reader: DriverReader = DriverReader(name)
+        writer, commit = running.runner.writer, running.runner.writer.commit
+
+        def commit_and_read(acquired_ns: int) -> int:
+            sequence = commit(acquired_ns)
+            self.taken.append(next(self.reader.in_order(timeout_s=30)))
+            return sequence
+
+        running.do(lambda: setattr(writer, "commit", commit_and_read))
+        self._forget: Callable[[], None] = lambda: running.do(lambda: setattr(writer, "commit", commit))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._forget()
+        self.reader.close()
 
 
 class LateBoards:
@@ -173,15 +227,19 @@ def driving(
     **options: Any,
 ) -> Iterator[Driving]:
     lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
-    with driving_lines(
-        lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
-    ) as running:
+    with (
+        mock.patch.object(publisher, "_LEAST_SILENCE_NS", SILENCE_NS),
+        driving_lines(
+            lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
+        ) as running,
+    ):
         yield running
 
 
 __all__ = [
     "Chatter",
     "Driving",
+    "EveryFrame",
     "LateBoards",
     "Together",
     "TroubledBus",
@@ -192,5 +250,6 @@ __all__ = [
     "follow",
     "hardware_of",
     "read_until",
+    "restarted_on_demand",
     "troubled",
 ]

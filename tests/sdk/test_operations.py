@@ -69,7 +69,10 @@ def test_disabled_boards_stay_silent_until_they_are_enabled() -> None:
         reader.call("enable", patch="board 7", on=False)
         frame = read_until(reader, lambda f: f.patch_state[0] == PatchState.STALE)
         later = read_until(reader, lambda f: f.sequence > frame.sequence + 30)  # longer than it takes to probe
-        assert later.patch_state.tolist() == [PatchState.STALE, PatchState.LIVE]
+        read_until(
+            reader,
+            lambda f: f.sequence >= later.sequence and f.patch_state.tolist() == [PatchState.STALE, PatchState.LIVE],
+        )
         assert told(log, before) == [(0x207, "0701")]  # nobody took it for restarted
         reader.call("enable", patch="board 7")
         read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE and not f.status.any())

@@ -51,12 +51,12 @@ class Line:
     def write(self, data: bytes) -> None:
         """Send all of it."""
         while data:
-            select.select([], [self.master], [], 10)
+            select.select([], [self.master], [], 30)
             data = data[os.write(self.master, data) :]
 
     def read(self, size: int = 65536) -> bytes:
         """What the driver has sent, after waiting for something."""
-        ready, _, _ = select.select([self.master], [], [], 10)
+        ready, _, _ = select.select([self.master], [], [], 30)
         assert ready, "the driver sends nothing"
         return os.read(self.master, size)
 
@@ -157,7 +157,7 @@ class Device(threading.Thread):
 
     def stop(self) -> None:
         self._ending.set()
-        self.join(10)
+        self.join(30)
         assert not self.is_alive()
 
 

@@ -11,7 +11,7 @@ from skinware.errors import RequestFailed
 from skinware_drivers.serial.agni import AgniDriver, command
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
-from tests.sdk.driving import read_until
+from tests.sdk.driving import read_until, restarted_on_demand
 
 CONFIGURATION = bytes.fromhex("F0 C4 00 C0 F4")
 STOP = bytes.fromhex("F0 C4 00 00 34")
@@ -71,11 +71,12 @@ def test_a_device_that_streams_already_and_describes_itself() -> None:
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
     faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with emulated_skin(
-        AgniDriver, EmulatedAgni, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
-    ) as skin:
+    devices = restarted_on_demand(EmulatedAgni)
+    with emulated_skin(AgniDriver, devices, pattern="cycle", boot_s=0.1, **faults) as skin:
         reader = skin.reader
         for live in (True, False, True):
+            if not live:
+                devices.restart_now = True
             frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
             for module in (0, 1):
                 assert len(set(frame.values[frame.structure.module_index(module)].tolist())) == 1

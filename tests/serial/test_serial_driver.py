@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import select
 from pathlib import Path
 
 import numpy as np
@@ -117,11 +118,12 @@ def test_damaged_frames_are_not_shown() -> None:
         wait_until(lambda: runner.ready)
         damaged = bytearray(data_frame(0xEEEE))
         damaged[4] ^= 1
-        tip._flood = bytes(damaged) + data_frame(7) + bytes(damaged)
+        shown = 0xAAAA  # to which the device has not counted before
+        tip._flood = bytes(damaged) + data_frame(shown) + bytes(damaged)
         with DriverReader("fingertip") as reader:
-            read_until(reader, lambda frame: frame.values[0] == 7, 20000)
+            read_until(reader, lambda frame: frame.values[0] == shown, 20000)
             for _, frame in zip(range(200), reader.in_order(timeout_s=30), strict=False):
-                assert (frame.values == 7).all()
+                assert (frame.values == shown).all()
         assert runner.lines[0].bus.counters.errors > 200
 
 
@@ -131,22 +133,25 @@ def test_every_program_sees_what_became_of_every_byte() -> None:
     answer, good = FRAMING.encode(ANSWER, b"I am tip1"), data_frame(2) + data_frame(3)
     garbage, idle, tail = b"garbage" * 3 + b"\0", b"\0" * 5, data_frame(4)[:7]
     with line() as where, driving(where.path) as runner:
-        assert where.read().startswith(FRAMING.encode(ASK, b"who"))
-        where.write(answer)
-        wait_until(lambda: runner.ready)
+        answers = 0
+        while not runner.ready:  # a driver that waited in vain for the first answer asks again
+            if select.select([where.master], [], [], 0.01)[0]:
+                assert FRAMING.encode(ASK, b"who") in where.read()
+                where.write(answer)
+                answers += 1
         where.write(garbage + data_frame(2) + idle + bytes(damaged) + data_frame(3) + tail)
         with DriverReader("fingertip") as reader:
             frame = read_until(reader, lambda frame: frame.values[0] == 3)
-            total = len(answer + garbage + good + idle + damaged + tail)
+            total = len(answers * answer + garbage + good + idle + damaged + tail)
             frame = read_until(reader, lambda frame: reader.bus_counters(frame)[0]["bytes_in"] == total)
             counters = reader.bus_counters(frame)[0]
             shown = json.loads(CliRunner().invoke(info, ["fingertip", "--json"]).output)["drivers"][0]["buses"][0]
             assert [shown[name] for name in OWN_BUS_COUNTERS] == [counters[name] for name in OWN_BUS_COUNTERS]
-        assert counters["frame_bytes"] == len(answer + good)
+        assert counters["frame_bytes"] == len(answers * answer + good)
         assert counters["idle_bytes"] == len(idle)
         assert counters["skipped_bytes"] == len(garbage + damaged)
         assert (counters["checksum_errors"] + counters["bad_form"], counters["errors"]) == (2, 2)
-        assert counters["frames"] == 3
+        assert counters["frames"] == answers + 2
         assert "skipped bytes" in CliRunner().invoke(info, ["fingertip"]).output
 
 

@@ -12,7 +12,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
-from tests.sdk.driving import read_until
+from tests.sdk.driving import read_until, restarted_on_demand
 
 START_10_MS = bytes.fromhex("AA AA AA 21 03 00 00 0A 00 DA B5")
 MATRIX = bytes.fromhex("AA AA AA 30 00 00 CA CF")
@@ -75,17 +75,18 @@ def test_a_sensor_that_streams_already_and_its_operations() -> None:
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
     faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with emulated_skin(
-        WeissWtsDriver, EmulatedWeissWts, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
-    ) as skin:
+    devices = restarted_on_demand(EmulatedWeissWts)
+    with emulated_skin(WeissWtsDriver, devices, pattern="cycle", boot_s=0.1, **faults) as skin:
         reader = skin.reader
 
         def whole(live: bool) -> None:
             frame = read_until(reader, lambda f: (f.patch_state[0] == PatchState.LIVE) == live)
             assert len(set(frame.values.tolist())) == 1
 
-        for live in (True, False, True):
-            whole(live)
+        whole(live=True)
+        devices.restart_now = True
+        whole(live=False)
+        whole(live=True)
 
 
 def test_refusals_and_run_lengths() -> None:

@@ -12,7 +12,7 @@ from skinware.errors import RequestFailed
 from skinware_drivers.serial.wuji_glove import Refused, WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
-from tests.sdk.driving import read_until
+from tests.sdk.driving import read_until, restarted_on_demand
 
 DEVICE_INFO = bytes.fromhex("AA 56 0A 00 01 01 01 00 A7 FA")
 MS = 1_000_000
@@ -80,10 +80,11 @@ def test_values_invalid_cells_and_operations() -> None:
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
     faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "corrupt": 0.02, "repeat": 0.02}
-    with emulated_skin(
-        WujiGloveDriver, EmulatedWujiGlove, pattern="cycle", restart=(1,), restart_after_s=1.0, boot_s=0.1, **faults
-    ) as skin:
+    devices = restarted_on_demand(EmulatedWujiGlove)
+    with emulated_skin(WujiGloveDriver, devices, pattern="cycle", boot_s=0.1, **faults) as skin:
         reader = skin.reader
         for live in (True, False, True):
+            if not live:
+                devices.restart_now = True
             frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
             assert len(set(frame.values.tolist())) == 1

@@ -125,7 +125,7 @@ def test_what_a_test_leaves_behind_fails_it(tmp_path: Path) -> None:
     (tmp_path / "test_it.py").write_text(
         "import threading, time\n"
         "def test_it(namespace):\n"
-        "    threading.Thread(target=time.sleep, args=(3,), name='mine', daemon=True).start()\n"
+        "    threading.Thread(target=time.sleep, args=(100,), name='mine', daemon=True).start()\n"
     )
     assert "the test left behind: thread 'mine'" in pytest_in(tmp_path)
 

@@ -78,7 +78,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
         what = f"{plural(heard.frames, 'frame')} ({heard.rate_hz:,.0f} a second{load})" if heard.frames else "nothing"
         errors = f", {plural(heard.error_frames, 'error frame')}" if heard.error_frames else ""
         errors += f"; the controller tells: {heard.trouble}" if heard.trouble else ""
-        lines += _wrapped(f"heard in {heard.duration_s:g} s: {what}{errors}")
+        lines += _wrapped(f"heard in {heard.duration_s:.1f} s: {what}{errors}")
         for one in heard.classes[:_MOST_CLASSES]:
             span = f"{one.first:X}" if one.first == one.last else f"{one.first:X} to {one.last:X}"
             which = f"{plural(one.identifiers, 'identifier')}, {span}"

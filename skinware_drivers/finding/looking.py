@@ -92,16 +92,18 @@ async def listen_on(bus: Bus, bus_name: str, duration_s: float, drivers: Mapping
     traffic, bits_before = Traffic(), bus.wire_bits
     try:
         async with attended(bus, traffic.take):
+            begun_ns = now_ns()
             await asyncio.sleep(duration_s)
+            passed_ns = now_ns() - begun_ns  # on a busy machine, more than was asked for
             reason = bus.reason(now_ns())
     except BusNotAvailable as error:
         return HeardOnBus(bus_name, str(error))
     return HeardOnBus(
         bus=bus_name,
-        duration_s=duration_s,
+        duration_s=passed_ns / NS_PER_S,
         frames=traffic.frames,
-        rate_hz=traffic.frames / duration_s if duration_s else 0.0,
-        load=share_of_time(bus, bus.wire_bits - bits_before, round(duration_s * NS_PER_S)) if duration_s else None,
+        rate_hz=traffic.frames * NS_PER_S / passed_ns,
+        load=share_of_time(bus, bus.wire_bits - bits_before, passed_ns),
         error_frames=bus.counters.errors,
         trouble=reason_text(reason) if reason else "",
         lost=bus.counters.lost,

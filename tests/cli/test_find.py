@@ -119,7 +119,7 @@ def test_what_is_heard_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert "CAN interfaces" not in text
     (bus,) = found_data(capsys, STREAMING)["buses"]
     assert bus["heard"]["guesses"][0]["patches"] == ["board 7", "board 8"]
-    assert bus["heard"]["duration_s"] == 0.2
+    assert bus["heard"]["duration_s"] >= 0.2
     assert bus["probe"] is None
     assert "no installed driver knows" not in text
 

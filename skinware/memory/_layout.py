@@ -190,7 +190,7 @@ def plan(
         ConfigurationError: a slot count or a column that the format cannot hold.
     """
     if not MIN_SLOTS <= slot_count <= MAX_SLOTS:
-        raise ConfigurationError(f"{slot_count} slots: give {MIN_SLOTS} to {MAX_SLOTS}")
+        raise ConfigurationError(f"slots={slot_count}: give {MIN_SLOTS} to {MAX_SLOTS}")
     if len(static) + len(slot) > MAX_COLUMNS:
         raise ConfigurationError(f"{len(static) + len(slot)} columns: at most {MAX_COLUMNS}")
     end = COLUMN_OFFSET + COLUMN.itemsize * (len(static) + len(slot))

@@ -102,7 +102,10 @@ class Frame:
         Raises:
             KeyError: no column of that name.
         """
-        shape, dtype, offset = self._columns[name]
+        try:
+            shape, dtype, offset = self._columns[name]
+        except KeyError:
+            raise KeyError(f"no column {name!r}; there are {', '.join(self._columns)}") from None
         return np.ndarray(shape, dtype, self._data, offset)
 
     def __repr__(self) -> str:

@@ -108,7 +108,13 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     type=click.Choice(["cycle", "rate", "request"]),
     help="When every patch has delivered, at the driver's rate, or what programs ask for.  [default: as the driver]",
 )
-@click.option("--slots", type=int, default=8, show_default=True, help="Frames that slow users may lag behind, 2-64.")
+@click.option(
+    "--slots",
+    type=click.IntRange(2, 64),
+    default=8,
+    show_default=True,
+    help="Frames that slow users may lag behind, 2-64.",
+)
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")

@@ -66,6 +66,14 @@ def kill(process: Any) -> None:
 # -- coherency ----------------------------------------------------------------------------------------------------
 
 
+def test_a_column_that_there_is_not_is_refused_with_those_that_there_are() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        writer.begin()
+        writer.commit(now_ns())
+        with pytest.raises(KeyError, match="no column 'velocity'; there are values"):
+            reader.read().column("velocity")
+
+
 def test_a_slot_that_is_being_filled_is_never_handed_out() -> None:
     with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
         publish(writer, 1)
@@ -237,7 +245,7 @@ def test_a_forked_child_neither_writes_nor_keeps_the_writer_alive() -> None:
 
 @pytest.mark.parametrize("slots", [0, 1, 65])
 def test_impossible_slots_are_refused_and_the_name_is_free_again(slots: int, namespace: Namespace) -> None:
-    with pytest.raises(ConfigurationError, match=f"{slots} slots: give 2 to 64"):
+    with pytest.raises(ConfigurationError, match=f"slots={slots}: give 2 to 64"):
         ServiceWriter("x", SMALL, slots=slots)
     assert namespace.services() == []
     with ServiceWriter("x", SMALL) as writer:

@@ -57,10 +57,15 @@ class FakeSkin:
         name: of the driver.
         structure: default: four patches of sixteen modules.
         namespace: default: the one of the environment.
+        slots: of its ring.
     """
 
     def __init__(
-        self, name: str = "fake", structure: Structure | None = None, namespace: Namespace | None = None
+        self,
+        name: str = "fake",
+        structure: Structure | None = None,
+        namespace: Namespace | None = None,
+        slots: int = 64,
     ) -> None:
         self.structure = structure or fake_structure()
         self.is_hung = False
@@ -82,7 +87,7 @@ class FakeSkin:
             bus_counters=BUS_COUNTERS,
             patch_counters=PATCH_COUNTERS,
             namespace=namespace,
-            slots=64,
+            slots=slots,
         )
 
     def publish(self, count: int = 1) -> None:

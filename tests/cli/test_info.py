@@ -40,7 +40,7 @@ def text(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2), slots=8) as skin, DriverReader("torso") as reader:
         skin.break_some()
         skin.publish(8)
         reader.read()
@@ -143,7 +143,7 @@ def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_the_rate_is_that_of_the_frames_in_the_ring(capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeSkin("a") as skin, DriverReader("a", announce=False) as reader:
+    with FakeSkin("a", slots=8) as skin, DriverReader("a", announce=False) as reader:
         assert told(capsys)["drivers"][0]["rate_hz"] == 0.0
         skin.publish()
         assert told(capsys)["drivers"][0]["rate_hz"] is None  # one frame makes no rate
@@ -299,7 +299,7 @@ def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Nam
 
 
 def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]) -> None:
-    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin, DriverReader("torso") as reader:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2), slots=8) as skin, DriverReader("torso") as reader:
         skin.break_some()
         skin.publish(8)
         reader.read()

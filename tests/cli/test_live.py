@@ -87,7 +87,7 @@ def test_what_cannot_be_read_any_more_is_dropped() -> None:
 
 
 def test_two_frames_at_once_right_after_a_start_make_no_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    with FakeSkin("a") as skin, closing(LiveDrivers(Namespace())) as drivers:
+    with FakeSkin("a", slots=8) as skin, closing(LiveDrivers(Namespace())) as drivers:
         clock_ns = now_ns()
         monkeypatch.setattr(ring, "now_ns", lambda: clock_ns)
         skin.publish()

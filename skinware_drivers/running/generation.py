@@ -65,7 +65,6 @@ class Generation:
         self.batch = make_batch(self.lines, self.decoder.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patch_state.copy()
-        self.publisher.bus_limits = [line.limits for line in self.lines]
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         for line in self.lines:
             if line.patches:
@@ -108,6 +107,7 @@ class Generation:
             self.publisher.bus_state[line.ordinal] = line.state
             self.publisher.bus_reason[line.ordinal] = line.reason
             self.publisher.bus_since_ns[line.ordinal] = line.since_ns
+            self.publisher.bus_load[line.ordinal] = line.limits.permille
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
         """Number of a patch in the structure, None if it is not in it (any more)."""

@@ -10,13 +10,12 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState, PatchState, Status
+from skinware.status import LOAD_UNKNOWN, BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 from skinware_drivers.running.bursts import Bursts
-from skinware_drivers.running.limits import BusLimits
 from skinware_drivers.running.patch_timing import PatchTiming
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
@@ -98,7 +97,7 @@ class Publisher:
         self.bus_state: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(BusState.CONNECTING), np.uint8)
         self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
         self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
-        self.bus_limits: Sequence[BusLimits] = ()
+        self.bus_load: npt.NDArray[np.uint16] = np.full(len(structure.buses), LOAD_UNKNOWN, np.uint16)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -177,8 +176,7 @@ class Publisher:
         columns["bus_state"][:] = self.bus_state
         columns["bus_reason"][:] = self.bus_reason
         columns["bus_since_ns"][:] = self.bus_since_ns
-        if self.bus_limits:
-            columns["bus_load"][:] = [limits.permille for limits in self.bus_limits]
+        columns["bus_load"][:] = self.bus_load
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinware.status import load_report
+from skinware import DriverReader
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.running.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
-from tests.sdk.driving import emulated
+from tests.sdk.driving import driving, emulated, read_until
 from tests.sdk.test_bus_states import Clock
 
 
@@ -77,6 +78,14 @@ def test_of_a_bus_with_filters_the_load_is_not_known(watched: tuple[Bus, BusLimi
     clock.pass_s(1)
     limits.look()
     assert load_report(limits.permille) == {"load": None, "load_unknown": "filter"}
+
+
+def test_every_reader_sees_the_load() -> None:
+    filtered, busy = emulated(boards=(7,)), emulated(boards=(8,))
+    filtered.narrows, busy.bit_rate = True, 1_000_000
+    with driving(filtered, busy), DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: f.bus_load[0] == LOAD_FILTERED and f.bus_load[1] != LOAD_UNKNOWN)
+    assert frame.bus_load[1] == 1  # no frame was counted, but it is known
 
 
 def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:

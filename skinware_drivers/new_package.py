@@ -11,8 +11,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterable
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -58,7 +57,7 @@ def check_name(name: str) -> None:
     if keyword.iskeyword(name):
         raise ConfigurationError(f"{name!r} is a word of Python and cannot name a package")
     for group, what in ((DRIVERS, "driver"), (EMULATORS, "emulator")):
-        for taken in _named(entry_points(group=group), name):
+        for taken in entry_points(group=group, name=name):
             raise ConfigurationError(f"there is {what} {name!r} already ({taken.value}): choose another name")
     if name in sys.stdlib_module_names or find_spec(name) is not None:
         raise ConfigurationError(f"there is a Python package {name!r} already, which yours would hide: choose another")
@@ -106,7 +105,3 @@ def _files(part: str) -> dict[str, str]:
 
 def _template(part: str, name: str) -> Template:
     return Template((files("skinware_drivers") / "templates" / part / f"{name}.template").read_text())
-
-
-def _named(entries: Iterable[EntryPoint], name: str) -> list[EntryPoint]:
-    return [entry for entry in entries if entry.name == name]

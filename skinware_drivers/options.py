@@ -16,7 +16,7 @@ import re
 import traceback
 import types
 from collections.abc import Iterable, Mapping
-from importlib.metadata import EntryPoint
+from importlib.metadata import entry_points
 from typing import (
     Annotated,
     Any,
@@ -194,21 +194,27 @@ def nearest_name(wrong: str, right: Iterable[str]) -> str:
     return f"{hint} Known: {', '.join(names) or 'none'}"
 
 
-def load_entry_point(entry: EntryPoint, what: str) -> Any:
-    """What somebody's package has registered.
+def load_registered(group: str, kind: str, name: str, unknown: str) -> Any:
+    """What somebody's package has registered under a name.
 
     Args:
-        entry: as it is registered.
-        what: for messages.
+        group: of entry points.
+        kind: what those are, for messages: ``driver``.
+        name: of the one that is wanted.
+        unknown: what to say if there is none of that name.
 
     Raises:
-        ConfigurationError: it cannot be loaded; the message says why, and where in the package.
+        ConfigurationError: there is none, or it cannot be loaded; the message says why, and where in the package.
     """
+    known = {entry.name: entry for entry in entry_points(group=group)}
+    if name not in known:
+        names = nearest_name(name, known)
+        raise ConfigurationError(f"{unknown}{names}. One of yours has to be installed: pip install -e .")
     try:
-        return entry.load()
+        return known[name].load()
     except Exception as error:
         raise ConfigurationError(
-            f"{what} ({entry.value}) cannot be loaded: {type(error).__name__}: {error}{_place_of(error)}"
+            f"{kind} {name!r} ({known[name].value}) cannot be loaded: {type(error).__name__}: {error}{_place_of(error)}"
         ) from error
 
 
@@ -302,7 +308,7 @@ __all__ = [
     "Option",
     "check_options",
     "describe_options",
-    "load_entry_point",
+    "load_registered",
     "nearest_name",
     "option_text",
     "options_from_strings",

@@ -9,7 +9,7 @@ from urllib.parse import parse_qsl
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import load_entry_point, nearest_name
+from skinware_drivers.options import load_registered, nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
@@ -88,11 +88,8 @@ def load_driver(name: str) -> type[AnyAdapter]:
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
-    known = {entry.name: entry for entry in entry_points(group=DRIVERS)}
-    if name not in known:
-        names = nearest_name(name, known)
-        raise ConfigurationError(f"unknown driver {name!r}{names}. One of yours has to be installed: pip install -e .")
-    loaded = load_entry_point(known[name], f"driver {name!r}")
+    loaded = load_registered(DRIVERS, "driver", name, f"unknown driver {name!r}")
     if not (isinstance(loaded, type) and issubclass(loaded, Adapter)):
-        raise ConfigurationError(f"driver {name!r}: {known[name].value} is no subclass of CanAdapter or its like")
+        *_, entry = entry_points(group=DRIVERS, name=name)
+        raise ConfigurationError(f"driver {name!r}: {entry.value} is no subclass of CanAdapter or its like")
     return loaded

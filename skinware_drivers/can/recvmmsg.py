@@ -81,6 +81,7 @@ _rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()
 
 def rows_of(batch: FrameBatch) -> Rows:
     """Made once for a batch: all buses that fill it share them, as they share its rows."""
-    if batch not in _rows:
-        _rows[batch] = Rows(batch)
-    return _rows[batch]
+    rows = _rows.get(batch)
+    if rows is None:
+        rows = _rows[batch] = Rows(batch)
+    return rows

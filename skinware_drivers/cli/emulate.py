@@ -75,7 +75,7 @@ def command(
     options = options_from_strings(emulator.Options, given)
     medium = medium_of(emulator)
     bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
-    if bus.medium not in (None, medium):
+    if not bus.fits(medium):
         where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty:./port or a port"
         raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
     log = JsonLinesLog(log_path) if log_path else None

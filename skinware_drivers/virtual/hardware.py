@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options import load_entry_point, nearest_name
+from skinware_drivers.options import load_registered
 
 EMULATORS = "skinware.emulators"
 """The entry point group in which emulators register, under the name of the driver they serve."""
@@ -96,13 +96,7 @@ def load_emulator(name: str) -> HardwareFactory:
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
-    known = {entry.name: entry for entry in entry_points(group=EMULATORS)}
-    if name not in known:
-        names = nearest_name(name, known)
-        raise ConfigurationError(
-            f"there is no emulator {name!r}{names}. One of yours has to be installed: pip install -e ."
-        )
-    emulator: HardwareFactory = load_entry_point(known[name], f"emulator {name!r}")
+    emulator: HardwareFactory = load_registered(EMULATORS, "emulator", name, f"there is no emulator {name!r}")
     return emulator
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,7 @@ from skinware_drivers import Frame, Identifier, Layout, Module, NoOptions, Patch
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.cli import emulate
 from skinware_drivers.cli.driver import command
-from skinware_drivers.options import load_entry_point
-from skinware_drivers.registry import parse_bus_name
+from skinware_drivers.registry import load_driver, parse_bus_name
 
 
 @pytest.mark.parametrize(
@@ -72,11 +70,15 @@ def test_a_path_may_have_an_equals_sign() -> None:
 def test_a_driver_that_cannot_be_imported_says_where(
     text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
     module = f"mine_{abs(hash(text))}"  # a module is imported once
     (tmp_path / f"{module}.py").write_text(text)
+    installed = tmp_path / "mine-1.dist-info"
+    installed.mkdir()
+    (installed / "METADATA").write_text("Name: mine\nVersion: 1\n")
+    (installed / "entry_points.txt").write_text(f"[skinware.drivers]\nmine = {module}:Driver\n")
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ConfigurationError, match=f"driver 'mine' .* cannot be loaded: .*{words}"):
-        load_entry_point(EntryPoint("mine", f"{module}:Driver", "skinware.drivers"), "driver 'mine'")
+        load_driver("mine")
 
 
 class Complete(CanAdapter[NoOptions]):

@@ -22,7 +22,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import msgspec.structs
@@ -53,6 +53,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         wait: for a bus to appear, if there is none at the start.
         publish: when frames are published: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
+        latency_ms: the longest that frames may wait so that more are taken with them, 0 to 1000; None for the default.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
     """
@@ -62,6 +63,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     listen_only: bool = False
     wait: bool = False
     publish: Literal["", "cycle", "rate", "request"] = ""
+    latency_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
     realtime: str | None = None
     cpus: tuple[int, ...] = ()
     options: dict[str, Any] = {}

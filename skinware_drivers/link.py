@@ -85,6 +85,11 @@ class Link:
         """Whether sending is forbidden."""
         return self._bus.listen_only
 
+    @property
+    def is_awaiting(self) -> bool:
+        """Whether somebody waits for an answer."""
+        return bool(self._waiters)
+
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:
         """Send one frame; waits while the interface's queue is full.
 

@@ -115,6 +115,13 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     show_default=True,
     help="Frames that slow users may lag behind, 2-64.",
 )
+@click.option(
+    "--latency",
+    "latency_ms",
+    type=click.FloatRange(0, 1000),
+    metavar="MS",
+    help="Longest that frames may wait so that more are taken with them; less costs processor time.  [default: 5]",
+)
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
@@ -138,6 +145,7 @@ def command(
     wait: bool,
     publish: PublishMode | None,
     slots: int,
+    latency_ms: float | None,
     group: str | None,
     realtime: str | None,
     cpus: str | None,
@@ -158,6 +166,7 @@ def command(
     """
     from skinware.memory.namespace import Namespace
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
+    from skinware_drivers.running.intake import DEFAULT_LATENCY_S
     from skinware_drivers.running.runner import Runner
 
     logging.basicConfig(
@@ -168,6 +177,7 @@ def command(
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
     driver_type = driver_name or settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
+    latency_ms = settings.latency_ms if latency_ms is None else latency_ms
     listen_only = listen_only or settings.listen_only
     bus_names = list(buses) or [bus.name for bus in settings.bus]
     if not bus_names:
@@ -202,6 +212,7 @@ def command(
         listen_only=listen_only,
         wait_for_buses=wait or settings.wait,
         publish=publish or settings.publish or None,
+        latency_s=DEFAULT_LATENCY_S if latency_ms is None else latency_ms / 1e3,
         namespace=Namespace(namespace),
         slots=slots,
         group=group,

@@ -13,7 +13,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running.bus_line import BusLine
 
 _TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
-_REST, _LONGEST_REST_S = 4, 0.005  # after a take: so many times its duration, while more arrives (decision 0006)
+_REST, _REST_WHILE_ASKING = 16, 4  # after a take: so many times its duration, while more arrives (decision 0006)
+DEFAULT_LATENCY_S = 0.005
+"""What the longest rest is if nobody says."""
 
 
 class Intake:
@@ -24,6 +26,7 @@ class Intake:
         lines: the buses; the list may change.
         empty_batch: gives the batch to fill.
         digest: gets it, filled.
+        latency_s: the longest rest.
     """
 
     def __init__(
@@ -32,11 +35,13 @@ class Intake:
         lines: Sequence[BusLine],
         empty_batch: Callable[[], FrameBatch],
         digest: Callable[[FrameBatch], None],
+        latency_s: float,
     ) -> None:
         self._epoll = epoll
         self._lines = lines
         self._empty_batch = empty_batch
         self._digest = digest
+        self._latency_s = latency_s
         self._rest: asyncio.TimerHandle | None = None
         self._by_fd: dict[int, BusLine] = {}
 
@@ -72,7 +77,8 @@ class Intake:
             self.start()
         else:
             loop.remove_reader(self._epoll.fileno())
-            rest_s = min(_REST * (now_ns() - begun_ns) / NS_PER_S, _LONGEST_REST_S)
+            factor = _REST_WHILE_ASKING if any(line.link.is_awaiting for line in self._lines) else _REST
+            rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self._latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:

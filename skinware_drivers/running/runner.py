@@ -29,10 +29,11 @@ from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
-from skinware_drivers.running.intake import Intake
+from skinware_drivers.running.intake import DEFAULT_LATENCY_S, Intake
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.patch_care import PatchCare
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.turns import short_turns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -50,6 +51,7 @@ class Runner:
         wait_for_buses: for one to appear, if there is none at the start.
         publish: ``cycle`` (when every living patch has delivered), ``rate`` (at the adapter's rate), ``request`` (by
             cycle, but only what a program has asked for); default: what the adapter says.
+        latency_s: the longest that frames may wait so that more are taken with them, s.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         on_ready: called once, when frames are being published.
 
@@ -70,6 +72,7 @@ class Runner:
         listen_only: bool = False,
         wait_for_buses: bool = False,
         publish: PublishMode | None = None,
+        latency_s: float = DEFAULT_LATENCY_S,
         namespace: Namespace | None = None,
         slots: int = DEFAULT_SLOTS,
         group: str | None = None,
@@ -95,7 +98,7 @@ class Runner:
         self._on_ready = on_ready
         self._machine = MachineLimits()
         self._serving: dict[BusLine, asyncio.Task[None]] = {}
-        self._intake = Intake(self._epoll, self.lines, self._empty_batch, self._digest)
+        self._intake = Intake(self._epoll, self.lines, self._empty_batch, self._digest, latency_s)
         self._first_batch = make_batch(self.lines)
         self._stopping = asyncio.Event()
         self._failure: BaseException | None = None
@@ -112,12 +115,17 @@ class Runner:
     async def run(self) -> None:
         """Run until ``stop``. A bus that is not there is waited for while the others go on.
 
+        Meanwhile other threads of this process get short turns of the interpreter (see ``running.turns``).
+
         Raises:
             BusNotAvailable: at the start, not one bus is there, or this user may not open one.
             NameInUse: a living driver has this name.
             NamespaceError: the namespace cannot be used.
         """
-        loop = asyncio.get_running_loop()
+        with short_turns():
+            await self._run(asyncio.get_running_loop())
+
+    async def _run(self, loop: asyncio.AbstractEventLoop) -> None:
         self._namespace.create(self._group)
         try:
             self._open_buses()

@@ -1,13 +1,17 @@
-"""``skin-driver --realtime`` and ``--cpus``, on the command line and in a file."""
+"""``skin-driver --realtime``, ``--cpus`` and ``--latency``, on the command line and in a file."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from skinware import DriverReader
+from skinware.errors import ConfigurationError
+from skinware_drivers.cli.driver import command
+from skinware_drivers.running import runner
 from tests import scheduling
 from tests.commands import BIN, run, running
 from tests.scheduling import may_have_fifo
@@ -85,6 +89,25 @@ def test_a_driver_without_rights_says_so_line_by_line_and_runs() -> None:
 
 
 @pytest.mark.parametrize(
+    ("file", "arguments", "latency_s"),
+    [("", (), 0.005), ("latency_ms = 2", (), 0.002), ("latency_ms = 2", ("--latency", "0.5"), 0.0005)],
+)
+def test_how_long_frames_may_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: str, arguments: tuple[str, ...], latency_s: float
+) -> None:
+    known: dict[str, Any] = {}
+
+    def remember(*_arguments: object, **settings: object) -> None:
+        known.update(settings)
+        raise ConfigurationError("enough")
+
+    monkeypatch.setattr(runner, "Runner", remember)
+    with pytest.raises(ConfigurationError, match="enough"):
+        command.main(["--config", str(config_file(tmp_path, file)), *arguments], standalone_mode=False)
+    assert known["latency_s"] == pytest.approx(latency_s)
+
+
+@pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--realtime", "fast"], "real-time profile 'fast': give normal or fifo:PRIORITY"),
@@ -113,6 +136,7 @@ def test_wrong_text_gets_one_line_and_exit_code_2(arguments: list[str], words: s
         ('realtime = ""', "real-time profile ''"),
         ("realtime = 50", "Expected str"),
         ("cpus = [99999]", "CPU 99999 is not there"),
+        ("latency_ms = -1", "Expected float >= 0.0"),
         ('cpus = "1"', "Expected array"),
         ('realtim = "normal"', "unknown key 'realtim'; did you mean 'realtime'"),
     ],

@@ -1,0 +1,116 @@
+"""How long the driver rests after it has taken frames, and the turns of other threads meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import select
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from skinware import DriverReader
+from skinware.realtime import now_ns
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.running import intake
+from skinware_drivers.running.intake import Intake
+from skinware_drivers.running.turns import TURN_S, short_turns
+from tests.sdk.driving import driving, emulated
+
+TAKE_NS = 100_000
+
+
+def rest_after_a_take(monkeypatch: pytest.MonkeyPatch, *, latency_s: float, is_awaiting: bool = False) -> float:
+    """What the loop is asked for after a take of TAKE_NS, s; the clock stands still otherwise."""
+    clock_ns = now_ns()
+    monkeypatch.setattr(intake, "now_ns", lambda: clock_ns)
+    read, write = os.pipe()
+    epoll = select.epoll()
+    rests: list[float] = []
+
+    def receive(batch: FrameBatch, ordinal: int) -> int:
+        os.read(read, 1)
+        return 0
+
+    def digest(batch: FrameBatch) -> None:
+        nonlocal clock_ns
+        clock_ns += TAKE_NS
+
+    async def take() -> None:
+        loop = asyncio.get_running_loop()
+        gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, latency_s)
+        gather.start()
+        first_rest = loop.create_future()
+
+        def call_later(delay_s: float, call: Any) -> asyncio.TimerHandle:
+            rests.append(delay_s)
+            first_rest.set_result(None)
+            return loop.call_at(loop.time() + 3600, call)
+
+        monkeypatch.setattr(loop, "call_later", call_later)
+        os.write(write, b".")
+        await first_rest
+        gather.stop()
+
+    line: Any = SimpleNamespace(
+        bus=SimpleNamespace(receive=receive, fileno=lambda: read),
+        link=SimpleNamespace(is_awaiting=is_awaiting),
+        ordinal=0,
+    )
+    try:
+        epoll.register(read, select.EPOLLIN)
+        asyncio.run(take())
+    finally:
+        epoll.close()
+        os.close(read)
+        os.close(write)
+    (rest_s,) = rests
+    return rest_s
+
+
+def test_the_rest_is_in_proportion_to_what_the_take_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rest_after_a_take(monkeypatch, latency_s=1.0) == pytest.approx(16 * TAKE_NS / 1e9)
+
+
+def test_while_an_answer_is_waited_for_it_is_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert rest_after_a_take(monkeypatch, latency_s=1.0, is_awaiting=True) == pytest.approx(4 * TAKE_NS / 1e9)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 1e-4, 1e-3])
+def test_it_is_never_longer_than_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, latency_s: float) -> None:
+    assert rest_after_a_take(monkeypatch, latency_s=latency_s) == latency_s
+
+
+def test_turns_are_short_until_the_last_driver_has_ended() -> None:
+    before_s = sys.getswitchinterval()
+    first, second = short_turns(), short_turns()
+    try:
+        first.__enter__()
+        second.__enter__()
+        assert sys.getswitchinterval() == pytest.approx(TURN_S, abs=3e-6)
+        first.__exit__(None, None, None)
+        assert sys.getswitchinterval() == pytest.approx(TURN_S, abs=3e-6)
+        second.__exit__(None, None, None)
+        assert sys.getswitchinterval() == pytest.approx(before_s, abs=3e-6)
+    finally:
+        sys.setswitchinterval(before_s)
+
+
+def test_turns_that_are_shorter_already_stay_so() -> None:
+    before_s = sys.getswitchinterval()
+    try:
+        sys.setswitchinterval(TURN_S / 10)
+        with short_turns():
+            assert sys.getswitchinterval() == pytest.approx(TURN_S / 10, abs=3e-6)
+    finally:
+        sys.setswitchinterval(before_s)
+
+
+def test_a_driver_shortens_the_turns_of_others_while_it_runs() -> None:
+    before_s = sys.getswitchinterval()
+    with driving(emulated(boards=(7,))), DriverReader("roboskin", timeout_s=30) as reader:
+        reader.read(timeout_s=30)
+        assert sys.getswitchinterval() == pytest.approx(TURN_S, abs=3e-6)
+    assert sys.getswitchinterval() == pytest.approx(before_s, abs=3e-6)

@@ -186,7 +186,8 @@ class Adapter(HasOptions[OptionsT], ABC):
     async def revive(self, link: Link, patch: Patch) -> None:  # noqa: ARG002
         """Set one patch up anew and start it; by default, whatever is on the bus, once for all that need it.
 
-        To be overridden where patches can be set up one by one, or where the others would be disturbed.
+        To be overridden where patches can be set up one by one: as long as one patch is missing, the others are
+        disturbed, after 1 s, 2 s, 4 s and so on, at last once a minute.
         """
         await self.configure(link)
         await self.start(link)

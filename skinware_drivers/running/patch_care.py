@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
+_FIRST_PAUSE_NS, _LONGEST_PAUSE_NS = NS_PER_S, 60 * NS_PER_S  # between set-ups that disturb living patches
 
 Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
@@ -50,7 +51,8 @@ class PatchCare:
         self._beside = beside
         adapter = type(line.adapter)
         self._revives_all = adapter.revive is Adapter.revive
-        self._asks_nobody = adapter.probe is Adapter.probe
+        self._knows_only_all = self._revives_all and adapter.probe is Adapter.probe
+        self._pause_ns = self._not_before_ns = 0
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
     async def check_data(self) -> None:
@@ -78,8 +80,8 @@ class PatchCare:
         if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
             states.append(PatchState.RESTARTED)
         silent, asked_ns = generation.patches_in(line, *states), now_ns()
-        if self._asks_nobody and self._revives_all:
-            silent = silent[:1]  # the others are set up with it
+        if self._knows_only_all:
+            silent = silent[:1] if self._may_set_up_all(silent) else []  # the others are set up with it
         for patch in silent:
             try:
                 if not await line.adapter.probe(line.link, patch):
@@ -89,6 +91,19 @@ class PatchCare:
                 log.debug("%s: %s", line.name, str(error))
                 continue
             await self._revive(patch, asked_ns)
+
+    def _may_set_up_all(self, silent: Sequence[Patch]) -> bool:
+        """Whether the whole bus is to be set up for silent patches: more and more rarely while that disturbs others."""
+        if not silent:
+            self._pause_ns = self._not_before_ns = 0
+            return False
+        if not self._patches_in(PatchState.LIVE):
+            return True
+        if now_ns() < self._not_before_ns:
+            return False
+        self._pause_ns = min(max(2 * self._pause_ns, _FIRST_PAUSE_NS), _LONGEST_PAUSE_NS)
+        self._not_before_ns = now_ns() + self._pause_ns
+        return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
         """Hear what devices say of themselves, for ever.

@@ -10,10 +10,13 @@ from typing import Any, cast
 import pytest
 
 from skinware.errors import HandshakeTimeout
+from skinware.realtime import NS_PER_S
+from skinware.status import PatchState
 from skinware_drivers.adapter import NoOptions, Notice
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
+from skinware_drivers.running import patch_care
 from skinware_drivers.running.patch_care import PatchCare
 
 PATCHES = [Patch(f"patch {key}", [Module(taxels(1, first_uid=key))], key=key) for key in range(8)]
@@ -49,14 +52,16 @@ class OneByOne(Answering):
 
 
 class Stage:
-    """A bus on which every patch is silent; nothing is ever published.
+    """A bus on which every patch is silent at first; nothing is ever published.
 
     Attributes:
+        states: of the patches, by their keys.
         forgotten: keys of the patches whose sequence numbers may begin anew.
         tasks: what was started beside the rest.
     """
 
     def __init__(self, adapter: Silent) -> None:
+        self.states = dict.fromkeys(range(len(PATCHES)), PatchState.STALE)
         self.forgotten: list[int] = []
         self.tasks: list[asyncio.Task[None]] = []
         nothing: Callable[..., None] = lambda *_: None  # noqa: E731
@@ -65,7 +70,7 @@ class Stage:
             publisher=SimpleNamespace(silence_ns=0, lose=nothing),
             decoder=SimpleNamespace(forget=self.forgotten.append),
             watch=SimpleNamespace(forget=nothing),
-            patches_in=lambda *_: PATCHES,
+            patches_in=lambda _line, *states: [patch for patch in PATCHES if self.states[patch.key] in states],
             number_of=lambda _line, patch: patch.key,
         )
         line = SimpleNamespace(
@@ -100,6 +105,35 @@ def test_silent_patches_that_can_only_be_set_up_together_are_so_once(
         assert adapter.set_ups == 2 * set_ups
 
     asyncio.run(run())
+
+
+def test_a_patch_that_stays_away_has_the_living_ones_disturbed_more_and_more_rarely(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock_ns = 1000 * NS_PER_S
+    monkeypatch.setattr(patch_care, "now_ns", lambda: clock_ns)
+    adapter = Silent(fails=False)
+    stage = Stage(adapter)
+    stage.states = {key: PatchState.STALE if key == 3 else PatchState.LIVE for key in stage.states}
+
+    async def at_seconds(end_s: int) -> list[int]:
+        """When it was set up, in the next seconds."""
+        nonlocal clock_ns
+        times = []
+        for second in range(end_s):
+            before = adapter.set_ups
+            await stage.care.recover_silent()
+            times += [second] * (adapter.set_ups - before)
+            clock_ns += NS_PER_S
+        return times
+
+    assert asyncio.run(at_seconds(200)) == [0, 1, 3, 7, 15, 31, 63, 123, 183]
+    stage.states[3] = PatchState.LIVE
+    assert asyncio.run(at_seconds(2)) == []
+    stage.states[5] = PatchState.STALE  # another time: at once
+    assert asyncio.run(at_seconds(3)) == [0, 1]
+    stage.states = dict.fromkeys(stage.states, PatchState.STALE)  # nobody is disturbed
+    assert asyncio.run(at_seconds(3)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -1,17 +1,21 @@
-"""Fuzzing of the framers, guided by coverage: ``tools/fuzz [NAME ...] [--seconds 60] [--keep]``.
+"""Fuzzing of the framers, guided by coverage: ``tools/fuzz [NAME ...] [--seconds 60] [--seed N] [--keep]``.
 
 Every framing of the tests and of the installed drivers gets an equal part of the time, in a process of its own, with
 at most 1 GiB of memory and 10 s for an input. It begins with the seeds in tests/serial/seeds and with what earlier
 runs left in .cache/fuzz. What it breaks is written to .cache/fuzz/NAME.crash-*, and belongs into the seeds once
 the cause is removed: ``--keep`` writes some of what reached anything new there. The tests run the seeds, and changes of
-them that are always the same; here everything is different each time.
+them that are always the same; here everything is different each time, unless ``--seed`` is given, as ``tools/test fuzz``
+does: a failure there comes again.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,9 +46,11 @@ def libfuzzer(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
 
 
-def fuzz(name: str, seconds: float) -> bool:
+def fuzz(name: str, seconds: float, seed: int | None) -> bool:
     """Fuzz one framing for a time; tells whether it held."""
-    corpus = CACHE / name
+    corpus = CACHE / (name if seed is None else f"{name}.seed-{seed}")
+    if seed is not None:
+        shutil.rmtree(corpus, ignore_errors=True)  # what earlier runs found would lead elsewhere
     corpus.mkdir(parents=True, exist_ok=True)
     seeds = SEEDS / f"{name}.hex"
     for number, line in enumerate(seeds.read_text().split() if seeds.exists() else []):
@@ -57,6 +63,7 @@ def fuzz(name: str, seconds: float) -> bool:
         "-max_len=600",
         "-len_control=20",
         "-print_final_stats=1",
+        f"-seed={seed or 0}",  # 0: another each time
         f"-artifact_prefix={CACHE}/{name}.",
         str(corpus),
     )
@@ -89,7 +96,8 @@ def main() -> None:
         fuzz_one(sys.argv[2], sys.argv[3:])
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="framings; default: all")
-    parser.add_argument("--seconds", type=float, default=60, help="for all of them together")
+    parser.add_argument("--seconds", type=float, default=60, help="of fuzzing, for all of them together")
+    parser.add_argument("--seed", type=int, metavar="N", help="the same inputs each time, from 1 on")
     parser.add_argument("--keep", action="store_true", help="write the inputs worth keeping as seeds")
     arguments = parser.parse_args()
     from tests.serial.framings import EXAMPLES
@@ -99,7 +107,8 @@ def main() -> None:
     names = arguments.names or known
     if unknown := sorted(set(names) - set(known)):
         parser.error(f"no framing {', '.join(unknown)}; there are: {', '.join(known)}")
-    held = [fuzz(name, arguments.seconds / len(names)) for name in names]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # they wait for processes
+        held = list(pool.map(lambda name: fuzz(name, arguments.seconds / len(names), arguments.seed), names))
     if arguments.keep:
         for name in names:
             keep(name)

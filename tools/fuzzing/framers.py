@@ -4,8 +4,8 @@ Every framing of the tests and of the installed drivers gets an equal part of th
 at most 1 GiB of memory and 10 s for an input. It begins with the seeds in tests/serial/seeds and with what earlier
 runs left in .cache/fuzz. What it breaks is written to .cache/fuzz/NAME.crash-*, and belongs into the seeds once
 the cause is removed: ``--keep`` writes some of what reached anything new there. The tests run the seeds, and changes of
-them that are always the same; here everything is different each time, unless ``--seed`` is given, as ``tools/test fuzz``
-does: a failure there comes again.
+them that are always the same; here everything is different each time, unless ``--seed`` is given: a failure of
+``tools/test fuzz`` comes again.
 """
 
 from __future__ import annotations
@@ -46,9 +46,14 @@ def libfuzzer(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
 
 
+def corpus_of(name: str, seed: int | None) -> Path:
+    """Where the inputs for a framing are kept."""
+    return CACHE / (name if seed is None else f"{name}.seed-{seed}")
+
+
 def fuzz(name: str, seconds: float, seed: int | None) -> bool:
     """Fuzz one framing for a time; tells whether it held."""
-    corpus = CACHE / (name if seed is None else f"{name}.seed-{seed}")
+    corpus = corpus_of(name, seed)
     if seed is not None:
         shutil.rmtree(corpus, ignore_errors=True)  # what earlier runs found would lead elsewhere
     corpus.mkdir(parents=True, exist_ok=True)
@@ -81,9 +86,9 @@ def fuzz(name: str, seconds: float, seed: int | None) -> bool:
     return held
 
 
-def keep(name: str) -> None:
+def keep(name: str, seed: int | None) -> None:
     """Write some of the inputs that reached something new, small and large ones, as seeds."""
-    inputs = sorted((path.read_bytes() for path in (CACHE / name).iterdir()), key=len)
+    inputs = sorted((path.read_bytes() for path in corpus_of(name, seed).iterdir()), key=len)
     kept = [data.hex() for data in inputs if 0 < len(data) <= LONGEST_KEPT]
     spread = kept[:: max(1, -(-len(kept) // MOST_KEPT))]
     SEEDS.mkdir(exist_ok=True)
@@ -111,7 +116,7 @@ def main() -> None:
         held = list(pool.map(lambda name: fuzz(name, arguments.seconds / len(names), arguments.seed), names))
     if arguments.keep:
         for name in names:
-            keep(name)
+            keep(name, arguments.seed)
     sys.exit(not all(held))
 
 

@@ -152,17 +152,6 @@ class Adapter(HasOptions[OptionsT], ABC):
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
         return self.patches
 
-    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
-        """Put the times at which devices took their samples in place of the times of receipt, where frames tell them.
-
-        Called with what arrived from this bus before it is decoded; see :mod:`skinware_drivers.device_time`. By default
-        the times of receipt stay.
-
-        Args:
-            wire: (n,) frames, rows of :func:`skinware_drivers.bus.wire_dtype`.
-            time_ns: (n,) CLOCK_MONOTONIC ns; to be changed in place.
-        """
-
     async def configure(self, link: Link) -> None:
         """Set the devices up."""
 

@@ -29,13 +29,16 @@ _LEAST_SPAN_NS = 2 * NS_PER_S
 """Before that, the device's clock is taken to go as ours."""
 _JUMP_NS = NS_PER_S / 20
 """A stamp that lies so far in the future shows that the device's clock was set."""
+_LONGEST_DELAY_NS = 2 * NS_PER_S
+"""A stamp that lies further in the past shows that the device's clock does not go."""
 
 
 class DeviceClock:
     """Brings the stamps of one device onto CLOCK_MONOTONIC.
 
     The times never lie after the receipt, and never go back. After ``restarts`` (a stamp that goes back, or that lies
-    in the future) nothing that was known of the clock counts any more.
+    in the future) nothing that was known of the clock counts any more. Nor does it after ``stops`` (a clock that stands
+    still, or goes far too slowly): what was received then has the time of its receipt.
 
     A gap in the stream, or a frame that is late, may be as long as half the time in which the stamps wrap around; the
     time of receipt tells how often they did meanwhile.
@@ -48,6 +51,7 @@ class DeviceClock:
 
     Attributes:
         restarts: how often the device's clock began anew.
+        stops: how often its stamps fell behind by more than any frame can be late.
         repeated: stamps that were equal to the one before.
     """
 
@@ -66,6 +70,7 @@ class DeviceClock:
         self._slope = 0.0
         self._offset_ns = 0.0
         self.restarts: int = 0
+        self.stops: int = 0
         self.repeated: int = 0
 
     @property
@@ -101,6 +106,10 @@ class DeviceClock:
         self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
         np.maximum.accumulate(np.maximum(told, self._told_ns), out=told)
         np.minimum(told, received, out=told)
+        if (received - told).max() > _LONGEST_DELAY_NS:
+            self.stops += 1
+            self._stamp = -1  # the next one begins anew
+            told = received.copy()
         self._told_ns = int(told[-1])
         return told
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
@@ -20,7 +19,6 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
-from skinware_drivers.device_time import DeviceClock
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
@@ -30,12 +28,9 @@ from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
-    DATA,
-    DATA_HEADER,
     MAJOR,
     MINOR,
     MOST_PAYLOAD,
-    STAMP,
     BadDescription,
     Description,
     Greeting,
@@ -53,7 +48,6 @@ _REPLY = 0x40
 _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
 _TRIES_AFTER_RESET = 10  # opening a port resets many boards, which hear nothing while their boot loader waits
-_LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _MOST_MATTERS = 50
 _ERRORS = (
@@ -107,10 +101,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._patch: Patch | None = None
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
         self._disabled: set[int] = set()
-        self._clock = DeviceClock(1e-6)
-        self._clock_fails = False
-        self._has_sampled = False  # since it was last asked whether it does
         self._number = 0
+        self._n_samples: int | None = None  # taken since its reset, when it was last silent and asked
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
         self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
@@ -157,6 +149,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     async def start(self, link: Link) -> None:
         """Start the patch, if it still is the one that was described."""
+        self._n_samples = None
         try:
             await self._ask(link, START, self._crc.to_bytes(4, "little"))
         except Refused as error:
@@ -167,21 +160,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def stop(self, link: Link) -> None:
         """Make it silent."""
         await self._ask(link, STOP)
-
-    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
-        """Data messages tell when their samples were taken, by the patch's clock."""
-        rows = np.flatnonzero((wire["identifier"] >= DATA) & (wire["length"] >= DATA_HEADER))
-        if not len(rows):
-            return
-        self._has_sampled = True
-        stamps = np.ascontiguousarray(wire["payload"][rows, STAMP]).view("<u4")[:, 0]
-        received_ns = time_ns[rows]
-        sampled_ns = self._clock.convert(stamps, received_ns)
-        if (received_ns - sampled_ns).max() > _LONGEST_DELAY_NS:
-            self._clock = DeviceClock(1e-6)
-            self._clock_fails = True
-        else:
-            time_ns[rows] = sampled_ns
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
@@ -199,11 +177,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
             while True:
                 message = await heard.get()
-                if self._clock_fails:
-                    self._say(
-                        link, logging.WARNING, "clock", "has a clock that stands still: times are those of receipt"
-                    )
-                    self._clock_fails = False
                 try:
                     if message.identifier == BOOT:
                         self._take_greeting(link, Greeting.read(message.payload))
@@ -217,26 +190,21 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         """Whether the silent patch has restarted. One that says that it streams, and does not, has not.
 
-        Its sampling hangs if nothing came since it was last asked, up to its answer: what it sampled before that has
-        been read by then, however late, and old samples are silence only because this machine is slow.
+        Its sampling hangs if it has counted no sample since it was last asked; if it has, this machine or the line is
+        slow.
         """
         greeting = await self._greet(link, tries=1)
-        has_sampled, self._has_sampled = self._has_sampled, False
         if greeting.crc != self._crc:
             self._changed(link)
             return False
-        if greeting.streaming and has_sampled:
-            return False
-        if greeting.streaming:
-            self._say(link, logging.WARNING, "sampling", "answers, but delivers no samples: its sampling hangs")
-            return False
-        self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
-        return True
-
-    async def revive(self, link: Link, patch: Patch) -> None:
-        """Set it up and start it again, with a clock that begins anew."""
-        self._clock = DeviceClock(1e-6)
-        await super().revive(link, patch)
+        if not greeting.streaming:
+            self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
+            return True
+        report = Report.read(await self._ask(link, STATUS, tries=1))
+        before, self._n_samples = self._n_samples, report.sent + report.dropped
+        if self._n_samples == before:
+            self._say(link, logging.WARNING, "sampling", "answers, but takes no samples: its sampling hangs")
+        return False
 
     def _take_greeting(self, link: Link, greeting: Greeting) -> None:
         if self._patch is None:

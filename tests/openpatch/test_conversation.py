@@ -9,14 +9,13 @@ import pytest
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers.adapter import Notice
-from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.serial.openpatch_description import BadDescription
 from tests.openpatch import wire
-from tests.openpatch.scripted import Answer, ScriptedLink, answering, data, describe
+from tests.openpatch.scripted import Answer, ScriptedLink, answering, describe
 
 PATCH = Patch("finger", [Module(taxels(1))])
 
@@ -106,22 +105,17 @@ def test_a_probe_tells_what_happened() -> None:
 def test_samples_that_this_machine_reads_late_are_not_held_against_the_patch(caplog: pytest.LogCaptureFixture) -> None:
     items = wire.Said().items()
     driver = describe(answering(items))
-    message = FrameBatch(1, driver.payload_size)
-    message.append(0, 10**9, 0x80, data(0, b""))
 
-    def blamed(answer: Answer) -> bool:
+    def blamed(sent: int, dropped: int) -> bool:
         caplog.clear()
-        assert not asyncio.run(driver.probe(ScriptedLink(answer), PATCH))
+        link = ScriptedLink(answering(items, sent=sent, dropped=dropped, streaming=True))
+        assert not asyncio.run(driver.probe(link, PATCH))
         return "its sampling hangs" in caplog.text
 
-    def late(request: int, arguments: bytes) -> bytes | None:
-        driver.stamp(message.wire, message.time_ns)  # lay unread before the answer
-        return answering(items, streaming=True)(request, arguments)
-
-    assert not blamed(late)
-    driver.stamp(message.wire, message.time_ns)  # read just before it was asked
-    assert not blamed(answering(items, streaming=True))
-    assert blamed(answering(items, streaming=True))
+    assert not blamed(5, 0)
+    assert not blamed(6, 0)
+    assert not blamed(6, 1)  # its line is slow
+    assert blamed(6, 1)
 
 
 def test_another_patch_in_its_place_is_not_started() -> None:

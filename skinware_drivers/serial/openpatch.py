@@ -7,7 +7,7 @@ each serial line.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -105,7 +105,6 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._n_samples: int | None = None  # taken since its reset, when it was last silent and asked
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
-        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
 
     @property
     def payload_size(self) -> int:
@@ -171,9 +170,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     # -- looking after it -----------------------------------------------------------------------------------------
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+    async def attend(self, link: Link) -> None:
         """Hear when it restarts, what it counts, and what it has to say to people."""
-        self._tell = tell
         with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
             while True:
                 message = await heard.get()
@@ -213,7 +211,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if greeting.crc != self._crc:
             self._changed(link)
         else:
-            self._tell(self._patch, Notice.RESTARTED)
+            self.tell(self._patch, Notice.RESTARTED)
 
     def _take_report(self, link: Link, report: Report) -> None:
         before, self._report = self._report, report
@@ -235,7 +233,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     def _changed(self, link: Link) -> None:
         self._say(link, logging.WARNING, "changed", "is not what it was: reading its description anew")
         if self._patch is not None:
-            self._tell(self._patch, Notice.CHANGED)
+            self.tell(self._patch, Notice.CHANGED)
 
     def _say(self, link: Link, level: int, matter: str, text: str) -> None:
         """One line in the log, at most one every ten seconds about one matter."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Module, Patch, Sensor
@@ -109,7 +109,6 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     def __init__(self, options: WeissWtsOptions) -> None:
         super().__init__(options)
         self._matrix: tuple[int, ...] = ()
-        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
 
     @property
     def payload_size(self) -> int:
@@ -152,20 +151,12 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         except Refused as error:
             log.debug("%s: %s", link.bus_name, error)
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:  # noqa: ARG002
-        """Only remembers whom to tell: the sensor says nothing of itself."""
-        self._tell = tell
-
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
-        try:
-            matrix = await self._ask_matrix(link, tries=1)
-        except HandshakeTimeout:
-            return False
-        if matrix != self._matrix:
-            self._tell(patch, Notice.CHANGED)
-            return False
-        return True
+        if await self._ask_matrix(link, tries=1) == self._matrix:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002

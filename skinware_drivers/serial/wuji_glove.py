@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
@@ -150,10 +150,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         """Whether it answers, unless it is silent because it was told to be."""
         if not self._on:
             return False
-        try:
-            await self._ask(link, _INFO, size=32, tries=1)
-        except HandshakeTimeout:
-            return False
+        await self._ask(link, _INFO, size=32, tries=1)
         return True
 
     @operation()

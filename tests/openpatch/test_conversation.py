@@ -85,15 +85,11 @@ def test_a_probe_tells_what_happened() -> None:
     driver = describe(answering(items))
     patch = asyncio.run(driver.describe(ScriptedLink(answering(items))))[0]
     told: list[Notice] = []
+    driver.heard_by = lambda patch, notice: told.append(notice)
 
     async def probe(answer: Answer) -> bool:
         link = ScriptedLink(answer)
-        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
-        await asyncio.sleep(0)
-        try:
-            return await driver.probe(link, patch)
-        finally:
-            attending.cancel()
+        return await driver.probe(link, patch)
 
     assert asyncio.run(probe(answering(items, streaming=False)))
     assert not asyncio.run(probe(answering(items, streaming=True)))
@@ -122,19 +118,14 @@ def test_another_patch_in_its_place_is_not_started() -> None:
     items = wire.Said().items()
     driver = describe(answering(items))
     told: list[Notice] = []
+    driver.heard_by = lambda patch, notice: told.append(notice)
 
     def answer(request: int, arguments: bytes) -> bytes:
         assert (request, arguments) == (3, struct.pack("<I", wire.crc32(b"".join(items))))
         return b"\x08"
 
     async def start() -> None:
-        link = ScriptedLink(answer)
-        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
-        await asyncio.sleep(0)
-        try:
-            await driver.start(link)
-        finally:
-            attending.cancel()
+        await driver.start(ScriptedLink(answer))
 
     with pytest.raises(BusError, match="its description is not the one that was read"):
         asyncio.run(start())

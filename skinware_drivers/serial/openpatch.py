@@ -23,6 +23,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
@@ -50,18 +51,21 @@ _TRIES = 3
 _TRIES_AFTER_RESET = 10  # opening a port resets many boards, which hear nothing while their boot loader waits
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _MOST_MATTERS = 50
-_ERRORS = (
-    "it is done",
-    "it does not know this request",
-    "the request is too short",
-    "there is no such module or item",
-    "the value is not one it can have",
-    "it is busy",
-    "its hardware failed",
-    "it cannot do this",
-    "its description is not the one that was read",
-)
 _OTHER_DESCRIPTION = 8
+_ANSWERS = Answers(
+    "patch",
+    {
+        1: "it does not know this request",
+        2: "the request is too short",
+        3: "there is no such module or item",
+        4: "the value is not one it can have",
+        5: "it is busy",
+        6: "its hardware failed",
+        7: "it cannot do this",
+        _OTHER_DESCRIPTION: "its description is not the one that was read",
+    },
+    offset=1,
+)
 _SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR)
 
 
@@ -71,19 +75,6 @@ class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Annotated[
         float, Meta(ge=0, le=1e6, description="cycles per second, as the patches are told; 0: what each does by itself")
     ] = 0.0
-
-
-class Refused(BusError):
-    """A patch does not do what it was asked for.
-
-    Attributes:
-        error: the number with which it answered.
-    """
-
-    def __init__(self, request: int, error: int) -> None:
-        why = _ERRORS[error] if error < len(_ERRORS) else f"error {error}"
-        super().__init__(f"the patch refuses request {request:#04x}: {why}")
-        self.error = error
 
 
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
@@ -152,7 +143,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         try:
             await self._ask(link, START, self._crc.to_bytes(4, "little"))
         except Refused as error:
-            if error.error == _OTHER_DESCRIPTION:
+            if error.status == _OTHER_DESCRIPTION:
                 self._changed(link)
             raise
 
@@ -324,8 +315,4 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         number = bytes((self._number,))
         answer = Match(_REPLY + request, prefix=number)
         reply = await link.request(request, number + arguments, answer, timeout_s=timeout_s, tries=tries)
-        if len(reply.payload) < 2:
-            raise BadDescription(f"the answer to request {request:#04x} has {len(reply.payload)} bytes")
-        if reply.payload[1]:
-            raise Refused(request, reply.payload[1])
-        return reply.payload[2:]
+        return _ANSWERS.result(request, reply.payload)

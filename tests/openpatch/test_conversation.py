@@ -31,13 +31,13 @@ def test_answers_that_are_none() -> None:
     good = answering(wire.Said().items())
     with pytest.raises(HandshakeTimeout):
         describe(lambda request, arguments: None)
-    with pytest.raises(BusError, match="refuses request 0x02: there is no such module or item"):
+    with pytest.raises(BusError, match="refuses command 0x02 with status 3: there is no such module or item"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\x03")
-    with pytest.raises(BusError, match="error 200"):
+    with pytest.raises(BusError, match="with status 200: look into the maker's manual"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\xc8")
     with pytest.raises(BadDescription, match="asked for item 0 and sent another"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\0\x01\0abc")
-    with pytest.raises(BadDescription, match="the answer to request 0x01 has 1 bytes"):
+    with pytest.raises(BusError, match="the patch's answer to command 0x01 has no status"):
         describe(lambda request, arguments: b"")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import msgspec
@@ -179,8 +180,8 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         """Whether the silent patch has restarted. One that says that it streams, and does not, has not.
 
-        Its sampling hangs if it has counted no sample since it was last asked; if it has, this machine or the line is
-        slow.
+        Its sampling hangs if it has counted no sample since it was last asked, though not all modules are off; if it
+        has, this machine or the line is slow.
         """
         greeting = await self._greet(link, tries=1)
         if greeting.crc != self._crc:
@@ -191,7 +192,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
             return True
         report = Report.read(await self._ask(link, STATUS, tries=1))
         before, self._n_samples = self._n_samples, report.sent + report.dropped
-        if self._n_samples == before:
+        if self._n_samples == before and self._disabled != self._modules(ALL_MODULES):
             self._say(link, logging.WARNING, "sampling", "answers, but takes no samples: its sampling hangs")
         return False
 
@@ -273,8 +274,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     @operation()
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:  # noqa: ARG002
         """What the patch counts: uptime_s, sent, dropped, bad_requests."""
-        report: dict[str, Any] = vars(Report.read(await self._ask(link, STATUS)))
-        return dict(report)
+        return asdict(Report.read(await self._ask(link, STATUS)))
 
     def _modules(self, module: int) -> set[int]:
         known = set(range(len(self._description.modules))) if self._description else set()

@@ -114,6 +114,21 @@ def test_samples_that_this_machine_reads_late_are_not_held_against_the_patch(cap
     assert blamed(6, 1)
 
 
+def test_a_patch_whose_modules_are_all_off_is_not_blamed_for_its_silence(caplog: pytest.LogCaptureFixture) -> None:
+    link = ScriptedLink(answering(wire.Said().items(), streaming=True))
+    driver = describe(answering(wire.Said().items()))
+
+    def probed() -> bool:
+        for _ in range(2):
+            assert not asyncio.run(driver.probe(link, PATCH))
+        return "its sampling hangs" in caplog.text
+
+    asyncio.run(driver.enable(link, [PATCH], on=False))
+    assert not probed()
+    asyncio.run(driver.enable(link, [PATCH], module=1))
+    assert probed()
+
+
 def test_another_patch_in_its_place_is_not_started() -> None:
     items = wire.Said().items()
     driver = describe(answering(items))

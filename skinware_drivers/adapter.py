@@ -97,6 +97,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
+        heard_by: gets what ``tell`` tells; the runner sets it.
     """
 
     medium: ClassVar[str]
@@ -107,6 +108,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     patches: Sequence[Patch] = ()
     by_cycle: bool = True
     pace_per_ms: float = DEFAULT_PACE_PER_MS
+    heard_by: Callable[[Patch, Notice], None] | None = None
 
     @property
     def polls(self) -> Sequence[Poll]:
@@ -152,17 +154,6 @@ class Adapter(HasOptions[OptionsT], ABC):
         """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
         return self.patches
 
-    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
-        """Put the times at which devices took their samples in place of the times of receipt, where frames tell them.
-
-        Called with what arrived from this bus before it is decoded; see :mod:`skinware_drivers.device_time`. By default
-        the times of receipt stay.
-
-        Args:
-            wire: (n,) frames, rows of :func:`skinware_drivers.bus.wire_dtype`.
-            time_ns: (n,) CLOCK_MONOTONIC ns; to be changed in place.
-        """
-
     async def configure(self, link: Link) -> None:
         """Set the devices up."""
 
@@ -179,6 +170,9 @@ class Adapter(HasOptions[OptionsT], ABC):
 
         Returns:
             True if it answered: it has restarted, and ``revive`` is called next.
+
+        Raises:
+            HandshakeTimeout: it did not answer. That is the same as False.
         """
         await self.revive(link, patch)
         return False
@@ -192,15 +186,16 @@ class Adapter(HasOptions[OptionsT], ABC):
         await self.configure(link)
         await self.start(link)
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
-        """Runs beside the data from ``describe`` to the end: for devices that speak of their own state.
+    async def attend(self, link: Link) -> None:
+        """Runs beside the data from ``describe`` to the end: for devices that speak of their own state (``tell``).
 
         What belongs to no module can be heard with ``link.follow``. A ``BusError`` ends it, and it is called again.
-
-        Args:
-            link: the bus.
-            tell: to be called with what a patch says of itself.
         """
+
+    def tell(self, patch: Patch, notice: Notice) -> None:
+        """To be called, from any of the coroutines, with what a patch says of itself; before there is data in vain."""
+        if self.heard_by is not None:
+            self.heard_by(patch, notice)
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
         """On request: the patches with what has appeared on the bus meanwhile added; by default describe again."""

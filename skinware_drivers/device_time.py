@@ -29,13 +29,17 @@ _LEAST_SPAN_NS = 2 * NS_PER_S
 """Before that, the device's clock is taken to go as ours."""
 _JUMP_NS = NS_PER_S / 20
 """A stamp that lies so far in the future shows that the device's clock was set."""
+_FAR_BEHIND_NS = NS_PER_S
+"""If no stamp of a whole part lies less far in the past, the device's clock does not go: what comes late because this
+machine or the line was held up is followed at once by what does not."""
 
 
 class DeviceClock:
     """Brings the stamps of one device onto CLOCK_MONOTONIC.
 
     The times never lie after the receipt, and never go back. After ``restarts`` (a stamp that goes back, or that lies
-    in the future) nothing that was known of the clock counts any more.
+    in the future) nothing that was known of the clock counts any more. Nor does it after ``stops`` (a clock that stands
+    still, or goes far too slowly): what was received then has the time of its receipt.
 
     A gap in the stream, or a frame that is late, may be as long as half the time in which the stamps wrap around; the
     time of receipt tells how often they did meanwhile.
@@ -48,6 +52,7 @@ class DeviceClock:
 
     Attributes:
         restarts: how often the device's clock began anew.
+        stops: how often it was found to stand still.
         repeated: stamps that were equal to the one before.
     """
 
@@ -66,6 +71,7 @@ class DeviceClock:
         self._slope = 0.0
         self._offset_ns = 0.0
         self.restarts: int = 0
+        self.stops: int = 0
         self.repeated: int = 0
 
     @property
@@ -101,6 +107,10 @@ class DeviceClock:
         self._stamp, self._received_ns = int(raw[-1]), int(received[-1])
         np.maximum.accumulate(np.maximum(told, self._told_ns), out=told)
         np.minimum(told, received, out=told)
+        if self._is_far_behind():
+            self.stops += 1
+            self._stamp = -1  # the next one begins anew
+            told = received.copy()
         self._told_ns = int(told[-1])
         return told
 
@@ -157,6 +167,13 @@ class DeviceClock:
                 self._points[-1] = point
         recent = self._points[-1][0] - _RECENT_PARTS
         self._offset_ns = min(y - self._slope * x for part, x, y in self._points if part > recent)
+
+    def _is_far_behind(self) -> bool:
+        """Whether the newest whole part says that the clock does not go."""
+        if len(self._points) < 2:
+            return False
+        _, x, y = self._points[-2]
+        return y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS
 
     def _fit_slope(self) -> None:
         """The slope of the edge under the middle of the points, of their lower convex hull."""

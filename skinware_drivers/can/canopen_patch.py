@@ -160,10 +160,10 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         await self._configure(link, patch.key)
         await link.send(0x000, bytes((_START, patch.key)))
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+    async def attend(self, link: Link) -> None:
         """Boot-up, heartbeat and EMCY of all nodes."""
         patches = {patch.key: patch for patch in self.patches}
-        nodes = {node: _NodeState(patch, tell) for node, patch in patches.items()}
+        nodes = {node: _NodeState(patch, self.tell) for node, patch in patches.items()}
         matches = [Match(base + node, mask=_EXACT) for node in nodes for base in (0x700, 0x080)]
         loss_s = max(_LOST_HEARTBEATS * self.options.heartbeat_ms / 1e3, _LEAST_HEARTBEAT_LOSS_S)
         with link.follow(*matches) as frames:

@@ -98,7 +98,7 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._last_sequence = np.full(self._n_modules, -1, np.int64)
-        self.device_stamps: DeviceStamps = DeviceStamps(self._frames, self._module_patch)
+        self.device_stamps: DeviceStamps = DeviceStamps(self._frames, structure)
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
             (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
         )
@@ -161,8 +161,9 @@ class Decoder:
         return updates, foreign + first
 
     def forget(self, patch: int) -> None:
-        """A patch has restarted: its sequence numbers begin anew."""
+        """A patch has restarted: its sequence numbers and its clock begin anew."""
         self._last_sequence[self._module_patch == patch] = -1
+        self.device_stamps.forget(patch)
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.structure import Structure
 from skinware_drivers.device_time import DeviceClock
 from skinware_drivers.layout import DeviceTime, Frame
+
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
@@ -20,15 +24,17 @@ class DeviceStamps:
 
     Args:
         frames: all kinds of frame.
-        module_patch: (n_modules,) patch of each module.
+        structure: the skin.
 
     Attributes:
         clocks: by patch, of those that have sent a stamp.
     """
 
-    def __init__(self, frames: Sequence[Frame], module_patch: npt.NDArray[np.intp]) -> None:
+    def __init__(self, frames: Sequence[Frame], structure: Structure) -> None:
         self._times = [(number, frame.time) for number, frame in enumerate(frames) if frame.time is not None]
-        self._module_patch = module_patch
+        self._structure = structure
+        self._module_patch = structure.module_patch.astype(np.intp)
+        self._warned: set[int] = set()
         self.clocks: dict[int, DeviceClock] = {}
 
     def tell(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
@@ -56,6 +62,22 @@ class DeviceStamps:
             if number not in self.clocks:
                 self.clocks[number] = DeviceClock(time.unit_s, time.turn)
             time_ns[own] = self.clocks[number].convert(stamp[own], time_ns[own])
+            if self.clocks[number].stops and number not in self._warned:
+                self._warn(number)
+
+    def forget(self, patch: int) -> None:
+        """A patch has restarted, and its clock with it."""
+        self.clocks.pop(patch, None)
+
+    def _warn(self, patch: int) -> None:
+        self._warned.add(patch)
+        structure = self._structure
+        log.warning(
+            "%s: the clock of %s stands still, or goes far too slowly: its samples have the times of their receipt;"
+            " told once",
+            structure.buses[structure.patch_bus[patch]],
+            structure.patch_name[patch].decode(),
+        )
 
 
 def _read(payload: Bytes, time: DeviceTime) -> npt.NDArray[Any]:

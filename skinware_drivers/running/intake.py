@@ -88,10 +88,8 @@ class Intake:
         is_behind = False
         for number, line in enumerate(ready):
             batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
-            first = batch.stop
             try:
                 if line.bus.receive(batch, line.ordinal):
-                    line.adapter.stamp(batch.wire[first : batch.stop], batch.time_ns[first : batch.stop])
                     line.heard_ns = time_ns
                     is_behind |= not batch.free
             except BusNotAvailable as error:

@@ -111,16 +111,19 @@ class PatchCare:
         Args:
             pause_s: what to wait after the bus failed.
         """
+        adapter = self._line.adapter
         reviving: dict[int, asyncio.Task[None]] = {}
+        adapter.heard_by = partial(self._note, reviving)
         try:
             while True:
                 try:
-                    await self._line.adapter.attend(self._line.link, partial(self._note, reviving))
-                    return
+                    await adapter.attend(self._line.link)
+                    await asyncio.Event().wait()  # for ever: it may still tell something when it is asked
                 except BusError as error:
                     log.debug("%s: %s", self._line.name, str(error))
                 await asyncio.sleep(pause_s())
         finally:
+            adapter.heard_by = None
             for task in reviving.values():
                 task.cancel()
 

@@ -1,6 +1,7 @@
 """Serial lines: the adapter that drivers of serial devices subclass, framings, and checksums."""
 
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import (
     CRC8,
     CRC16_CCITT_FALSE,
@@ -38,12 +39,14 @@ __all__ = [
     "SLIP",
     "SUM8",
     "XOR",
+    "Answers",
     "Crc",
     "Delimited",
     "Field",
     "Length",
     "LengthTable",
     "Packet",
+    "Refused",
     "SerialAdapter",
     "Sum",
     "Unframed",

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -98,7 +98,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._configuration = b""
         self._patch: Patch | None = None
         self._n_sensors = 0
-        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
         self.types: Sequence[SensorType] = [PRESSURE.measured(unit="counts")]
         self.dtype: npt.DTypeLike = np.dtype(options.values).newbyteorder("=")
 
@@ -175,18 +174,15 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self.change_framing(type(self).framing)
         try:
             configuration = await self._ask(link, tries=1)
-        except HandshakeTimeout:
-            return False
         finally:
             self.change_framing(described)
-        if configuration != self._configuration:
-            self._tell(patch, Notice.CHANGED)
-            return False
-        return True
+        if configuration == self._configuration:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+    async def attend(self, link: Link) -> None:
         """Say which errors it reports."""
-        self._tell = tell
         with link.follow(Match(_ERROR)) as heard:
             while True:
                 error = (await heard.get()).payload[0]

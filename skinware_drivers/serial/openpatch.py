@@ -7,11 +7,11 @@ each serial line.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
@@ -20,22 +20,19 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
-from skinware_drivers.device_time import DeviceClock
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.openpatch_description import (
     ALL_MODULES,
-    DATA,
-    DATA_HEADER,
     MAJOR,
     MINOR,
     MOST_PAYLOAD,
-    STAMP,
     BadDescription,
     Description,
     Greeting,
@@ -53,21 +50,23 @@ _REPLY = 0x40
 _TIMEOUT_S, _TARE_TIMEOUT_S = 0.25, 3.0
 _TRIES = 3
 _TRIES_AFTER_RESET = 10  # opening a port resets many boards, which hear nothing while their boot loader waits
-_LONGEST_DELAY_NS = 2 * NS_PER_S  # of a sample; more is a clock that does not go
 _QUIET_NS = 10 * NS_PER_S  # between two lines of the log about one matter
 _MOST_MATTERS = 50
-_ERRORS = (
-    "it is done",
-    "it does not know this request",
-    "the request is too short",
-    "there is no such module or item",
-    "the value is not one it can have",
-    "it is busy",
-    "its hardware failed",
-    "it cannot do this",
-    "its description is not the one that was read",
-)
 _OTHER_DESCRIPTION = 8
+_ANSWERS = Answers(
+    "patch",
+    {
+        1: "it does not know this request",
+        2: "the request is too short",
+        3: "there is no such module or item",
+        4: "the value is not one it can have",
+        5: "it is busy",
+        6: "its hardware failed",
+        7: "it cannot do this",
+        _OTHER_DESCRIPTION: "its description is not the one that was read",
+    },
+    offset=1,
+)
 _SEVERITIES = (logging.INFO, logging.WARNING, logging.ERROR)
 
 
@@ -77,19 +76,6 @@ class OpenPatchOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Annotated[
         float, Meta(ge=0, le=1e6, description="cycles per second, as the patches are told; 0: what each does by itself")
     ] = 0.0
-
-
-class Refused(BusError):
-    """A patch does not do what it was asked for.
-
-    Attributes:
-        error: the number with which it answered.
-    """
-
-    def __init__(self, request: int, error: int) -> None:
-        why = _ERRORS[error] if error < len(_ERRORS) else f"error {error}"
-        super().__init__(f"the patch refuses request {request:#04x}: {why}")
-        self.error = error
 
 
 class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
@@ -107,13 +93,10 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._patch: Patch | None = None
         self._wanted_us = round(1e6 / options.rate_hz) if options.rate_hz else 0
         self._disabled: set[int] = set()
-        self._clock = DeviceClock(1e-6)
-        self._clock_fails = False
-        self._has_sampled = False  # since it was last asked whether it does
         self._number = 0
+        self._n_samples: int | None = None  # taken since its reset, when it was last silent and asked
         self._report: Report | None = None
         self._notices: dict[str, tuple[int, int]] = {}  # matter -> (when told, how often since)
-        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
 
     @property
     def payload_size(self) -> int:
@@ -157,31 +140,17 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     async def start(self, link: Link) -> None:
         """Start the patch, if it still is the one that was described."""
+        self._n_samples = None
         try:
             await self._ask(link, START, self._crc.to_bytes(4, "little"))
         except Refused as error:
-            if error.error == _OTHER_DESCRIPTION:
+            if error.status == _OTHER_DESCRIPTION:
                 self._changed(link)
             raise
 
     async def stop(self, link: Link) -> None:
         """Make it silent."""
         await self._ask(link, STOP)
-
-    def stamp(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
-        """Data messages tell when their samples were taken, by the patch's clock."""
-        rows = np.flatnonzero((wire["identifier"] >= DATA) & (wire["length"] >= DATA_HEADER))
-        if not len(rows):
-            return
-        self._has_sampled = True
-        stamps = np.ascontiguousarray(wire["payload"][rows, STAMP]).view("<u4")[:, 0]
-        received_ns = time_ns[rows]
-        sampled_ns = self._clock.convert(stamps, received_ns)
-        if (received_ns - sampled_ns).max() > _LONGEST_DELAY_NS:
-            self._clock = DeviceClock(1e-6)
-            self._clock_fails = True
-        else:
-            time_ns[rows] = sampled_ns
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
@@ -193,17 +162,11 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
 
     # -- looking after it -----------------------------------------------------------------------------------------
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+    async def attend(self, link: Link) -> None:
         """Hear when it restarts, what it counts, and what it has to say to people."""
-        self._tell = tell
         with link.follow(Match(BOOT), Match(REPORT), Match(NOTE)) as heard:
             while True:
                 message = await heard.get()
-                if self._clock_fails:
-                    self._say(
-                        link, logging.WARNING, "clock", "has a clock that stands still: times are those of receipt"
-                    )
-                    self._clock_fails = False
                 try:
                     if message.identifier == BOOT:
                         self._take_greeting(link, Greeting.read(message.payload))
@@ -217,26 +180,21 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         """Whether the silent patch has restarted. One that says that it streams, and does not, has not.
 
-        Its sampling hangs if nothing came since it was last asked, up to its answer: what it sampled before that has
-        been read by then, however late, and old samples are silence only because this machine is slow.
+        Its sampling hangs if it has counted no sample since it was last asked, though not all modules are off; if it
+        has, this machine or the line is slow.
         """
         greeting = await self._greet(link, tries=1)
-        has_sampled, self._has_sampled = self._has_sampled, False
         if greeting.crc != self._crc:
             self._changed(link)
             return False
-        if greeting.streaming and has_sampled:
-            return False
-        if greeting.streaming:
-            self._say(link, logging.WARNING, "sampling", "answers, but delivers no samples: its sampling hangs")
-            return False
-        self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
-        return True
-
-    async def revive(self, link: Link, patch: Patch) -> None:
-        """Set it up and start it again, with a clock that begins anew."""
-        self._clock = DeviceClock(1e-6)
-        await super().revive(link, patch)
+        if not greeting.streaming:
+            self._say(link, logging.WARNING, "reset", f"was reset: {greeting.reset}, {greeting.uptime_s:g} s ago")
+            return True
+        report = Report.read(await self._ask(link, STATUS, tries=1))
+        before, self._n_samples = self._n_samples, report.sent + report.dropped
+        if self._n_samples == before and self._disabled != self._modules(ALL_MODULES):
+            self._say(link, logging.WARNING, "sampling", "answers, but takes no samples: its sampling hangs")
+        return False
 
     def _take_greeting(self, link: Link, greeting: Greeting) -> None:
         if self._patch is None:
@@ -245,7 +203,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         if greeting.crc != self._crc:
             self._changed(link)
         else:
-            self._tell(self._patch, Notice.RESTARTED)
+            self.tell(self._patch, Notice.RESTARTED)
 
     def _take_report(self, link: Link, report: Report) -> None:
         before, self._report = self._report, report
@@ -267,7 +225,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     def _changed(self, link: Link) -> None:
         self._say(link, logging.WARNING, "changed", "is not what it was: reading its description anew")
         if self._patch is not None:
-            self._tell(self._patch, Notice.CHANGED)
+            self.tell(self._patch, Notice.CHANGED)
 
     def _say(self, link: Link, level: int, matter: str, text: str) -> None:
         """One line in the log, at most one every ten seconds about one matter."""
@@ -316,8 +274,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
     @operation()
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:  # noqa: ARG002
         """What the patch counts: uptime_s, sent, dropped, bad_requests."""
-        report: dict[str, Any] = vars(Report.read(await self._ask(link, STATUS)))
-        return dict(report)
+        return asdict(Report.read(await self._ask(link, STATUS)))
 
     def _modules(self, module: int) -> set[int]:
         known = set(range(len(self._description.modules))) if self._description else set()
@@ -358,8 +315,4 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         number = bytes((self._number,))
         answer = Match(_REPLY + request, prefix=number)
         reply = await link.request(request, number + arguments, answer, timeout_s=timeout_s, tries=tries)
-        if len(reply.payload) < 2:
-            raise BadDescription(f"the answer to request {request:#04x} has {len(reply.payload)} bytes")
-        if reply.payload[1]:
-            raise Refused(request, reply.payload[1])
-        return reply.payload[2:]
+        return _ANSWERS.result(request, reply.payload)

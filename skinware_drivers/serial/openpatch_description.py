@@ -18,21 +18,29 @@ from skinware.errors import BusError, StructureError
 from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.layout import Bits, Flag, Frame, Identifier, Layout, Sentinel, Stamp, StatusBytes, Values
+from skinware_drivers.layout import (
+    Bits,
+    DeviceTime,
+    Flag,
+    Frame,
+    Identifier,
+    Layout,
+    Sentinel,
+    Stamp,
+    StatusBytes,
+    Values,
+)
 
 MAJOR, MINOR = 1, 0
 MOST_PAYLOAD = 1024
 MOST_ITEMS = 256
 ALL_MODULES = 0xFF
-DATA = 0x80
-DATA_HEADER = 8
-"""Bytes of a data message's payload before the values."""
-STAMP = slice(3, 7)
-"""Of these, the device time."""
 
+_DATA = 0x80
+_DATA_HEADER = 8  # bytes of a data message's payload before the values
 _MOST_KINDS, _MOST_TYPES, _MOST_MODULES, _MOST_AXES = 32, 64, 255, 9
 _MOST_VALUES = 16384  # of all modules together
-_MOST_VALUE_BYTES = MOST_PAYLOAD - DATA_HEADER  # of one module
+_MOST_VALUE_BYTES = MOST_PAYLOAD - _DATA_HEADER  # of one module
 _PATCH, _TYPE, _KIND, _MODULES = 1, 2, 3, 4  # tags of items
 _PADDING = 0xFF
 _DTYPES = ("u1", "<i2", "<u2", "<i4", "<f4")
@@ -301,7 +309,7 @@ def _check(found: Description) -> None:
 
 
 def _frame(number: int, kind: Kind) -> Frame:
-    values = Values(DATA_HEADER, kind.dtype, kind.n_values)
+    values = Values(_DATA_HEADER, kind.dtype, kind.n_values)
     flags: list[Flag | Sentinel | StatusBytes] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
     lengths = [values.end]
     if values.end + kind.n_values <= MOST_PAYLOAD:
@@ -311,12 +319,13 @@ def _frame(number: int, kind: Kind) -> Frame:
         flags.append(Sentinel(Status.NOT_CONNECTED, math.nan))
     return Frame(
         f"kind {number}",
-        [Identifier(DATA + number)],
+        [Identifier(_DATA + number)],
         lengths,
         values,
         module=Bits(0, 8, byte=0),
         flags=flags,
         stamp=Stamp(1, "<u2"),
+        time=DeviceTime(3, "<u4", 1e-6),
     )
 
 

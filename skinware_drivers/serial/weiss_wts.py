@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
 from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Module, Patch, Sensor
@@ -32,6 +32,7 @@ from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers, Refused
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -44,13 +45,17 @@ _MOST_CELLS = 1024
 _MOST_PAYLOAD = _HEADER + 2 * _MOST_CELLS
 _TIMEOUT_S, _TRIES = 0.5, 3
 _RLE = 1
-_STATUS = {
-    7: "a timeout",
-    11: "the command's checksum was wrong on its side",
-    14: "it does not know this command",
-    16: "access is denied",
-    27: "overrun: its line is too slow for its data",
-}
+_ANSWERS = Answers(
+    "sensor",
+    {
+        7: "a timeout",
+        11: "the command's checksum was wrong on its side",
+        14: "it does not know this command",
+        16: "access is denied",
+        27: "overrun: its line is too slow for its data",
+    },
+    dtype="<u2",
+)
 
 
 class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,19 +85,6 @@ class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigurationError(f"option tare_payload: {self.tare_payload!r} is not hexadecimal") from None
 
 
-class Refused(BusError):
-    """A sensor does not do what it was told.
-
-    Attributes:
-        status: the number with which it answered.
-    """
-
-    def __init__(self, command: int, status: int) -> None:
-        why = _STATUS.get(status, "see the maker's manual")
-        super().__init__(f"the sensor refuses command {command:#04x} with status {status}: {why}")
-        self.status = status
-
-
 class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     """One WTS on a serial line."""
 
@@ -109,7 +101,6 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     def __init__(self, options: WeissWtsOptions) -> None:
         super().__init__(options)
         self._matrix: tuple[int, ...] = ()
-        self._tell: Callable[[Patch, Notice], None] = lambda _patch, _notice: None
 
     @property
     def payload_size(self) -> int:
@@ -152,20 +143,12 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         except Refused as error:
             log.debug("%s: %s", link.bus_name, error)
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:  # noqa: ARG002
-        """Only remembers whom to tell: the sensor says nothing of itself."""
-        self._tell = tell
-
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
-        try:
-            matrix = await self._ask_matrix(link, tries=1)
-        except HandshakeTimeout:
-            return False
-        if matrix != self._matrix:
-            self._tell(patch, Notice.CHANGED)
-            return False
-        return True
+        if await self._ask_matrix(link, tries=1) == self._matrix:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
@@ -175,9 +158,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     @operation(looks=True)
     async def temperature(self, link: Link, patches: Sequence[Patch]) -> float:  # noqa: ARG002
         """Temperature of the sensor in degrees Celsius."""
-        answer = await self._ask(link, _TEMPERATURE)
-        if len(answer) < 2:
-            raise BusError(f"the sensor's temperature has {len(answer)} bytes instead of 2")
+        answer = await self._ask(link, _TEMPERATURE, size=2)
         return int.from_bytes(answer[:2], "little", signed=True) / 10
 
     @operation(looks=True)
@@ -199,20 +180,14 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
     @classmethod
     async def _ask_matrix(cls, link: Link, *, tries: int = _TRIES) -> tuple[int, ...]:
         """Columns, rows, width and height of a cell in 1/100 mm, greatest value."""
-        answer = await cls._ask(link, _MATRIX, tries=tries)
-        if len(answer) < 10:
-            raise BusError(f"the sensor's matrix information has {len(answer)} bytes instead of 10")
-        return struct.unpack_from("<5H", answer)
+        return struct.unpack_from("<5H", await cls._ask(link, _MATRIX, size=10, tries=tries))
 
     @classmethod
-    async def _ask(cls, link: Link, command: int, arguments: bytes = b"", *, tries: int = _TRIES) -> bytes:
+    async def _ask(
+        cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int = _TRIES
+    ) -> bytes:
         reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S, tries=tries)
-        if len(reply.payload) < 2:
-            raise BusError(f"the sensor's answer to command {command:#04x} has no status")
-        status = int.from_bytes(reply.payload[:2], "little")
-        if status:
-            raise Refused(command, status)
-        return reply.payload[2:]
+        return _ANSWERS.result(command, reply.payload, size)
 
 
 Numbers = npt.NDArray[np.int64]

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
@@ -30,6 +30,7 @@ from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers
 from skinware_drivers.serial.checksums import CRC16_CCITT_FALSE
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
@@ -44,7 +45,9 @@ _N = _ROWS * _COLUMNS
 _BODY = 3082
 _TIMEOUT_S, _TRIES = 1.0, 3  # the line stalls for half a second now and then, its maker's program says
 _USUAL_HZ = 120.0
-_STATUS = {0x10: "bad length", 0x11: "bad checksum", 0x12: "unknown command", 0x13: "bad arguments"}
+_ANSWERS = Answers(
+    "board", {0x10: "bad length", 0x11: "bad checksum", 0x12: "unknown command", 0x13: "bad arguments"}, offset=4
+)
 
 
 class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,19 +61,6 @@ class WujiGloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         check_options(self)
-
-
-class Refused(BusError):
-    """The board does not do what it was told.
-
-    Attributes:
-        status: the number with which it answered.
-    """
-
-    def __init__(self, command: int, status: int) -> None:
-        why = _STATUS.get(status, "not a known status")
-        super().__init__(f"the board refuses command {command:#06x} with status {status:#04x}: {why}")
-        self.status = status
 
 
 class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
@@ -150,10 +140,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         """Whether it answers, unless it is silent because it was told to be."""
         if not self._on:
             return False
-        try:
-            await self._ask(link, _INFO, size=32, tries=1)
-        except HandshakeTimeout:
-            return False
+        await self._ask(link, _INFO, size=32, tries=1)
         return True
 
     @operation()
@@ -174,7 +161,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
     @operation(looks=True)
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, float]:  # noqa: ARG002
         """What the board counts: uptime_s, frames, checksum_errors, dropouts, usb_resets."""
-        uptime_ms, *counts = struct.unpack("<IIIIH", await self._ask(link, _DIAGNOSTICS, size=18))
+        uptime_ms, *counts = struct.unpack_from("<IIIIH", await self._ask(link, _DIAGNOSTICS, size=18))
         names = ("frames", "checksum_errors", "dropouts", "usb_resets")
         return {"uptime_s": uptime_ms / 1000, **dict(zip(names, counts, strict=True))}
 
@@ -196,9 +183,4 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         head = struct.pack("<HH", command, self._number)
         answer = Match(_ANSWER, prefix=head)
         reply = await link.request(0, head + arguments, answer, timeout_s=_TIMEOUT_S, tries=tries)
-        status, result = reply.payload[4:5], reply.payload[5:]
-        if status not in (b"", b"\0"):
-            raise Refused(command, status[0])
-        if not status or len(result) < size:
-            raise BusError(f"the board's answer to command {command:#06x} has {len(result)} bytes instead of {size}")
-        return result
+        return _ANSWERS.result(command, reply.payload, size)

@@ -136,7 +136,8 @@ class Bench:
         tables = assemble([("bus", self.patches)], adapter.types, adapter.dtype)
         self._decoder = Decoder([adapter.layout], tables)
         self._batch = FrameBatch(4096, adapter.payload_size, self._decoder.headroom)
-        self._attending = asyncio.create_task(adapter.attend(self.link, self._tell))
+        adapter.heard_by = self._tell
+        self._attending = asyncio.create_task(adapter.attend(self.link))
         await self.during(adapter.configure(self.link))
         await self.during(adapter.start(self.link))
 

@@ -50,10 +50,6 @@ static const openpatch_kind wide_kinds[] = {{OPENPATCH_U8, OPENPATCH_TABLE(wide_
                                             {OPENPATCH_I32, OPENPATCH_TABLE(deep_runs), "deep"}};
 static openpatch_module wide_modules[] = {OPENPATCH_MODULE(0), OPENPATCH_MODULE(1), OPENPATCH_MODULE(1)};
 
-#define MODEL(name) {20000, 1000, 1000000, "test patch", "", "1.0", OPENPATCH_TABLE(types), \
-                     OPENPATCH_TABLE(name##_kinds), OPENPATCH_TABLE(name##_modules)}
-static const openpatch_description models[] = {MODEL(finger), MODEL(hand), MODEL(wide)};
-
 static volatile sig_atomic_t hangs, speaks;
 static uint32_t first_us;
 static uint8_t tared[MAX_MODULES];
@@ -96,6 +92,11 @@ static uint8_t tare(uint8_t module) {
     return OPENPATCH_OK;
 }
 
+#define MODEL(name) {20000, 1000, 1000000, "test patch", "", "1.0", OPENPATCH_TABLE(types), \
+                     OPENPATCH_TABLE(name##_kinds), OPENPATCH_TABLE(name##_modules), \
+                     read_byte, write_bytes, now_us, NULL, set_period, tare}
+static const openpatch_description models[] = {MODEL(finger), MODEL(hand), MODEL(wide)};
+
 static void sample(openpatch *op, uint8_t module, uint32_t us, const char *model) {
     static union { uint8_t u8[MAX_VALUES]; int16_t i16[MAX_VALUES]; uint16_t u16[MAX_VALUES];
                    int32_t i32[MAX_VALUES]; float f32[MAX_VALUES]; } values;
@@ -123,7 +124,6 @@ static void sample(openpatch *op, uint8_t module, uint32_t us, const char *model
 
 int main(int argc, char **argv) {
     static openpatch op;
-    static const openpatch_hardware hardware = {read_byte, write_bytes, now_us, NULL, set_period, tare};
     openpatch_description d;
     struct sigaction action;
     uint32_t due_us;
@@ -136,7 +136,7 @@ int main(int argc, char **argv) {
     action.sa_handler = on_signal;
     sigaction(SIGUSR1, &action, NULL);
     sigaction(SIGUSR2, &action, NULL);
-    openpatch_init(&op, &d, &hardware, (uint8_t)atoi(argv[3]));
+    openpatch_init(&op, &d, (uint8_t)atoi(argv[3]));
     due_us = now_us();
     for (;;) {
         struct pollfd wait = {0, POLLIN, 0};

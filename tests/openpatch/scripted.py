@@ -36,7 +36,7 @@ class ScriptedLink(Link):
         raise HandshakeTimeout("no answer")
 
 
-def answering(items: Sequence[bytes], **greeting: Any) -> Answer:
+def answering(items: Sequence[bytes], *, sent: int = 0, dropped: int = 0, **greeting: Any) -> Answer:
     """A patch with these items."""
 
     def answer(request: int, arguments: bytes) -> bytes:
@@ -44,6 +44,8 @@ def answering(items: Sequence[bytes], **greeting: Any) -> Answer:
             return b"\0" + wire.greeting(items, **greeting)
         if request == 2:
             return b"\0" + arguments + items[int.from_bytes(arguments, "little")]
+        if request == 8:
+            return b"\0" + struct.pack("<IIII", 1000, sent, dropped, 0)
         return b"\0"
 
     return answer
@@ -56,21 +58,24 @@ def describe(answer: Answer) -> OpenPatchDriver:
     return driver
 
 
-def decoded(said: wire.Said, messages: Sequence[tuple[int, bytes]]) -> Decoder:
+def decoded(
+    said: wire.Said, messages: Sequence[tuple[int, bytes]], received_ns: Sequence[int] | None = None
+) -> Decoder:
     """A decoder that has seen some messages of a patch."""
     driver = OpenPatchDriver(OpenPatchOptions())
     patches = asyncio.run(driver.describe(ScriptedLink(answering(said.items()))))
     decoder = Decoder([driver.layout], assemble([("bus", patches)], driver.types, driver.dtype))
     batch = FrameBatch(64, driver.payload_size, decoder.headroom)
     decoder.put_back(batch)
-    for number, (identifier, payload) in enumerate(messages):
-        batch.append(0, number + 1, identifier, payload)
+    times_ns = range(1, len(messages) + 1) if received_ns is None else received_ns
+    for time_ns, (identifier, payload) in zip(times_ns, messages, strict=True):
+        batch.append(0, time_ns, identifier, payload)
     updates, foreign = decoder.decode(batch)
     decoder.count_unknown(batch, foreign)
     decoder.state.show(updates)
     return decoder
 
 
-def data(module: int, values: bytes, *, status: int = 0, sequence: int = 0) -> bytes:
+def data(module: int, values: bytes, *, status: int = 0, sequence: int = 0, us: int = 123) -> bytes:
     """Payload of a data message."""
-    return struct.pack("<BHIB", module, sequence, 123, status) + values
+    return struct.pack("<BHIB", module, sequence, us, status) + values

@@ -9,14 +9,13 @@ import pytest
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware_drivers.adapter import Notice
-from skinware_drivers.bus import FrameBatch
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.link import Link
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.serial.openpatch_description import BadDescription
 from tests.openpatch import wire
-from tests.openpatch.scripted import Answer, ScriptedLink, answering, data, describe
+from tests.openpatch.scripted import Answer, ScriptedLink, answering, describe
 
 PATCH = Patch("finger", [Module(taxels(1))])
 
@@ -32,13 +31,13 @@ def test_answers_that_are_none() -> None:
     good = answering(wire.Said().items())
     with pytest.raises(HandshakeTimeout):
         describe(lambda request, arguments: None)
-    with pytest.raises(BusError, match="refuses request 0x02: there is no such module or item"):
+    with pytest.raises(BusError, match="refuses command 0x02 with status 3: there is no such module or item"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\x03")
-    with pytest.raises(BusError, match="error 200"):
+    with pytest.raises(BusError, match="with status 200: look into the maker's manual"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\xc8")
     with pytest.raises(BadDescription, match="asked for item 0 and sent another"):
         describe(lambda request, arguments: good(request, arguments) if request == 1 else b"\0\x01\0abc")
-    with pytest.raises(BadDescription, match="the answer to request 0x01 has 1 bytes"):
+    with pytest.raises(BusError, match="the patch's answer to command 0x01 has no status"):
         describe(lambda request, arguments: b"")
 
 
@@ -86,15 +85,11 @@ def test_a_probe_tells_what_happened() -> None:
     driver = describe(answering(items))
     patch = asyncio.run(driver.describe(ScriptedLink(answering(items))))[0]
     told: list[Notice] = []
+    driver.heard_by = lambda patch, notice: told.append(notice)
 
     async def probe(answer: Answer) -> bool:
         link = ScriptedLink(answer)
-        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
-        await asyncio.sleep(0)
-        try:
-            return await driver.probe(link, patch)
-        finally:
-            attending.cancel()
+        return await driver.probe(link, patch)
 
     assert asyncio.run(probe(answering(items, streaming=False)))
     assert not asyncio.run(probe(answering(items, streaming=True)))
@@ -106,41 +101,46 @@ def test_a_probe_tells_what_happened() -> None:
 def test_samples_that_this_machine_reads_late_are_not_held_against_the_patch(caplog: pytest.LogCaptureFixture) -> None:
     items = wire.Said().items()
     driver = describe(answering(items))
-    message = FrameBatch(1, driver.payload_size)
-    message.append(0, 10**9, 0x80, data(0, b""))
 
-    def blamed(answer: Answer) -> bool:
+    def blamed(sent: int, dropped: int) -> bool:
         caplog.clear()
-        assert not asyncio.run(driver.probe(ScriptedLink(answer), PATCH))
+        link = ScriptedLink(answering(items, sent=sent, dropped=dropped, streaming=True))
+        assert not asyncio.run(driver.probe(link, PATCH))
         return "its sampling hangs" in caplog.text
 
-    def late(request: int, arguments: bytes) -> bytes | None:
-        driver.stamp(message.wire, message.time_ns)  # lay unread before the answer
-        return answering(items, streaming=True)(request, arguments)
+    assert not blamed(5, 0)
+    assert not blamed(6, 0)
+    assert not blamed(6, 1)  # its line is slow
+    assert blamed(6, 1)
 
-    assert not blamed(late)
-    driver.stamp(message.wire, message.time_ns)  # read just before it was asked
-    assert not blamed(answering(items, streaming=True))
-    assert blamed(answering(items, streaming=True))
+
+def test_a_patch_whose_modules_are_all_off_is_not_blamed_for_its_silence(caplog: pytest.LogCaptureFixture) -> None:
+    link = ScriptedLink(answering(wire.Said().items(), streaming=True))
+    driver = describe(answering(wire.Said().items()))
+
+    def probed() -> bool:
+        for _ in range(2):
+            assert not asyncio.run(driver.probe(link, PATCH))
+        return "its sampling hangs" in caplog.text
+
+    asyncio.run(driver.enable(link, [PATCH], on=False))
+    assert not probed()
+    asyncio.run(driver.enable(link, [PATCH], module=1))
+    assert probed()
 
 
 def test_another_patch_in_its_place_is_not_started() -> None:
     items = wire.Said().items()
     driver = describe(answering(items))
     told: list[Notice] = []
+    driver.heard_by = lambda patch, notice: told.append(notice)
 
     def answer(request: int, arguments: bytes) -> bytes:
         assert (request, arguments) == (3, struct.pack("<I", wire.crc32(b"".join(items))))
         return b"\x08"
 
     async def start() -> None:
-        link = ScriptedLink(answer)
-        attending = asyncio.create_task(driver.attend(link, lambda patch, notice: told.append(notice)))
-        await asyncio.sleep(0)
-        try:
-            await driver.start(link)
-        finally:
-            attending.cancel()
+        await driver.start(ScriptedLink(answer))
 
     with pytest.raises(BusError, match="its description is not the one that was read"):
         asyncio.run(start())

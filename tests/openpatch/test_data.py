@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware import Status
-from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS
-from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
+from skinware_drivers.serial.openpatch import OpenPatchDriver
 from tests.openpatch import wire
 from tests.openpatch.scripted import data, decoded
 
@@ -69,33 +67,8 @@ def test_of_a_damaged_stream_only_whole_messages_are_shown(samples: list[int], m
         assert shown <= {0, *samples}
 
 
-def stamped(driver: OpenPatchDriver, stamps: Sequence[int], received_ns: Sequence[int]) -> list[int]:
-    batch = FrameBatch(len(stamps), driver.payload_size)
-    for stamp, time_ns in zip(stamps, received_ns, strict=True):
-        batch.append(0, time_ns, 0x80, struct.pack("<BHIB", 0, 0, stamp, 0))
-    driver.stamp(batch.wire, batch.time_ns)
-    times: list[int] = batch.time_ns.tolist()
-    return times
-
-
 def test_samples_have_the_time_at_which_they_were_taken() -> None:
-    driver = OpenPatchDriver(OpenPatchOptions())
-    wrapping = [2**32 - 10_000, 0, 10_000, 20_000]
-    assert stamped(driver, wrapping, [10**9, 1_010_000_000, 1_055_000_000, 1_056_000_000]) == [
-        1_000_000_000,
-        1_010_000_000,
-        1_020_000_000,
-        1_030_000_000,
-    ]
-    batch = FrameBatch(2, driver.payload_size)
-    batch.append(0, 5, 0x41, bytes(20))
-    batch.append(0, 6, 0x80, bytes(3))
-    driver.stamp(batch.wire, batch.time_ns)
-    assert batch.time_ns.tolist() == [5, 6]
-
-
-def test_a_clock_that_stands_still_is_not_believed_for_long() -> None:
-    driver = OpenPatchDriver(OpenPatchOptions())
-    received_ns = [n * 10**8 for n in range(1, 50)]
-    told = [stamped(driver, [7], [time_ns])[0] for time_ns in received_ns]
-    assert all(time_ns - then <= 2 * 10**9 for time_ns, then in zip(received_ns, told, strict=True))
+    samples = [(0x80, data(n % 2, bytes(8), us=(n * 10_000 - 10_000) % 2**32)) for n in range(4)]
+    received_ns = [1_000_000_000, 1_010_000_000, 1_055_000_000, 1_056_000_000]
+    state = decoded(wire.Said(), samples, received_ns).state
+    assert state.module_time_ns.tolist() == [1_020_000_000, 1_030_000_000]

@@ -20,10 +20,6 @@ static const openpatch_type types[] = {{1, 0.5f, -10.0f, 0.0f, 100.0f, "pressure
 static const openpatch_run runs[] = {{3, 1, {0}}, {1, 1, {1}}};
 static const openpatch_kind kinds[] = {{OPENPATCH_U16, OPENPATCH_TABLE(runs), "tip"}};
 static openpatch_module modules[2];
-static const openpatch_description description = {
-    10000, 1000, 1000000, "tip", "7", "1.0",
-    OPENPATCH_TABLE(types), OPENPATCH_TABLE(kinds), OPENPATCH_TABLE(modules)};
-
 static uint32_t clock_us;
 static size_t room = 4096;
 static const char *received = ""; /* in hex */
@@ -43,11 +39,15 @@ static void write_hex(const uint8_t *bytes, size_t n) {
 static uint32_t now_us(void) { return clock_us; }
 static size_t room_now(void) { return room; }
 
+static const openpatch_description description = {
+    10000, 1000, 1000000, "tip", "7", "1.0",
+    OPENPATCH_TABLE(types), OPENPATCH_TABLE(kinds), OPENPATCH_TABLE(modules),
+    read_hex, write_hex, now_us, room_now, NULL, NULL};
+
 int main(void) {
     static openpatch op;
-    static const openpatch_hardware hardware = {read_hex, write_hex, now_us, room_now, NULL, NULL};
     static char line[8192];
-    openpatch_init(&op, &description, &hardware, OPENPATCH_RESET_POWER);
+    openpatch_init(&op, &description, OPENPATCH_RESET_POWER);
     while (fgets(line, sizeof line, stdin) != NULL) {
         unsigned a, b;
         line[strcspn(line, "\n")] = 0;

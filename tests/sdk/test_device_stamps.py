@@ -75,6 +75,31 @@ def test_frames_that_wait_for_their_partners_are_told_their_time_once() -> None:
     assert compiled.device_stamps.clocks[0].repeated == 0
 
 
+def one_frame(compiled: Decoder, time_ns: int, stamp_ms: int) -> int:
+    """The time that the module has after it."""
+    batch = FrameBatch(1, 8, compiled.headroom)
+    batch.append(0, time_ns, 1, payload(0, stamp_ms, 0))
+    updates, _ = compiled.decode(batch)
+    return int(updates.newest_ns[0])
+
+
+def test_a_clock_that_stands_still_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    compiled = decoder(Layout([frame("one", 1, 0)]))
+    told_ns = [one_frame(compiled, BEGIN_NS + n * 1000 * MS, 0) for n in range(8)]
+    assert told_ns == [BEGIN_NS + n * 1000 * MS for n in (0, 0, 0, 3, 4, 4, 4, 7)]
+    assert [record.message.split(";")[0] for record in caplog.records] == [
+        "b0: the clock of tip stands still, or goes far too slowly: its samples have the times of their receipt"
+    ]
+
+
+def test_a_patch_that_was_set_up_anew_has_a_clock_that_begins_anew() -> None:
+    compiled = decoder(Layout([frame("one", 1, 0)]))
+    assert one_frame(compiled, BEGIN_NS, 0) == BEGIN_NS
+    assert one_frame(compiled, BEGIN_NS + 800 * MS, 10) == BEGIN_NS + 10 * MS  # late
+    compiled.forget(0)
+    assert one_frame(compiled, BEGIN_NS + 900 * MS, 20) == BEGIN_NS + 900 * MS
+
+
 def test_times_that_cannot_be() -> None:
     with pytest.raises(ConfigurationError, match="'one': the device's time is not in every right payload"):
         Layout([Frame("one", [], [5], Values(0, "u1", 2), time=TIME)])

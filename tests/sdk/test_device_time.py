@@ -158,6 +158,27 @@ def test_the_first_frames_may_be_late_ones() -> None:
     assert abs(error[100:] - 200_000).max() < 1 * MS
 
 
+@pytest.mark.parametrize("us_per_s", [0, 1000])  # stands still, and counts milliseconds
+def test_a_clock_that_does_not_go_is_not_believed_for_long(us_per_s: int) -> None:
+    clock = DeviceClock(1e-6)
+    received = 5_000 * S + np.arange(1, 100) * S // 10
+    told = np.array([int(clock.convert([7 + n * us_per_s // 10], received[n : n + 1])[0]) for n in range(99)])
+    assert (received - told).max() <= 3 * S
+    assert (np.diff(told) >= 0).all()
+    assert clock.stops == 3
+    assert clock.restarts == 0
+
+
+def test_what_was_held_up_for_long_has_the_time_at_which_it_was_stamped() -> None:
+    device = run(60)
+    held_up = (device.true > device.true[0] + 20 * S) & (device.true < device.true[0] + 26 * S)
+    device.received[held_up] = device.true[0] + 26 * S
+    clock = DeviceClock(1e-6)
+    error = converted(clock, device) - device.true
+    assert clock.stops == clock.restarts == 0
+    assert abs(error[1500:] - 200_000).max() < 300_000
+
+
 def test_nothing_gives_nothing() -> None:
     assert DeviceClock(1e-3).convert([], []).tolist() == []
     assert DeviceClock(1e-3).convert([5], [123]).tolist() == [123]

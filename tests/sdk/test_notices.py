@@ -39,11 +39,11 @@ class Speaking(CanAdapter[NoOptions]):
         self.probed: list[str] = []
         self.failures = 0
 
-    async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+    async def attend(self, link: Link) -> None:
         with link.follow(Match(0x700, mask=0x7F0), Match(0x600, mask=0x7F0)) as heard:
             while True:
                 frame = await heard.get()
-                tell(self.patches[(frame.identifier & 0xF) - 1], list(Notice)[frame.payload[0]])
+                self.tell(self.patches[(frame.identifier & 0xF) - 1], list(Notice)[frame.payload[0]])
 
     async def probe(self, link: Link, patch: Patch) -> bool:
         self.probed.append(patch.name)
@@ -206,7 +206,7 @@ def test_a_patch_that_restarts_again_while_it_is_set_up_is_found(devices: Device
 
 def test_an_adapter_that_fails_while_it_attends_ends_the_driver(devices: Devices) -> None:
     class Broken(Speaking):
-        async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        async def attend(self, link: Link) -> None:
             raise ZeroDivisionError("a bug")
 
     lines = [(Broken(NoOptions()), VirtualCanBus.with_hardware(devices))]
@@ -261,12 +261,12 @@ def test_an_adapter_whose_bus_fails_while_it_attends_attends_again(devices: Devi
         failures_to_attend = 2
         attends = False
 
-        async def attend(self, link: Link, tell: Callable[[Patch, Notice], None]) -> None:
+        async def attend(self, link: Link) -> None:
             if self.failures_to_attend:
                 self.failures_to_attend -= 1
                 raise HandshakeTimeout("no answer")
             self.attends = True
-            await super().attend(link, tell)
+            await super().attend(link)
 
     adapter, bus = Shaky(NoOptions()), VirtualCanBus.with_hardware(devices)
     with driving_lines([(adapter, bus)], "speaking") as running, DriverReader("speaking") as reader:

@@ -152,3 +152,20 @@ def test_patches_that_restart_together_are_set_up_together(kind: type[Silent], s
         assert adapter.set_ups == set_ups + 1
 
     asyncio.run(run())
+
+
+def test_what_is_told_outside_of_attend_is_heard_until_the_end() -> None:
+    async def run() -> None:
+        adapter = Silent(fails=False)
+        stage = Stage(adapter)
+        attending = asyncio.ensure_future(stage.care.attend(lambda: 0.0))
+        await asyncio.sleep(0)
+        adapter.tell(PATCHES[3], Notice.RESTARTED)
+        await asyncio.gather(*stage.tasks)
+        assert stage.forgotten == [3]
+        attending.cancel()
+        await asyncio.gather(attending, return_exceptions=True)
+        adapter.tell(PATCHES[3], Notice.RESTARTED)
+        assert len(stage.tasks) == 1
+
+    asyncio.run(run())

@@ -9,7 +9,7 @@ import pytest
 
 from skinware import DriverFrame, PatchState
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.weiss_wts import Refused, WeissWtsDriver, WeissWtsOptions, _runs
+from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions, _runs
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
 from tests.sdk.driving import read_until, restarted_on_demand
@@ -89,8 +89,7 @@ def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
         whole(live=True)
 
 
-def test_refusals_and_run_lengths() -> None:
-    assert "14: it does not know this command" in str(Refused(0x77, 14))
+def test_impossible_options_and_run_lengths() -> None:
     with pytest.raises(ConfigurationError, match=r"SDHLibrary.*RobWork.*rle_offset"):
         WeissWtsOptions(rle=True)
     with pytest.raises(ConfigurationError, match="not hexadecimal"):

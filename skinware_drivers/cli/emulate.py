@@ -60,6 +60,7 @@ def command(
 
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
+    from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus, parse_bus_name
@@ -76,8 +77,8 @@ def command(
     medium = medium_of(emulator)
     bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if not bus.fits(medium):
-        where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty:./port or a port"
-        raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
+        such_as = "vcan0 or can0" if medium == "can" else "pty:./port, or a port that is there"
+        raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {kind_of_bus(medium)}; give {such_as}")
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)

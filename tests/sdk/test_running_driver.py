@@ -14,7 +14,6 @@ import pytest
 from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
 from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.running import generation
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles
@@ -53,7 +52,7 @@ class Flood(VirtualCanBus):
 
 @pytest.mark.usefixtures("hurry")
 def test_a_flood_on_one_bus_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "BATCH_FRAMES", 128)
+    monkeypatch.setattr("skinware_drivers.bus.BATCH_FRAMES", 128)
     hardware = EmulatedRoboskin(EmulatorOptions(boards=(7,)))
     flood = Flood.with_hardware(hardware)
     others = [emulated(boards=(board,), pattern="idle") for board in (8, 9)]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
+    from skinware_drivers.bus_names import BusPlace
     from skinware_drivers.config import ConfigFile, DriverConfig
     from skinware_drivers.running.runner import PublishMode, Runner
 
@@ -310,14 +311,16 @@ def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
 
 def _refuse_twice(bus_names: Sequence[str]) -> None:
     """Refuse a bus that stands there twice: its boards would be set up twice, and be two skins."""
-    from skinware_drivers.registry import parse_bus_name
+    from skinware_drivers.bus_names import parse_bus_name, place_of_bus
 
-    seen = []
+    seen: dict[BusPlace, str] = {}
     for name in bus_names:
-        bus = parse_bus_name(name)
-        if bus in seen:
-            raise ConfigurationError(f"bus {name} is named twice; a driver has each of its buses once")
-        seen.append(bus)
+        parse_bus_name(name)  # refuses what is no name
+        place = place_of_bus(name)
+        if place in seen:
+            also = f", also as {seen[place]}" if seen[place] != name else ""
+            raise ConfigurationError(f"bus {name} is named twice{also}; a driver has each of its buses once")
+        seen[place] = name
 
 
 def _read(path: Path | None) -> ConfigFile:

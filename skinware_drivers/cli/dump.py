@@ -42,8 +42,9 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         BusError: nothing came for ``timeout_s``.
     """
     from skinware.realtime import now_ns
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.can.candump import channel_name, text_frames
-    from skinware_drivers.registry import make_bus, parse_bus_name
+    from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)
     _refuse_what_has_one_owner(bus_name, interface)

@@ -61,9 +61,10 @@ def command(
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
     from skinware_drivers.bus import kind_of_bus
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
     from skinware_drivers.options import options_from_strings
-    from skinware_drivers.registry import make_bus, parse_bus_name
+    from skinware_drivers.registry import make_bus
     from skinware_drivers.virtual.events import JsonLinesLog
     from skinware_drivers.virtual.hardware import load_emulator, medium_of
 

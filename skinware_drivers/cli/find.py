@@ -115,9 +115,9 @@ def _chosen(
 ) -> tuple[list[CanInterface], list[SerialPort], list[str]]:
     """CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
     from skinware.errors import BusNotAvailable
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.ports import serial_ports
     from skinware_drivers.finding.running import same_bus
-    from skinware_drivers.registry import parse_bus_name
 
     if not buses:
         return interfaces, serial_ports(), []

@@ -8,11 +8,14 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_names import parse_bus_name
-from skinware_drivers.options import load_registered, nearest_name
+from skinware_drivers.loading import Kind, load
+from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
 DEFAULT_DRIVER = "roboskin"
+
+_DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
 def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, driver: str = DEFAULT_DRIVER) -> Bus:
@@ -22,7 +25,7 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
         name: ``[interface:]channel[?key=value&...]``.
         payload_size: longest payload that the layout knows.
         listen_only: refuse to send.
-        driver: whose devices the bus ``virtual`` emulates, if its name does not say.
+        driver: whose devices the bus ``virtual`` emulates, if its name does not say; registered, or a file.
 
     Raises:
         ConfigurationError: no such interface, or a bad option.
@@ -47,13 +50,9 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
 
 
 def load_driver(name: str) -> type[AnyAdapter]:
-    """The driver class of a name.
+    """The driver class of a name; see :func:`skinware_drivers.loading.load`.
 
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
-    loaded = load_registered(DRIVERS, "driver", name, f"unknown driver {name!r}")
-    if not (isinstance(loaded, type) and issubclass(loaded, Adapter)):
-        *_, entry = entry_points(group=DRIVERS, name=name)
-        raise ConfigurationError(f"driver {name!r}: {entry.value} is no subclass of CanAdapter or its like")
-    return loaded
+    return load(_DRIVER, name)

@@ -66,7 +66,7 @@ def test_a_path_may_have_an_equals_sign() -> None:
     ("text", "words"),
     [
         ("import nonsuch", r"ModuleNotFoundError: No module named 'nonsuch' \(.*mine_\w+\.py:1\)"),
-        ("x =\n", r"SyntaxError: .*mine_\w+\.py, line 1\)$"),
+        ("x =\n", r"SyntaxError: .*mine_\w+\.py:1\)$"),
         ("1 / 0", r"ZeroDivisionError: division by zero \(.*mine_\w+\.py:1\)"),
         ("from skinware_drivers import Layout\nLayout([])", r"1 to 200 frames.*mine_\w+\.py:2\)"),
         ("", r"has no attribute 'Driver'$"),

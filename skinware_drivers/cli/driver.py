@@ -84,7 +84,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --listen-only       send nothing",
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
-        "skin-driver --driver ./my_skin.py --bus can0   a driver of yours, in this file",
+        "skin-driver --bus can0 --driver ./my.py    a driver of yours, in this file",
     ),
 )
 @click.option(

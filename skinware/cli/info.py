@@ -141,10 +141,8 @@ def _statistics_lines(entry: dict[str, Any]) -> list[str]:
     if not told["wall"]["count"]:
         return []
     wall, cpu = told["wall"], told["cpu"]
-    worst, on_cpu = age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
-    lines = [
-        f"a frame takes {age_text(wall['mean_ns'])} to fill (worst {worst}); with all else {on_cpu} of processor time"
-    ]
+    mean, worst, on_cpu = age_text(wall["mean_ns"]), age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
+    lines = [f"a frame takes {mean} to fill (worst {worst}); with all else {on_cpu} of processor time"]
     lines.append(f"99 % of its frames are published at most {_bound(told['age'])} after their newest data")
     if told["lateness"]["p99_ns"] is not None:
         lines.append(f"99 % of its periods begin up to {_bound(told['lateness'])} late")

@@ -52,7 +52,7 @@ class Declined(SkinwareError):
     "--driver",
     "driver_name",
     metavar="DRIVER",
-    help="Of a bus that has no running one: a name, or a file.  [default: roboskin]",
+    help="Name or file of the driver, where none runs on the bus.  [default: roboskin]",
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")

@@ -50,7 +50,7 @@ class EmulateCommand(HardwareCommand):
     metavar="DRIVER",
     default=_DEFAULT_DRIVER,
     show_default=True,
-    help="Whose devices: a name, or a file with an emulator.",
+    help="Whose devices: name of a driver, or a file with an emulator.",
 )
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")

@@ -36,7 +36,7 @@ _DETECTION_S = 10.0
     "driver_names",
     multiple=True,
     metavar="DRIVER",
-    help="Only this one guesses and asks: a name, or a file.",
+    help="Only this driver (name or file) guesses and asks.",
 )
 @click.option("--force", is_flag=True, help="With --probe: ask also where that may disturb somebody.")
 @click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,8 +20,8 @@ from skinware.memory.namespace import check_name
 from skinware_drivers.options import nearest_name
 
 _SUFFIX = ".py"
-_NOT_THEIRS = (os.path.dirname(__file__), os.path.dirname(skinware.__file__), os.path.dirname(os.__file__), "<")
-"""How the names of files begin that are Python's or ours."""
+_OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__file__))
+_PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first
 
 
 class Kind(NamedTuple):
@@ -63,7 +64,7 @@ def load(kind: Kind, name: str) -> type[Any]:
             f" ./{name}{_SUFFIX}, or install its package: pip install -e ."
         )
     entry = known[name]
-    with _blamed(f"{kind.word} {name!r} ({entry.value})", lambda file: not file.startswith(_NOT_THEIRS)):
+    with _blamed(f"{kind.word} {name!r} ({entry.value})", _is_theirs):
         loaded = entry.load()
     if not (isinstance(loaded, type) and kind.fits(loaded)):
         raise ConfigurationError(f"{kind.word} {name!r}: {entry.value} is no subclass of {kind.base} or its like")
@@ -116,6 +117,11 @@ def _module_of(name: str, kind: Kind) -> ModuleType:
         )
     with _blamed(f"{kind.word} {name}", lambda file: os.path.dirname(file) == folder):
         return importlib.import_module(own_name)
+
+
+def _is_theirs(file: str) -> bool:
+    """Whether a file of a traceback is neither Python's nor ours."""
+    return not file.startswith(("<", *_OURS)) and (file.startswith(_INSTALLED) or not file.startswith(_PYTHONS))
 
 
 @contextmanager

@@ -64,10 +64,10 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 
 
 def same_bus(one: str, other: str) -> bool:
-    """Whether two names, of one program or of two, mean one bus now: that of :func:`place_of_bus`, as it is plugged in.
+    """Whether two names, of one program or of two, mean one bus now, by :func:`place_of_bus`.
 
-    While a USB device that is named by what it is is not plugged in, the names alone are compared. A ``virtual`` bus is
-    nobody else's: each process has its own.
+    Serial lines that are named by their USB device are where that is plugged in now; while it is not plugged in, the
+    names alone are compared. A ``virtual`` bus is nobody else's: each process has its own.
     """
     place = _place_now(one)
     return place == _place_now(other) and place.interface != _PRIVATE

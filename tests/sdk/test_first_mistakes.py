@@ -69,6 +69,7 @@ def test_a_path_may_have_an_equals_sign() -> None:
         ("x =\n", r"SyntaxError: .*mine_\w+\.py:1\)$"),
         ("1 / 0", r"ZeroDivisionError: division by zero \(.*mine_\w+\.py:1\)"),
         ("from skinware_drivers import Layout\nLayout([])", r"1 to 200 frames.*mine_\w+\.py:2\)"),
+        ("from skinware import Namespace\nNamespace('a b')", r"namespace name 'a b'.*mine_\w+\.py:2\)$"),
         ("", r"has no attribute 'Driver'$"),
     ],
 )

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import SensorType
 from skinware.status import Status
-from skinware_drivers.bus import Bus
+from skinware_drivers.bus import Bus, kind_of_bus
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
@@ -144,10 +144,9 @@ class Adapter(HasOptions[OptionsT], ABC):
             ConfigurationError: it is another kind of bus.
         """
         if not bus.fits(self.medium):
-            names = {"can": "a CAN bus", "serial": "a serial line", "virtual": "a bus of this process"}
             raise ConfigurationError(
-                f"{bus.name} is {names.get(str(bus.medium), bus.medium)}; {type(self).__name__} needs"
-                f" {names.get(self.medium, self.medium)}{bus.instead(self.medium)}"
+                f"{bus.name} is {kind_of_bus(bus.medium)}; {type(self).__name__} needs"
+                f" {kind_of_bus(self.medium)}{bus.instead(self.medium)}"
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +25,15 @@ REMOTE_FLAG = 0x4000_0000
 ERROR_FLAG = 0x2000_0000
 """Identifier bit of an error frame (``CAN_ERR_FLAG``)."""
 
+BATCH_FRAMES, _FRAMES_OF_A_BUS, _FEWEST_FRAMES, _BATCH_BYTES = 2048, 256, 64, 1 << 20
+"""What is read at once: so many frames or, of many buses, so many of each; of long frames as many as fill a MiB."""
 
-_SUCH_AS = {
-    "can": ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual",
-    "serial": ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual",
-    "virtual": ": virtual",
+_MEDIA = {
+    "can": ("a CAN bus", ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual"),
+    "serial": ("a serial line", ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual"),
+    "virtual": ("a bus of this process", ": virtual"),
 }
-"""How the buses of a medium are written."""
+"""What the buses of a medium are called, and how they are written."""
 
 
 _WayT = TypeVar("_WayT")
@@ -45,6 +47,11 @@ class Filter(NamedTuple):
 
 
 _CAN_PAYLOAD = 64
+
+
+def kind_of_bus(medium: str | None) -> str:
+    """What people call a bus of a medium: ``a CAN bus``."""
+    return _MEDIA[medium][0] if medium in _MEDIA else f"a bus of medium {medium!r}"
 
 
 def wire_dtype(payload_size: int) -> np.dtype[np.void]:
@@ -94,6 +101,12 @@ class FrameBatch:
 
     def __len__(self) -> int:
         return self.stop - self.start
+
+    @classmethod
+    def for_buses(cls, count: int, payload_size: int, headroom: int = 0) -> Self:
+        """Room for what so many buses bring at once; of long frames, fewer."""
+        wanted = max(BATCH_FRAMES, _FRAMES_OF_A_BUS * count)
+        return cls(max(_FEWEST_FRAMES, min(wanted, _BATCH_BYTES // payload_size)), payload_size, headroom)
 
     @property
     def free(self) -> int:
@@ -176,7 +189,7 @@ class Bus(ABC):
 
     def instead(self, medium: str) -> str:
         """What to give instead to a driver that it does not fit, for people: the end of a sentence."""
-        return _SUCH_AS.get(medium, "")
+        return _MEDIA[medium][1] if medium in _MEDIA else ""
 
     @abstractmethod
     def open(self) -> None:
@@ -270,5 +283,6 @@ __all__ = [
     "Bus",
     "Filter",
     "FrameBatch",
+    "kind_of_bus",
     "wire_dtype",
 ]

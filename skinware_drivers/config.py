@@ -29,6 +29,7 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
+from skinware_drivers.loading import is_file
 from skinware_drivers.options import nearest_name, options_from_strings
 from skinware_drivers.toml_lines import Keys, line_of
 
@@ -51,6 +52,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole file.
 
     Attributes:
+        driver: name of one that is registered, or a file ``./my_skin.py`` with one, by its path from this file on.
         wait: for a bus to appear, if there is none at the start.
         publish: when frames are published: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
         latency_ms: the longest that frames may wait so that more are taken with them, 0 to 1000; None for the default.
@@ -104,9 +106,12 @@ class ConfigFile:
             _check_keys(DriverConfig, data)
             for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
                 _check_keys(BusConfig, bus, ("bus", number))
-            self.settings = _convert(DriverConfig, data)
+            settings = _convert(DriverConfig, data)
         except _Wrong as wrong:
             raise ConfigurationError(f"{self._place(wrong.keys)}: {wrong}") from None
+        if is_file(settings.driver):
+            settings = msgspec.structs.replace(settings, driver=str(path.parent / settings.driver))
+        self.settings = settings
 
     def options_of_bus(self, struct: type[T], bus_name: str, given: Mapping[str, str] | None = None) -> T:
         """A driver's options for one bus: what is given as text beats the bus' own, they beat the common ones.

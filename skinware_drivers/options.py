@@ -11,12 +11,9 @@ Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9`
 from __future__ import annotations
 
 import difflib
-import os
 import re
-import traceback
 import types
 from collections.abc import Iterable, Mapping
-from importlib.metadata import entry_points
 from typing import (
     Annotated,
     Any,
@@ -194,39 +191,6 @@ def nearest_name(wrong: str, right: Iterable[str]) -> str:
     return f"{hint} Known: {', '.join(names) or 'none'}"
 
 
-def load_registered(group: str, kind: str, name: str, unknown: str) -> Any:
-    """What somebody's package has registered under a name.
-
-    Args:
-        group: of entry points.
-        kind: what those are, for messages: ``driver``.
-        name: of the one that is wanted.
-        unknown: what to say if there is none of that name.
-
-    Raises:
-        ConfigurationError: there is none, or it cannot be loaded; the message says why, and where in the package.
-    """
-    known = {entry.name: entry for entry in entry_points(group=group)}
-    if name not in known:
-        names = nearest_name(name, known)
-        raise ConfigurationError(f"{unknown}{names}. One of yours has to be installed: pip install -e .")
-    try:
-        return known[name].load()
-    except Exception as error:
-        raise ConfigurationError(
-            f"{kind} {name!r} ({known[name].value}) cannot be loaded: {type(error).__name__}: {error}{_place_of(error)}"
-        ) from error
-
-
-def _place_of(error: Exception) -> str:
-    """The last file and line of the traceback that are somebody else's than Python's or ours, in brackets."""
-    if isinstance(error, SyntaxError):
-        return ""  # it says so itself
-    ours = (os.path.dirname(__file__), os.path.dirname(os.__file__), "<")
-    theirs = [place for place in traceback.extract_tb(error.__traceback__) if not place.filename.startswith(ours)]
-    return f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
-
-
 def _split(text: str, plain: Any) -> Any:
     """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
     if plain is bool:
@@ -308,7 +272,6 @@ __all__ = [
     "Option",
     "check_options",
     "describe_options",
-    "load_registered",
     "nearest_name",
     "option_text",
     "options_from_strings",

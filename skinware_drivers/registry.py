@@ -1,54 +1,21 @@
-"""Names to things: buses by ``[interface:]channel[?key=value&...]``, drivers and transports by entry point."""
+"""Names to things: a bus and a driver for what the command line says."""
 
 from __future__ import annotations
 
 from importlib.metadata import entry_points
-from typing import NamedTuple
-from urllib.parse import parse_qsl
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.options import load_registered, nearest_name
+from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.loading import Kind, load
+from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
 TRANSPORTS = "skinware.transports"
 DEFAULT_DRIVER = "roboskin"
 
-
-class BusName(NamedTuple):
-    """A bus' name taken apart."""
-
-    interface: str
-    channel: str
-    options: dict[str, str]
-
-
-def parse_bus_name(name: str) -> BusName:
-    """Take a bus' name apart.
-
-    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
-    (``/dev/ttyUSB0``, ``./port``), is a serial port; pyserial's URLs (``socket://host:port``) are serial, too.
-    python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
-
-    Raises:
-        ConfigurationError: empty, or options that are not ``key=value``.
-    """
-    address, _, query = name.partition("?")
-    if "=" in address and "/" not in address:
-        raise ConfigurationError(f"bus {name!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
-    if not address:
-        raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
-    try:
-        options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if query else {}
-    except ValueError:
-        raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
-    interface, colon, channel = address.partition(":")
-    if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
-        interface, channel = "serial", address
-    elif not colon:
-        interface, channel = (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)
-    return BusName(interface, channel, options)
+_DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
 def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, driver: str = DEFAULT_DRIVER) -> Bus:
@@ -58,7 +25,7 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
         name: ``[interface:]channel[?key=value&...]``.
         payload_size: longest payload that the layout knows.
         listen_only: refuse to send.
-        driver: whose devices the bus ``virtual`` emulates, if its name does not say.
+        driver: whose devices the bus ``virtual`` emulates, if its name does not say; registered, or a file.
 
     Raises:
         ConfigurationError: no such interface, or a bad option.
@@ -83,13 +50,9 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
 
 
 def load_driver(name: str) -> type[AnyAdapter]:
-    """The driver class of a name.
+    """The driver class of a name; see :func:`skinware_drivers.loading.load`.
 
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
-    loaded = load_registered(DRIVERS, "driver", name, f"unknown driver {name!r}")
-    if not (isinstance(loaded, type) and issubclass(loaded, Adapter)):
-        *_, entry = entry_points(group=DRIVERS, name=name)
-        raise ConfigurationError(f"driver {name!r}: {entry.value} is no subclass of CanAdapter or its like")
-    return loaded
+    return load(_DRIVER, name)

@@ -58,7 +58,7 @@ def command(
 ) -> None:
     """Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
 
-    A line of text has the least, mean and greatest value of the fresh sensors of each type. JSON has everything.
+    A line of text has the least, greatest and mean value of the fresh sensors of each type. JSON has everything.
     """
     from skinware.memory.namespace import Namespace
 
@@ -95,7 +95,7 @@ def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, phy
 
 
 def as_line(frame: DriverFrame, type_name: str | None, physical: bool) -> str:
-    """One frame for people: least / mean / greatest value of the fresh sensors of each type."""
+    """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
     from skinware.cli._format import age_text
@@ -109,8 +109,10 @@ def as_line(frame: DriverFrame, type_name: str | None, physical: bool) -> str:
             fresh = frame.status[index] == 0
             not_fresh += int(np.count_nonzero(~fresh))
             values = all_values[index][fresh]
-            figures = f"{values.min():.5g} / {values.mean():.5g} / {values.max():.5g}" if len(values) else "-"
-            parts.append(f"{sensor_type.name} {figures} {sensor_type.unit if physical else 'raw'}")
+            figures, mean = "-", ""
+            if len(values):
+                figures, mean = f"{values.min():.5g} to {values.max():.5g}", f" (mean {values.mean():.5g})"
+            parts.append(f"{sensor_type.name} {figures} {sensor_type.unit if physical else 'raw'}{mean}")
     return "  ".join([*parts, f"not fresh {not_fresh}"])
 
 

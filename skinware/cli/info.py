@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
 
 _WATCH_PERIOD_S = 1.0
-_OF_A_PATCH = {"99 % apart": "interval", "99 % aged": "age"}
+_OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
 """What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
 and of an update's age when it was published."""
+_ABOUT_A_PATCH = "99 %: at most so much in 99 of 100 cases; interval: between two updates; delay: until published"
 _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
 
 
@@ -108,6 +109,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             ),
             {"orphans"},
         ),
+        *([_ABOUT_A_PATCH] if timed else []),
     ]
     return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
 
@@ -139,9 +141,9 @@ def _statistics_lines(entry: dict[str, Any]) -> list[str]:
     if not told["wall"]["count"]:
         return []
     wall, cpu = told["wall"], told["cpu"]
-    worst, on_cpu = age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
-    lines = [f"a frame takes {age_text(wall['mean_ns'])} to fill (worst {worst}) and {on_cpu} of processor time in all"]
-    lines.append(f"99 % of its frames hold data up to {_bound(told['age'])} old when published")
+    mean, worst, on_cpu = age_text(wall["mean_ns"]), age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
+    lines = [f"a frame takes {mean} to fill (worst {worst}); with all else {on_cpu} of processor time"]
+    lines.append(f"99 % of its frames are published at most {_bound(told['age'])} after their newest data")
     if told["lateness"]["p99_ns"] is not None:
         lines.append(f"99 % of its periods begin up to {_bound(told['lateness'])} late")
     return lines
@@ -236,7 +238,7 @@ def _reader_lines(entry: dict[str, Any]) -> list[str]:
         ]
         for reader in entry["readers"]
     ]
-    titles = ("reader", "how", "pid", "rate", "data age", "99 % below", "its loop", "CPU", "frames", "not taken")
+    titles = ("reader", "how", "pid", "rate", "data age", "age 99 %", "its loop", "CPU", "frames", "not taken")
     return table(titles, rows, left=2)
 
 

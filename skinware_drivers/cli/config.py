@@ -49,7 +49,10 @@ class Declined(SkinwareError):
 @click.argument("operation", required=False)
 @click.argument("arguments", nargs=-1, metavar="[KEY=VALUE]...")
 @click.option(
-    "--driver", "driver_name", metavar="DRIVER", help="Of a bus that has no running one.  [default: roboskin]"
+    "--driver",
+    "driver_name",
+    metavar="DRIVER",
+    help="Name or file of the driver, where none runs on the bus.  [default: roboskin]",
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")

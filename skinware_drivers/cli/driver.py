@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
+    from skinware_drivers.bus_names import BusPlace
     from skinware_drivers.config import ConfigFile, DriverConfig
     from skinware_drivers.running.runner import PublishMode, Runner
 
@@ -42,6 +43,7 @@ class DriverCommand(HardwareCommand):
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
         """The options of the driver that the command line or the file names."""
+        from skinware_drivers.loading import short_name
         from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
         config = value_of("--config", args)
@@ -49,7 +51,7 @@ class DriverCommand(HardwareCommand):
         if not name and config:
             name = _read(Path(config)).settings.driver
         name = name or DEFAULT_DRIVER
-        return name, load_driver(name).Options
+        return short_name(name), load_driver(name).Options
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse; say what to do with a word that is no option."""
@@ -82,6 +84,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --listen-only       send nothing",
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
+        "skin-driver --bus can0 --driver ./my.py    a driver of yours, in this file",
     ),
 )
 @click.option(
@@ -95,7 +98,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "--driver",
     "driver_name",
     metavar="DRIVER",
-    help="What hangs there: roboskin, xela, anyskin ...  [default: roboskin]",
+    help="What hangs there: roboskin, xela, anyskin ..., or the file of a driver of yours.  [default: roboskin]",
 )
 @click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
 @click.option(
@@ -165,6 +168,7 @@ def command(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
     from skinware.memory.namespace import Namespace
+    from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
     from skinware_drivers.running.intake import DEFAULT_LATENCY_S
     from skinware_drivers.running.runner import Runner
@@ -175,8 +179,9 @@ def command(
     file = _read(config)
     settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
-    driver_type = driver_name or settings.driver or DEFAULT_DRIVER
-    driver = load_driver(driver_type)
+    driver_name = driver_name or settings.driver or DEFAULT_DRIVER
+    driver_type = short_name(driver_name)
+    driver = load_driver(driver_name)
     latency_ms = settings.latency_ms if latency_ms is None else latency_ms
     listen_only = listen_only or settings.listen_only
     bus_names = list(buses) or [bus.name for bus in settings.bus]
@@ -195,7 +200,7 @@ def command(
 
     def bus_of(bus_name: str, adapter: AnyAdapter, file: ConfigFile) -> Bus:
         with file.blamed_for(bus_name):
-            return make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_type)
+            return make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_name)
 
     async def read_buses_again() -> None:
         if config is not None and not buses:  # what the command line names is not the file's to change
@@ -321,14 +326,16 @@ def _check_own_options(buses: Sequence[str], settings: DriverConfig) -> None:
 
 def _refuse_twice(bus_names: Sequence[str]) -> None:
     """Refuse a bus that stands there twice: its boards would be set up twice, and be two skins."""
-    from skinware_drivers.registry import parse_bus_name
+    from skinware_drivers.bus_names import parse_bus_name, place_of_bus
 
-    seen = []
+    seen: dict[BusPlace, str] = {}
     for name in bus_names:
-        bus = parse_bus_name(name)
-        if bus in seen:
-            raise ConfigurationError(f"bus {name} is named twice; a driver has each of its buses once")
-        seen.append(bus)
+        parse_bus_name(name)  # refuses what is no name
+        place = place_of_bus(name)
+        if place in seen:
+            also = f", also as {seen[place]}" if seen[place] != name else ""
+            raise ConfigurationError(f"bus {name} is named twice{also}; a driver has each of its buses once")
+        seen[place] = name
 
 
 def _read(path: Path | None) -> ConfigFile:

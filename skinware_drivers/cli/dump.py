@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from skinware_drivers.bus import Bus, FrameBatch
 
 _CAN_PAYLOAD = 64
-_BATCH_FRAMES = 2048
 _SERIAL = ("serial", "pty")
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which a second listener takes nothing away from the first."""
@@ -43,8 +42,9 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         BusError: nothing came for ``timeout_s``.
     """
     from skinware.realtime import now_ns
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.can.candump import channel_name, text_frames
-    from skinware_drivers.registry import make_bus, parse_bus_name
+    from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)
     _refuse_what_has_one_owner(bus_name, interface)
@@ -97,7 +97,7 @@ def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[Frame
     from skinware.errors import BusError
     from skinware_drivers.bus import FrameBatch
 
-    batch = FrameBatch(_BATCH_FRAMES, bus.payload_size)
+    batch = FrameBatch.for_buses(1, bus.payload_size)
     poll = select.poll()
     poll.register(bus.fileno(), select.POLLIN)
     end_s = None if timeout_s is None else time.monotonic() + timeout_s

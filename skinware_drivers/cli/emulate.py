@@ -26,10 +26,11 @@ class EmulateCommand(HardwareCommand):
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
         """The options of the emulator that the command line names."""
+        from skinware_drivers.loading import short_name
         from skinware_drivers.virtual.hardware import load_emulator
 
         driver = value_of("--driver", args) or _DEFAULT_DRIVER
-        return f"emulated {driver}", load_emulator(driver).Options
+        return f"emulated {short_name(driver)}", load_emulator(driver).Options
 
 
 @click.command(
@@ -44,7 +45,13 @@ class EmulateCommand(HardwareCommand):
     ),
 )
 @click.option("--bus", "bus_name", metavar="BUS", required=True, help="Bus to live on: vcan0, pty:/tmp/skin ...")
-@click.option("--driver", metavar="DRIVER", default=_DEFAULT_DRIVER, show_default=True, help="Whose devices.")
+@click.option(
+    "--driver",
+    metavar="DRIVER",
+    default=_DEFAULT_DRIVER,
+    show_default=True,
+    help="Whose devices: name of a driver, or a file with an emulator.",
+)
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
 @click.option("-T", "duration_s", type=seconds, metavar="SECONDS", help="End after SECONDS.")
@@ -60,9 +67,12 @@ def command(
 
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
+    from skinware_drivers.bus import kind_of_bus
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
+    from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
-    from skinware_drivers.registry import make_bus, parse_bus_name
+    from skinware_drivers.registry import make_bus
     from skinware_drivers.virtual.events import JsonLinesLog
     from skinware_drivers.virtual.hardware import load_emulator, medium_of
 
@@ -76,14 +86,16 @@ def command(
     medium = medium_of(emulator)
     bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
     if not bus.fits(medium):
-        where = "a CAN bus; give vcan0 or can0" if medium == "can" else "serial lines; give pty:./port or a port"
-        raise ConfigurationError(f"--bus {bus_name}: devices of {driver} hang on {where}")
+        such_as = "vcan0 or can0" if medium == "can" else "pty:./port, or a port that is there"
+        raise ConfigurationError(
+            f"--bus {bus_name}: devices of {short_name(driver)} hang on {kind_of_bus(medium)}; give {such_as}"
+        )
     log = JsonLinesLog(log_path) if log_path else None
     try:
         report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)
         emulation = Emulation(bus, emulator(options, log=log), report)
         with SignalWatch() as signals:
-            emulation.run(signals, bus_name=bus_name, driver=driver, options=options, duration_s=duration_s)
+            emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
     finally:
         if log is not None:
             log.close()

@@ -31,7 +31,13 @@ _DETECTION_S = 10.0
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
 @click.option("--listen", "listen_s", type=seconds, default="1", show_default=True, help="Listen for SECONDS.")
 @click.option("--probe", is_flag=True, help="Send requests that disturb nobody, to see who answers.")
-@click.option("--driver", "driver_names", multiple=True, metavar="DRIVER", help="Only this driver guesses and asks.")
+@click.option(
+    "--driver",
+    "driver_names",
+    multiple=True,
+    metavar="DRIVER",
+    help="Only this driver (name or file) guesses and asks.",
+)
 @click.option("--force", is_flag=True, help="With --probe: ask also where that may disturb somebody.")
 @click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")
 @json_option
@@ -56,10 +62,6 @@ def command(
     if udev:
         _print_rules(buses, as_json)
         return
-    from skinware_drivers.registry import load_driver
-
-    for name in driver_names:
-        load_driver(name)  # refuses one that is not there
     found = asyncio.run(look(buses, listen_s, probe=probe, force=force, driver_names=driver_names))
     if as_json:
         print_json(found)
@@ -81,6 +83,7 @@ async def look(
 
     Raises:
         BusNotAvailable: one of ``buses`` is not there.
+        ConfigurationError: one of ``driver_names`` is not there.
     """
     from skinware.errors import BusNotAvailable
     from skinware_drivers.finding.adapters import Detection, detect_adapters
@@ -115,9 +118,9 @@ def _chosen(
 ) -> tuple[list[CanInterface], list[SerialPort], list[str]]:
     """CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
     from skinware.errors import BusNotAvailable
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.ports import serial_ports
     from skinware_drivers.finding.running import same_bus
-    from skinware_drivers.registry import parse_bus_name
 
     if not buses:
         return interfaces, serial_ports(), []

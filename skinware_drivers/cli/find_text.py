@@ -41,7 +41,7 @@ def as_text(found: dict[str, Any]) -> list[str]:
 
 def _interface_lines(one: dict[str, Any]) -> list[str]:
     state = click.style("up", fg="green") if one["up"] else click.style("down", fg="yellow")
-    parts = [state, one["driver"] or one["kind"]]
+    parts = [state, f"kernel driver {one['driver']}" if one["driver"] else one["kind"]]
     if one["bit_rate"]:
         parts.append(_bit_rate(one))
     elif one["kind"] == "can":
@@ -116,7 +116,7 @@ def _port_lines(port: dict[str, Any]) -> list[str]:
         parts.append(f"{usb['vendor_id']}:{usb['product_id']}")
         parts.append(f"serial number {usb['serial_number']}" if usb["serial_number"] else "no serial number")
     if port["driver"]:
-        parts.append(port["driver"])
+        parts.append(f"kernel driver {port['driver']}")
     lines = _wrapped(f"{click.style(port['path'], bold=True)}  {', '.join(parts)}", first="")
     for link in port["links"]:
         lines.append(f"  {link}")

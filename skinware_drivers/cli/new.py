@@ -38,6 +38,8 @@ def command(name: str, transport: str) -> None:
     """Make a driver package in the new folder NAME: driver, emulated hardware, tests, and how to install them.
 
     It works as it is, for a small device that does not exist: put yours in its place, piece by piece.
+
+    To try something out no package is needed: skin-driver --driver ./my_skin.py takes a driver in a file.
     """
     from skinware_drivers.new_package import check_name, make_package
 

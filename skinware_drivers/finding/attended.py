@@ -12,8 +12,6 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.link import Link
 
-_BATCH_FRAMES, _BATCH_BYTES = 2048, 1 << 20
-
 
 @asynccontextmanager
 async def attended(bus: Bus, take: Callable[[FrameBatch], object] = lambda _batch: None) -> AsyncIterator[Link]:
@@ -30,7 +28,7 @@ async def attended(bus: Bus, take: Callable[[FrameBatch], object] = lambda _batc
     """
     loop = asyncio.get_running_loop()
     link = Link(bus)
-    batch = FrameBatch(max(64, min(_BATCH_FRAMES, _BATCH_BYTES // bus.payload_size)), bus.payload_size)
+    batch = FrameBatch.for_buses(1, bus.payload_size)
 
     def read() -> None:
         batch.clear()

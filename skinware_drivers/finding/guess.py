@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.finding.traffic import Traffic
 from skinware_drivers.layout import Bits, Frame, Identifier, Layout
 from skinware_drivers.link import Heard, Link
+from skinware_drivers.loading import short_name
 from skinware_drivers.registry import DRIVERS, load_driver
 
 _NAMING_S = 0.5
@@ -53,21 +55,20 @@ class _Match:
 
 
 def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[AnyAdapter]]:
-    """Registered drivers for a kind of bus that can be loaded, by name.
+    """Drivers for a kind of bus, by name.
 
     Args:
         medium: kind of bus, ``can``.
-        only: names of those to take; none: all.
+        only: those in question, as ``load_driver`` takes them; none: all that are registered and can be loaded.
+
+    Raises:
+        ConfigurationError: one of ``only`` is not there, or cannot be loaded.
     """
-    found = {}
-    for name in sorted({entry.name for entry in entry_points(group=DRIVERS)}):
-        try:
-            driver = load_driver(name)
-        except ConfigurationError:
-            continue
-        if driver.medium == medium and (not only or name in only):
-            found[name] = driver
-    return found
+    found = {short_name(name): load_driver(name) for name in only}
+    for name in () if only else sorted(entry_points(group=DRIVERS).names):
+        with contextlib.suppress(ConfigurationError):
+            found[name] = load_driver(name)
+    return {name: driver for name, driver in found.items() if driver.medium == medium}
 
 
 async def guess(traffic: Traffic, bus: Bus, drivers: dict[str, type[AnyAdapter]]) -> list[Guess]:

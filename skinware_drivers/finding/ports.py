@@ -15,6 +15,8 @@ from pathlib import Path
 SLOW_LATENCY_MS = 1
 """A latency timer above this holds back what a device has sent: FTDI's default is 16 ms."""
 _UNKNOWN_UART = "0"
+_NO_HARDWARE = "serial-base"
+"""Subsystem of devices that the kernel has put between a port and its hardware since 6.5."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +138,9 @@ def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, .
     info = path.stat()
     group = _group_that_may(info)
     latency = _text(device / "latency_timer")
-    driver = device / "driver"
     return SerialPort(
         path=str(path),
-        driver=driver.resolve().name if driver.exists() else "",
+        driver=_driver(device),
         usb=_usb_identity(device),
         links=links,
         may_open=os.access(path, os.R_OK | os.W_OK),
@@ -149,6 +150,13 @@ def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, .
         users_known=all_seen,
         latency_ms=int(latency) if latency.isdigit() else None,
     )
+
+
+def _driver(device: Path) -> str:
+    """The kernel's driver of a port. Above built-in ones are two devices (port, ctrl) that say nothing of hardware."""
+    while (device / "subsystem").resolve().name == _NO_HARDWARE:
+        device = device.parent
+    return (device / "driver").resolve().name if (device / "driver").exists() else ""
 
 
 def _usb_identity(device: Path) -> UsbIdentity | None:

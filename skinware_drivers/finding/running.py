@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from urllib.parse import parse_qsl
 
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, BusNotAvailable, ConfigurationError, NamespaceError, ServiceNotFound
 from skinware.memory.namespace import ROOT, Namespace
-from skinware_drivers.registry import parse_bus_name
+from skinware_drivers.bus_names import BusPlace, place_of_bus
 from skinware_drivers.serial.opening import SerialOptions, find_port
 
 _PREFIX = "skinware."
 _PRIVATE = "virtual"
-_PLACING: dict[str, dict[str, str]] = {
-    "serial": {"serial_number": "", "vid_pid": ""},
-    "udp_multicast": {"port": "43113"},
-    "socketcand": {"host": "", "port": ""},
-}
-"""By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
 
 
 @dataclass(frozen=True)
@@ -72,25 +64,23 @@ def driver_on(bus_name: str, drivers: Iterable[RunningDriver]) -> RunningDriver 
 
 
 def same_bus(one: str, other: str) -> bool:
-    """Whether two names mean one bus: links are followed, and only those options count that say where the bus is.
+    """Whether two names, of one program or of two, mean one bus now, by :func:`place_of_bus`.
 
     Serial lines that are named by their USB device are where that is plugged in now; while it is not plugged in, the
     names alone are compared. A ``virtual`` bus is nobody else's: each process has its own.
     """
-    place = _place(one)
-    return place == _place(other) and place[0] != _PRIVATE
+    place = _place_now(one)
+    return place == _place_now(other) and place.interface != _PRIVATE
 
 
-def _place(bus_name: str) -> tuple[str, ...]:
-    address, _, query = bus_name.partition("?")
-    interface, channel, _ = parse_bus_name(address)
-    options = dict(parse_qsl(query))  # of any program's bus: whatever stands there is no error
-    placing = {key: options.get(key, usual) for key, usual in _PLACING.get(interface, {}).items()}
-    if interface == "serial" and not channel:
-        device = SerialOptions(serial_number=placing["serial_number"], vid_pid=placing["vid_pid"])
+def _place_now(bus_name: str) -> BusPlace:
+    place = place_of_bus(bus_name)
+    if (place.interface, place.channel) == ("serial", ""):
         with contextlib.suppress(BusNotAvailable, ConfigurationError):
-            channel, placing = find_port("", device), dict.fromkeys(placing, "")
-    return interface, os.path.realpath(channel) if channel.startswith("/dev/") else channel, *placing.values()
+            usb = dict(place.options)
+            device = SerialOptions(serial_number=usb["serial_number"], vid_pid=usb["vid_pid"])
+            return place_of_bus(find_port("", device))
+    return place
 
 
 def _look_at(namespace: Namespace, name: str) -> RunningDriver | None:

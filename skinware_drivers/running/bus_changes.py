@@ -11,6 +11,7 @@ from skinware.errors import ConfigurationError, StructureError
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.bus_names import place_of_bus
 from skinware_drivers.description import join_types
 from skinware_drivers.running.bus_line import BusLine
 
@@ -66,7 +67,7 @@ class BusChanges:
                     if same.adapter.options != adapter.options:
                         replaced[name] = same
                     continue
-                old = next((line for line in leaving if _address(line.name) == _address(name)), None)
+                old = next((line for line in leaving if place_of_bus(line.name) == place_of_bus(name)), None)
                 if old is None:
                     coming.append(name)
                 else:
@@ -109,9 +110,3 @@ class BusChanges:
             join_types([line.adapter.types for line in lines.values()])
         except StructureError as error:
             raise ConfigurationError(str(error)) from None
-
-
-def _address(bus_name: str) -> str:
-    """What stays when a bus gets other options; all of its name, where only the options tell which bus it is."""
-    address = bus_name.partition("?")[0]
-    return bus_name if address.endswith(":") else address

@@ -206,7 +206,7 @@ class BusLine:
                 await self.reopen()
             try:
                 self.patches = await self.adapter.describe(self.link)
-                why = "no patch answers"
+                why = "no patch is heard, and nobody may be asked" if self.bus.listen_only else "no patch answers"
             except BusError as error:
                 self.patches = ()
                 why = str(error)

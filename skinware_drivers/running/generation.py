@@ -20,15 +20,12 @@ from skinware_drivers.running.publisher import Publisher
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-BATCH_FRAMES, _FRAMES_OF_A_BUS, _BATCH_BYTES = 2048, 256, 1 << 20
 _LOOK_PAUSE_NS = NS_PER_S // 20
 
 
 def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
-    """Room for what arrives at once; of long frames, fewer do."""
-    payload_size = max(line.adapter.payload_size for line in lines)
-    wanted = max(BATCH_FRAMES, _FRAMES_OF_A_BUS * len(lines))
-    return FrameBatch(max(64, min(wanted, _BATCH_BYTES // payload_size)), payload_size, headroom)
+    """Room for what arrives at once on all of these."""
+    return FrameBatch.for_buses(len(lines), max(line.adapter.payload_size for line in lines), headroom)
 
 
 def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -> Sequence[npt.NDArray[np.int64]]:

@@ -259,7 +259,7 @@ class SerialBus(Bus):
         try:
             written = port.write(self._unsent)
         except OSError as error:
-            raise BusNotAvailable(f"{self!r} went away ({error.strerror or error}): unplugged?") from None
+            raise BusNotAvailable(f"{self!r} went away, perhaps unplugged ({error.strerror or error})") from None
         self._unsent = self._unsent[written:]
         wanted = select.EPOLLIN | (select.EPOLLOUT if self._unsent else 0)
         with contextlib.suppress(OSError):

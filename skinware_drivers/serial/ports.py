@@ -89,9 +89,9 @@ class DescriptorPort(Port):
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise BusNotAvailable(f"{self._name} went away ({error.strerror}): unplugged?") from None
+            raise BusNotAvailable(f"{self._name} went away, perhaps unplugged ({error.strerror})") from None
         if not data:
-            raise BusNotAvailable(f"{self._name} went away (readable, but nothing comes): unplugged?")
+            raise BusNotAvailable(f"{self._name} went away, perhaps unplugged (readable, but nothing comes)")
         return data
 
     def write(self, data: bytes) -> int:

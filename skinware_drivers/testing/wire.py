@@ -211,7 +211,7 @@ class _EmulatedPort(Port):
 
     def read(self, size: int) -> bytes:
         if not self.present:
-            raise BusNotAvailable("the emulated line went away: unplugged?")
+            raise BusNotAvailable("the emulated line went away, perhaps unplugged")
         self._bytes += b"".join(frame.payload for frame in self._hardware.emit(self._clock()))
         data, self._bytes = self._bytes[:size], self._bytes[size:]
         self._wake()

@@ -171,11 +171,6 @@ class VirtualCanBus(Bus):
             self._timer = None
         self._pending = []
 
-    @property
-    def note(self) -> str:
-        """That this is no real hardware."""
-        return f"emulated {self._emulated}"
-
     # Faults of the bus itself, for tests
 
     def fail_next_receive(self, error: BusError) -> None:

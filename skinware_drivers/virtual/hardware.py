@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.options import load_registered
+from skinware_drivers.loading import Kind, load
 
 EMULATORS = "skinware.emulators"
 """The entry point group in which emulators register, under the name of the driver they serve."""
@@ -32,6 +32,7 @@ class EventLog(Protocol):
         """Take one event. Events come in order of time, except those of a burst, which come together."""
 
 
+@runtime_checkable
 class EmulatedHardware(Protocol):
     """Devices on one bus. They never sleep and read no clock: whoever carries their frames tells the time.
 
@@ -74,6 +75,15 @@ class HardwareFactory(Protocol):
         """Make the devices. ``options`` is an instance of ``Options``; ``log`` takes what they do."""
 
 
+_EMULATOR = Kind(
+    "emulator",
+    EMULATORS,
+    "Emulator",
+    lambda found: issubclass(found, EmulatedHardware) and hasattr(found, "Options"),
+    instead="; without one, its driver needs the real devices, as on --bus can0",
+)
+
+
 def medium_of(emulator: HardwareFactory) -> str:
     """What the devices are connected by: ``can``, unless the class says otherwise in its attribute ``medium``."""
     medium: str = getattr(emulator, "medium", "can")
@@ -91,13 +101,12 @@ def emulators_instead(medium: str) -> str:
 
 
 def load_emulator(name: str) -> HardwareFactory:
-    """The emulator that is registered under ``name``.
+    """The emulator of a name; see :func:`skinware_drivers.loading.load`.
 
     Raises:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
-    emulator: HardwareFactory = load_registered(EMULATORS, "emulator", name, f"there is no emulator {name!r}")
-    return emulator
+    return cast("HardwareFactory", load(_EMULATOR, name))
 
 
 __all__ = [

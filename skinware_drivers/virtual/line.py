@@ -53,11 +53,6 @@ class VirtualSerialBus(SerialBus):
         """Emulators of devices on that medium."""
         return emulators_instead(medium) or super().instead(medium)
 
-    @property
-    def note(self) -> str:
-        """That this is no real hardware."""
-        return f"emulated {self.channel}"
-
     def _open_port(self) -> Port:
         return _EmulatedPort(self.hardware)
 

@@ -86,10 +86,12 @@ def test_people_see_a_line_per_frame(capsys: pytest.CaptureFixture[str]) -> None
         skin.publish()
         assert exit_status(command, ["-n", "1"]) == 0
         line = capsys.readouterr().out
-        assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 0 / 4 / 8 raw  temperature - raw  not fresh 3\n", line)
+        assert re.fullmatch(
+            r"a #1  age [\d.]+ ms  pressure 0 to 8 raw \(mean 4\)  temperature - raw  not fresh 3\n", line
+        )
         assert exit_status(command, ["-n", "1", "--physical", "--type", "pressure"]) == 0
         line = capsys.readouterr().out
-        assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 / 251 / 255 counts  not fresh 1\n", line)
+        assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  not fresh 1\n", line)
 
 
 def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFixture[str]) -> None:

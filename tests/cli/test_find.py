@@ -89,7 +89,7 @@ def test_a_machine_with_everything(capsys: pytest.CaptureFixture[str], machine: 
     text = found(capsys)
     assert fits(text), text
     for words in (
-        "can0  down, peak_usb, no bit rate known",
+        "can0  down, kernel driver peak_usb, no bit rate known",
         "      sudo ip link set can0 type can bitrate 1000000 restart-ms 100\n      sudo ip link set can0 up",
         "500 kbit/s, data 2000 kbit/s, bus-off",
         "received 12,345, sent 0, rx errors 7",

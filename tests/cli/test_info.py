@@ -128,7 +128,7 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
     assert (first["interval"]["p99_ns"], first["age"]["p50_ns"]) == (2**25 - 1, 2**21 - 1)
     assert second["interval"]["p99_ns"] is None
     assert first["interval"]["counts"][25] == 100
-    assert re.search(r"age  99 % apart  99 % aged", out)
+    assert re.search(r"age  interval 99 %  delay 99 %.*(?s:.*)\n  99 %: at most so much in 99 of 100 cases", out)
     assert re.search(r"board 7 .*ms +34 ms +2.1 ms", out)
     assert re.search(r"board 8 .*ms +- +2.1 ms", out)
 
@@ -320,9 +320,9 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
     assert re.fullmatch(r"  board 8  can1  stale +0 of 48 +[\d.]+ ms +0 +0", lines[12])
     figure = r"[\d.]+ [mu]s"
-    takes = rf"  a frame takes {figure} to fill \(worst {figure}\) and {figure} of processor time in all"
+    takes = rf"  a frame takes {figure} to fill \(worst {figure}\); with all else {figure} of processor time"
     assert re.fullmatch(takes, lines[14])
-    assert re.fullmatch(r"  99 % of its frames hold data up to [\d.]+ [a-z]+ old when published", lines[15])
+    assert re.fullmatch(r"  99 % of its frames are published at most [\d.]+ [a-z]+ after their newest data", lines[15])
     assert lines[16].split()[:3] == ["reader", "how", "pid"]
     assert "on demand" in lines[17]
     assert max(map(len, lines)) <= 100

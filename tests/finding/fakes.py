@@ -82,8 +82,17 @@ class FakeMachine:
 
     def add_uart(self, name: str, kind: int) -> Path:
         """A built-in port; of kind 0 there is nothing behind it."""
-        device = self.root / "sys/devices/platform" / name
+        chip = self.root / "sys/devices/pnp" / name
+        device = chip / f"{name}:0" / f"{name}:0.0"
         write(device)
+        for folder, subsystem, driver in (
+            (chip, "pnp", "serial"),
+            (device.parent, "serial-base", "ctrl"),
+            (device, "serial-base", "port"),
+        ):
+            for link, target in (("subsystem", subsystem), ("driver", driver)):
+                (folder / link).symlink_to(self.root / "sys/bus" / target)
+                (self.root / "sys/bus" / target).mkdir(parents=True, exist_ok=True)
         path = self._add(name, device)
         write(self.root / "sys/class/tty" / name, type=kind)
         return path

@@ -47,7 +47,7 @@ def test_ports_come_by_number_and_those_without_hardware_not_at_all(fake: FakeMa
     found = serial_ports(fake.machine)
     assert [Path(port.path).name for port in found] == ["ttyS0", "ttyUSB2", "ttyUSB10"]
     assert found[0].usb is None
-    assert found[0].name == "built-in port"
+    assert (found[0].name, found[0].driver) == ("built-in port", "serial")
 
 
 def test_a_port_that_was_unplugged_meanwhile_is_left_out(fake: FakeMachine) -> None:

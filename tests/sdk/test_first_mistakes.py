@@ -13,10 +13,11 @@ from skinware.cli._command import exit_status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
+from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.cli import emulate
 from skinware_drivers.cli.driver import command
-from skinware_drivers.registry import load_driver, parse_bus_name
+from skinware_drivers.registry import load_driver
 
 
 @pytest.mark.parametrize(
@@ -24,7 +25,11 @@ from skinware_drivers.registry import load_driver, parse_bus_name
     [
         (["xela", "--bus", "virtual"], "'xela' is no option: name the driver with --driver"),
         (["--bus", "virtual", "--bus", "virtual"], "bus virtual is named twice"),
-        (["--bus", "can0", "--bus", "can0"], "bus can0 is named twice"),
+        (["--bus", "can0", "--bus", "can0"], "bus can0 is named twice; a driver"),
+        (
+            ["--bus", "can0", "--bus", "socketcan:can0?x=1"],
+            r"bus socketcan:can0\?x=1 is named twice, also as can0; a driver",
+        ),
         (["--bus", "virtual", "--driver", "xelo"], r"did you mean 'xela'\?.*pip install -e \."),
         (["--bus", "virtual", "--driver", "xela", "--boards", "a"], r"boards=a: give a whole number \(number 1"),
         (["--bus", "virtual&lose=0.1"], r"options begin with a question mark, as in virtual\?lose"),
@@ -61,9 +66,10 @@ def test_a_path_may_have_an_equals_sign() -> None:
     ("text", "words"),
     [
         ("import nonsuch", r"ModuleNotFoundError: No module named 'nonsuch' \(.*mine_\w+\.py:1\)"),
-        ("x =\n", r"SyntaxError: .*mine_\w+\.py, line 1\)$"),
+        ("x =\n", r"SyntaxError: .*mine_\w+\.py:1\)$"),
         ("1 / 0", r"ZeroDivisionError: division by zero \(.*mine_\w+\.py:1\)"),
         ("from skinware_drivers import Layout\nLayout([])", r"1 to 200 frames.*mine_\w+\.py:2\)"),
+        ("from skinware import Namespace\nNamespace('a b')", r"namespace name 'a b'.*mine_\w+\.py:2\)$"),
         ("", r"has no attribute 'Driver'$"),
     ],
 )

@@ -14,7 +14,6 @@ import pytest
 from skinware import BusState, DriverFrame, DriverReader, PatchState, Skin, Status
 from skinware.errors import NameInUse
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.running import generation
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import LostHalf, damaged_cycles
@@ -53,7 +52,7 @@ class Flood(VirtualCanBus):
 
 @pytest.mark.usefixtures("hurry")
 def test_a_flood_on_one_bus_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "BATCH_FRAMES", 128)
+    monkeypatch.setattr("skinware_drivers.bus.BATCH_FRAMES", 128)
     hardware = EmulatedRoboskin(EmulatorOptions(boards=(7,)))
     flood = Flood.with_hardware(hardware)
     others = [emulated(boards=(board,), pattern="idle") for board in (8, 9)]
@@ -250,6 +249,12 @@ def test_a_driver_waits_for_a_board_and_goes_on_when_one_appears(caplog: pytest.
         with DriverReader("roboskin") as reader:
             assert read_until(reader, lambda f: not f.status.any()).structure.n_sensors == 192
     assert caplog.text.count("no patch answers") == 1
+
+
+def test_a_listener_that_hears_nobody_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    bus = emulated(boards=(7,), listen_only=True)
+    with caplog.at_level(logging.WARNING), driving(bus, wait=False, listen_only=True, learn_s=0.1):
+        wait_until(lambda: "no patch is heard, and nobody may be asked; waiting for one to appear" in caplog.text)
 
 
 def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:

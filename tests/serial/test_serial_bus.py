@@ -22,7 +22,8 @@ from serial.tools import list_ports
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.registry import make_bus, parse_bus_name
+from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed

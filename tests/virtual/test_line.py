@@ -66,7 +66,7 @@ def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.M
     bus = line.virtual_bus("strip", {"seed": "1"}, payload_size=8)
     assert isinstance(bus, line.VirtualSerialBus)
     bus.use(Packet(sync=(0xAA,), length=3), Packet(length=1, sync=(ord("?"),)))
-    assert bus.note == "emulated strip"
+    assert bus.name == "bus virtual:strip"
     bus.open()
     try:
         bus.send(0, b"")

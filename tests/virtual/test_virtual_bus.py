@@ -348,7 +348,7 @@ def test_the_channel_names_the_emulator_and_nothing_is_roboskin() -> None:
     for channel in ("", "roboskin"):
         bus = VirtualCanBus(channel, {"boards": "7-9", "lose": "0.01"})
         assert isinstance(bus.hardware, EmulatedRoboskin)
-        assert "roboskin" in bus.note
+        assert bus.name == "bus virtual:roboskin"
         bus.open()
         assert bus.receive(FrameBatch(10), 0) == 0
         bus.close()

@@ -1,0 +1,79 @@
+"""Names of buses, ``[interface:]channel[?key=value&...]``: taken apart, and which bus they mean."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+from urllib.parse import parse_qsl
+
+from skinware.errors import ConfigurationError
+
+_PLACING: dict[str, dict[str, str]] = {
+    "serial": {"serial_number": "", "vid_pid": ""},
+    "udp_multicast": {"port": "43113"},
+    "socketcand": {"host": "", "port": ""},
+}
+"""By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
+
+
+class BusName(NamedTuple):
+    """A bus' name taken apart."""
+
+    interface: str
+    channel: str
+    options: dict[str, str]
+
+
+class BusPlace(NamedTuple):
+    """What of a bus' name says which bus it is."""
+
+    interface: str
+    channel: str
+    options: tuple[tuple[str, str], ...]
+    """Those that place it, always in the same order."""
+
+
+def parse_bus_name(name: str) -> BusName:
+    """Take a bus' name apart.
+
+    ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
+    (``/dev/ttyUSB0``, ``./port``), is a serial port; pyserial's URLs (``socket://host:port``) are serial, too.
+    python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
+
+    Raises:
+        ConfigurationError: empty, or options that are not ``key=value``.
+    """
+    address, _, query = name.partition("?")
+    if "=" in address and "/" not in address:
+        raise ConfigurationError(f"bus {name!r}: options begin with a question mark, as in virtual?lose=0.1&seed=1")
+    if not address:
+        raise ConfigurationError("a bus needs a name, such as vcan0, can0, /dev/ttyUSB0 or virtual")
+    try:
+        options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if query else {}
+    except ValueError:
+        raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
+    return BusName(*_split(address), options)
+
+
+def place_of_bus(name: str) -> BusPlace:
+    """Which bus a name means: two names of one bus have the same place, whatever options stand in them beside that.
+
+    Links are followed. Emulated buses are told apart by all of their options. A USB device that is named by what it is
+    has the place that its name says, wherever it is plugged in. Any text has a place, also one that is no bus' name.
+    """
+    address, _, query = name.partition("?")
+    interface, channel = _split(address)
+    given = dict(parse_qsl(query, keep_blank_values=True))
+    usual = dict.fromkeys(sorted(given), "") if interface == "virtual" else _PLACING.get(interface, {})
+    options = tuple((key, given.get(key, value)) for key, value in usual.items())
+    return BusPlace(interface, os.path.realpath(channel) if channel.startswith("/") else channel, options)
+
+
+def _split(address: str) -> tuple[str, str]:
+    """Interface and channel."""
+    interface, colon, channel = address.partition(":")
+    if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
+        return "serial", address
+    if colon:
+        return interface, channel
+    return (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)

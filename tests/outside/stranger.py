@@ -10,7 +10,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -68,7 +68,16 @@ class Stranger:
 
     def do(self, *command: str, cwd: Path | None = None) -> str:
         """Run a command to its end; its output. It must succeed."""
-        done = subprocess.run(
+        with self._started(command, cwd) as process:
+            try:
+                told, _ = process.communicate(timeout=PATIENCE_S)
+            finally:
+                process.kill()  # nothing happens to one that has ended
+        assert process.returncode == 0, f"{' '.join(command)}\n{told}"
+        return told
+
+    def _started(self, command: Sequence[str], cwd: Path | None) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             [self._bin / command[0], *command[1:]],
             cwd=cwd or self.home,
             env=self.environ,
@@ -76,10 +85,7 @@ class Stranger:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=PATIENCE_S,
         )
-        assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}"
-        return done.stdout
 
     def _add_commands(self) -> None:
         """The commands of packages that are installed beside: Python's run with this environment's."""
@@ -92,15 +98,7 @@ class Stranger:
     @contextmanager
     def running(self, *command: str, cwd: Path | None = None) -> Iterator[None]:
         """A command that is interrupted at the end; it must then end well."""
-        process = subprocess.Popen(
-            [self._bin / command[0], *command[1:]],
-            cwd=cwd or self.home,
-            env=self.environ,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        process = self._started(command, cwd)
         try:
             yield
         finally:

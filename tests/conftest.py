@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -15,3 +17,4 @@ settings.load_profile("busy")
 @pytest.fixture(autouse=True)
 def everywhere(namespace: Namespace) -> None:
     """Also where no test asks for it."""
+    gc.freeze()  # what was there before need not be searched for garbage once more after every test

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -17,4 +15,3 @@ settings.load_profile("busy")
 @pytest.fixture(autouse=True)
 def everywhere(namespace: Namespace) -> None:
     """Also where no test asks for it."""
-    gc.freeze()  # what was there before need not be searched for garbage once more after every test

@@ -9,7 +9,6 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import pytest
 from skinware import DriverReader, DriverWriter, ServiceWriter, get_include
 from tests.compiling import LANGUAGES, compiled
 from tests.core.c_programs import SOURCE, SPAWN, Talk, ended, run, running, structure, write_flat_out
+from tests.wheel import ROOT, built_wheel
 
 # -- the header itself --------------------------------------------------------------------------------------------
 
@@ -43,19 +43,10 @@ def test_the_header_needs_nothing_and_warns_of_nothing(
     subprocess.run([str(tmp_path / "user")], check=True)
 
 
-def test_the_header_is_in_the_wheel(tmp_path: Path) -> None:
-    project = Path(__file__).parents[2]
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(project / name, tmp_path / name)
-    for name in ("skinware", "skinware_drivers"):
-        shutil.copytree(project / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
-    build = "import sys; from setuptools.build_meta import build_wheel; build_wheel(sys.argv[1])"
-    wheels = tmp_path / "wheels"
-    subprocess.run([sys.executable, "-c", build, str(wheels)], cwd=tmp_path, check=True, capture_output=True)
-    (wheel,) = wheels.glob("*.whl")
-    shutil.unpack_archive(wheel, tmp_path / "installed", "zip")
-    header = tmp_path / "installed" / "skinware" / "include" / "skinware.h"
-    assert header.read_bytes() == (project / "skinware" / "include" / "skinware.h").read_bytes()
+def test_the_header_is_in_the_wheel(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    shutil.unpack_archive(built_wheel(tmp_path_factory), tmp_path, "zip")
+    header = Path("skinware", "include", "skinware.h")
+    assert (tmp_path / header).read_bytes() == (ROOT / header).read_bytes()
 
 
 # -- the same values ----------------------------------------------------------------------------------------------

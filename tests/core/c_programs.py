@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import select
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,8 @@ import numpy as np
 from skinware import DriverWriter, Namespace, Structure
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware_drivers.testing.waiting import wait_until
+from tests.core.workers import PROCESSES, running
 
-SPAWN = multiprocessing.get_context("spawn")
 SOURCE = Path(__file__).with_name("c_reader.c")
 STRAIN = 77 << 12 | 5
 Event = dict[str, Any]
@@ -73,29 +71,9 @@ def write_until_killed(n_modules: int, value: int, published: Any) -> None:
 
 
 @contextmanager
-def running(function: Callable[..., None], *arguments: Any) -> Iterator[Any]:
-    """A process that is killed at the end, unless it was before."""
-    process = SPAWN.Process(target=function, args=arguments)
-    process.start()
-    try:
-        yield process
-    finally:
-        kill(process)
-
-
-def kill(process: Any) -> None:
-    if process._closed:
-        return
-    if process.is_alive():
-        os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    process.close()
-
-
-@contextmanager
 def lone_writer(n_modules: int = 6, value: int = 5) -> Iterator[Any]:
     """A driver in a process of its own that has published one frame and is filling the next."""
-    published = SPAWN.Event()
+    published = PROCESSES.Event()
     with running(write_until_killed, n_modules, value, published) as process:
         assert published.wait(60)
         yield process

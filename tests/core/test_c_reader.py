@@ -19,8 +19,12 @@ import pytest
 
 from skinware import DriverReader, DriverWriter, ServiceWriter, get_include
 from tests.compiling import LANGUAGES, compiled
-from tests.core.c_programs import SOURCE, SPAWN, Talk, ended, run, running, structure, write_flat_out
+from tests.core.c_programs import SOURCE, Talk, ended, run, structure, write_flat_out
+from tests.core.workers import PROCESSES, running
 from tests.wheel import ROOT, built_wheel
+
+pytestmark = pytest.mark.usefixtures("process_server")
+
 
 # -- the header itself --------------------------------------------------------------------------------------------
 
@@ -133,7 +137,7 @@ def test_services_that_are_no_drivers_are_read_too(any_program: Path) -> None:
 @pytest.mark.parametrize("slots", [2, 3, 8])
 @pytest.mark.parametrize("way", ["copy", "view"])
 def test_no_torn_frame_from_a_writer_flat_out(program: Path, slots: int, way: str) -> None:
-    stop = SPAWN.Event()
+    stop = PROCESSES.Event()
     with running(write_flat_out, slots, 100, stop) as process:
         wait_for_service(process)
         seen = run(program, "flood", "x", 20_000, way)
@@ -153,14 +157,14 @@ def wait_for_service(process: Any) -> None:
 
 def test_a_writer_that_is_killed_and_restarted_all_the_time(program: Path) -> None:
     generator = random.Random(4)
-    with running(write_flat_out, 3, 40, SPAWN.Event()) as process:
+    with running(write_flat_out, 3, 40, PROCESSES.Event()) as process:
         wait_for_service(process)
         flood = Talk([str(program), "flood", "x", "0", "copy"])
         time.sleep(generator.uniform(0.0, 0.05))  # a moment of the writer's life: nothing depends on it
     with ended(flood):
         for _ in range(6):
             flood.until("gone")
-            with running(write_flat_out, 3, 40, SPAWN.Event()):
+            with running(write_flat_out, 3, 40, PROCESSES.Event()):
                 flood.until("restarted")
                 time.sleep(generator.uniform(0.0, 0.05))
         flood.until("gone")
@@ -172,7 +176,7 @@ def test_a_writer_that_is_killed_and_restarted_all_the_time(program: Path) -> No
 
 
 def test_a_killed_c_reader_is_nothing_to_the_writer(program: Path) -> None:
-    stop = SPAWN.Event()
+    stop = PROCESSES.Event()
     with running(write_flat_out, 3, 40, stop) as process:
         wait_for_service(process)
         for _ in range(3):

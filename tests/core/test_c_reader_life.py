@@ -7,10 +7,14 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from skinware import ServiceWriter
 from skinware.memory import _layout
-from tests.core.c_programs import kill, lone_writer, run, talking
+from tests.core.c_programs import lone_writer, run, talking
+from tests.core.workers import kill
+
+pytestmark = pytest.mark.usefixtures("process_server")
 
 LONG_MS = 600_000
 """Nothing here may wait that long: what is told in spite of it was noticed, not waited for."""

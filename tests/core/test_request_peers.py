@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import socket
@@ -18,8 +17,9 @@ from skinware.realtime import now_ns
 from skinware.service._server import short_path
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import OPERATIONS, SMALL, on_request
+from tests.core.workers import PATIENCE_S, PROCESSES, running
 
-_context = multiprocessing.get_context("spawn")
+pytestmark = pytest.mark.usefixtures("process_server")
 
 
 def _serve(ready: Any) -> None:
@@ -32,15 +32,10 @@ def _serve(ready: Any) -> None:
 
 @contextmanager
 def served() -> Iterator[Any]:
-    ready = _context.Event()
-    process = _context.Process(target=_serve, args=(ready,))
-    process.start()
-    try:
-        assert ready.wait(60)
+    ready = PROCESSES.Event()
+    with running(_serve, ready) as process:
+        assert ready.wait(PATIENCE_S)
         yield process
-    finally:
-        process.kill()
-        process.join()
 
 
 def test_a_killed_writer_is_a_clear_error_and_its_successor_answers(namespace: Namespace) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -15,13 +16,14 @@ from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
-from tests.core.services import SMALL, Columns, publish
+from tests.core.services import SMALL, publish
+from tests.core.workers import PATIENCE_S, PROCESSES, kill, running
 
-SPAWN = multiprocessing.get_context("spawn")
+pytestmark = pytest.mark.usefixtures("process_server")
 
 
-def write_until_killed(name: str, columns: Columns, published: Any, fill_only: bool) -> None:
-    writer = ServiceWriter(name, columns)
+def write_until_killed(published: Any, fill_only: bool) -> None:
+    writer = ServiceWriter("x", SMALL)
     for value in range(1, 11):
         publish(writer, value)
     if fill_only:
@@ -31,24 +33,18 @@ def write_until_killed(name: str, columns: Columns, published: Any, fill_only: b
         time.sleep(1)
 
 
-def killed_writer(name: str = "x", columns: Columns = SMALL, fill_only: bool = False) -> Any:
-    published = SPAWN.Event()
-    process = SPAWN.Process(target=write_until_killed, args=(name, columns, published, fill_only))
-    process.start()
-    assert published.wait(30)
-    return process
-
-
-def kill(process: Any) -> None:
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    process.close()
+@contextmanager
+def lone_writer(fill_only: bool = False) -> Iterator[Any]:
+    """A writer in a process of its own that has published ten frames."""
+    published = PROCESSES.Event()
+    with running(write_until_killed, published, fill_only) as process:
+        assert published.wait(PATIENCE_S)
+        yield process
 
 
 @pytest.mark.parametrize("fill_only", [False, True])
 def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) -> None:
-    process = killed_writer(fill_only=fill_only)
-    with ServiceReader[Frame]("x") as reader:
+    with lone_writer(fill_only) as process, ServiceReader[Frame]("x") as reader:
         frame = reader.read()
         assert reader.alive
         assert not frame.stale
@@ -68,8 +64,7 @@ def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) ->
 
 
 def test_another_structure_is_told_and_old_data_stays_readable() -> None:
-    process = killed_writer()
-    with ServiceReader[Frame]("x") as reader:
+    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
         last = reader.read()
         kill(process)
         with ServiceWriter("x", {"values": ("<u8", 3)}) as writer:
@@ -83,8 +78,7 @@ def test_another_structure_is_told_and_old_data_stays_readable() -> None:
 
 
 def test_a_stopped_process_is_alive_but_silent() -> None:
-    process = killed_writer()
-    with ServiceReader[Frame]("x") as reader:
+    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
         os.kill(process.pid, signal.SIGSTOP)
         frame = reader.read()
         with pytest.raises(ServiceTimeout, match="lives, but is silent"):

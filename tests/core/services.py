@@ -10,8 +10,7 @@ from typing import Any
 
 from skinware import ServiceWriter
 
-Columns = dict[str, tuple[str, int]]
-SMALL: Columns = {"values": ("<u8", 512)}
+SMALL = {"values": ("<u8", 512)}
 
 
 def publish(writer: ServiceWriter, value: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -282,3 +283,5 @@ def test_a_node_of_the_canopen_package_on_python_cans_bus() -> None:
             assert running.status()["buses"][0]["unknown"] == 0
         wait_until(lambda: node.nmt.state == "PRE-OPERATIONAL")
         node.nmt.stop_heartbeat()
+    # python-can's threads of cyclic messages end a while after they were told to
+    wait_until(lambda: not any(thread.name.startswith("Cyclic send task") for thread in threading.enumerate()))

@@ -157,18 +157,6 @@ class ConfigFile:
         return f"{self._path}:{line_of(self._text, keys)}"
 
 
-def convert(struct: type[T], data: Mapping[str, Any], where: str) -> T:
-    """``data`` as a struct.
-
-    Raises:
-        ConfigurationError: an unknown key or a wrong value; the message begins with ``where``.
-    """
-    try:
-        return _convert(struct, data)
-    except _Wrong as wrong:
-        raise ConfigurationError(f"{where}: {wrong}") from None
-
-
 class _Wrong(Exception):
     """What is wrong, and with which key."""
 

@@ -1,7 +1,8 @@
-"""Compiles the C and C++ programs of the tests, once each."""
+"""Compiles the C and C++ programs of the tests, once each in a run."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import skinware
+from tests.sharing import made_once
 
 _WARNINGS = ("-Wall", "-Wextra", "-Werror")
 _SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -22,8 +24,6 @@ LANGUAGES: dict[str, tuple[str, ...]] = {
 }
 """Compiler and options, by what a test calls them."""
 
-_compiled: dict[tuple[Path, str], Path] = {}
-
 
 def compiled(source: Path, language: str, folder: pytest.TempPathFactory, options: Sequence[str] = ()) -> Path:
     """The program that a source file makes; skips the test where there is no compiler, fails it in CI.
@@ -31,7 +31,7 @@ def compiled(source: Path, language: str, folder: pytest.TempPathFactory, option
     Args:
         source: one source file.
         language: one of ``LANGUAGES``.
-        folder: where to put it.
+        folder: of the test.
         options: more of them.
     """
     compiler, *language_options = LANGUAGES[language]
@@ -40,11 +40,12 @@ def compiled(source: Path, language: str, folder: pytest.TempPathFactory, option
         if os.environ.get("CI") == "true":
             pytest.fail(message)
         pytest.skip(message)
-    if (source, language) not in _compiled:
-        program = folder.mktemp("compiled") / source.stem
-        command = [compiler, *language_options, *_WARNINGS, *options, f"-I{skinware.get_include()}", str(source)]
-        result = subprocess.run([*command, "-o", str(program)], capture_output=True, text=True)
+    command = [compiler, *language_options, *_WARNINGS, *options, f"-I{skinware.get_include()}", str(source)]
+    digest = hashlib.sha256("\0".join((*command, source.read_text())).encode()).hexdigest()
+
+    def compile_into(there: Path) -> None:
+        result = subprocess.run([*command, "-o", str(there / source.stem)], capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
         assert not result.stderr
-        _compiled[source, language] = program
-    return _compiled[source, language]
+
+    return made_once(folder, f"{source.stem}-{digest[:16]}", compile_into) / source.stem

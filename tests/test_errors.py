@@ -9,7 +9,9 @@ import re
 import resource
 import threading
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 from serial.tools import list_ports
@@ -19,7 +21,7 @@ from skinware.errors import SkinwareError
 from skinware.memory import _fences
 from skinware.realtime import Profile
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.config import BusConfig, convert
+from skinware_drivers.config import ConfigFile
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.link import Link, Match
 from skinware_drivers.registry import make_bus
@@ -53,7 +55,10 @@ def publish(to: ServiceWriter) -> None:
 
 @produces
 def ConfigurationError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    return convert(BusConfig, {"nmae": "can0"}, "torso.toml: bus 1")
+    with TemporaryDirectory() as folder, chdir(folder):
+        path = Path("torso.toml")
+        path.write_text('driver = "roboskin"\n\n[[bus]]\nnmae = "can0"\n')
+        return ConfigFile(path)
 
 
 @produces

@@ -1,4 +1,4 @@
-"""Processes and users for the tests of this folder."""
+"""Processes, users and compiled programs for the tests of this folder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from skinware import Namespace
+from tests.compiling import compiled
 from tests.core import workers
+from tests.core.c_programs import SOURCE
 from tests.core.users import Users, running_driver
 
 
@@ -26,3 +28,15 @@ def users(
     """The owner's driver ``x`` runs; others may do what they can."""
     with running_driver(tmp_path, monkeypatch) as made:
         yield made
+
+
+@pytest.fixture(params=["c99", "c++11", "sanitized"])
+def any_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """c_reader.c, compiled in each way."""
+    return compiled(SOURCE, request.param, tmp_path_factory)
+
+
+@pytest.fixture
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """c_reader.c, compiled."""
+    return compiled(SOURCE, "c99", tmp_path_factory)

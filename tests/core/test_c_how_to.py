@@ -15,7 +15,7 @@ import pytest
 
 from skinware import BusState, DriverReader, DriverWriter, PatchState
 from tests.compiling import compiled
-from tests.core.test_c_reader import structure
+from tests.core.c_programs import structure
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "how-to" / "c-and-cpp.md").read_text()
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", DOCUMENT, flags=re.M | re.S)

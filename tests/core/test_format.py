@@ -16,7 +16,7 @@ from skinware.errors import ConfigurationError
 from skinware.memory import _layout
 from skinware.sensor_types import CATALOGUE
 from skinware.structure import _COLUMNS, VALUE_DTYPES
-from tests.core.test_c_reader import structure
+from tests.core.c_programs import structure
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "shared-memory.md").read_text()
 

@@ -1,67 +1,24 @@
+"""What a service hands out: whole frames, every loss counted, and waits that end."""
+
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 
 from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.errors import (
-    Closed,
-    ConfigurationError,
-    Paused,
-    PlatformError,
-    ServiceError,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.errors import Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory import _fences, _layout, _segment
 from skinware.memory import ring as ring_module
-from skinware.memory.announcement import living_readers
 from skinware.memory.ring import RingReader, RingWriter
 from skinware.memory.schema import Schema
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
-
-SPAWN = multiprocessing.get_context("spawn")
-Columns = dict[str, tuple[str, int]]
-SMALL: Columns = {"values": ("<u8", 512)}
-
-
-def publish(writer: ServiceWriter, value: int) -> None:
-    writer.begin()["values"][:] = value
-    writer.commit(time.monotonic_ns())
-
-
-def write_until_killed(name: str, columns: Columns, published: Any, fill_only: bool) -> None:
-    writer = ServiceWriter(name, columns)
-    for value in range(1, 11):
-        publish(writer, value)
-    if fill_only:
-        writer.begin()["values"][:] = 99  # killed in the middle of filling
-    published.set()
-    while True:
-        time.sleep(1)
-
-
-def killed_writer(name: str = "x", columns: Columns = SMALL, fill_only: bool = False) -> Any:
-    published = SPAWN.Event()
-    process = SPAWN.Process(target=write_until_killed, args=(name, columns, published, fill_only))
-    process.start()
-    assert published.wait(30)
-    return process
-
-
-def kill(process: Any) -> None:
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    process.close()
-
+from tests.core.services import SMALL, publish
 
 # -- coherency ----------------------------------------------------------------------------------------------------
 
@@ -164,116 +121,6 @@ def test_losses_over_a_restart_are_counted() -> None:
             assert reader.lost == 2
 
 
-# -- life and death -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("fill_only", [False, True])
-def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) -> None:
-    process = killed_writer(fill_only=fill_only)
-    with ServiceReader[Frame]("x") as reader:
-        frame = reader.read()
-        assert reader.alive
-        assert not frame.stale
-        kill(process)
-        assert not reader.alive
-        with pytest.raises(ServiceTimeout, match="dead or was stopped"):
-            reader.read(newer_than=frame, timeout_s=0.2)
-        last = reader.read()
-        assert last.stale
-        assert set(last.column("values").tolist()) == {10}
-        with ServiceReader[Frame]("x") as late:
-            assert late.read().sequence == 10
-        with ServiceWriter("x", SMALL) as writer:
-            publish(writer, 1)
-            assert reader.read(newer_than=last).column("values")[0] == 1
-            assert reader.alive
-
-
-def test_another_structure_is_told_and_old_data_stays_readable() -> None:
-    process = killed_writer()
-    with ServiceReader[Frame]("x") as reader:
-        last = reader.read()
-        kill(process)
-        with ServiceWriter("x", {"values": ("<u8", 3)}) as writer:
-            publish(writer, 5)
-            with pytest.raises(StructureChanged, match="reattach"):
-                reader.read(newer_than=last)
-            assert reader.structure_changed
-            assert len(reader.read().column("values")) == 512
-            reader.reattach()
-            assert reader.read(newer_than=last).column("values").tolist() == [5, 5, 5]
-
-
-def test_a_stopped_process_is_alive_but_silent() -> None:
-    process = killed_writer()
-    with ServiceReader[Frame]("x") as reader:
-        os.kill(process.pid, signal.SIGSTOP)
-        frame = reader.read()
-        with pytest.raises(ServiceTimeout, match="lives, but is silent"):
-            reader.read(newer_than=frame, timeout_s=0.1)
-        kill(process)
-    ServiceWriter("x", SMALL).close()
-
-
-def test_a_forked_child_neither_writes_nor_keeps_the_writer_alive() -> None:
-    writer = ServiceWriter("x", SMALL)
-    publish(writer, 1)
-    ready, go = os.pipe(), os.pipe()
-    child = os.fork()
-    if child == 0:
-        try:
-            writer.begin()
-            verdict = b"wrote"
-        except Closed:
-            verdict = b"refus"
-        os.write(ready[1], verdict)
-        os.read(go[0], 1)
-        os._exit(0)
-    try:
-        assert os.read(ready[0], 5) == b"refus"
-        with ServiceReader[Frame]("x") as reader:
-            assert reader.alive
-            writer.close()
-            assert not reader.alive
-        ServiceWriter("x", SMALL).close()
-    finally:
-        os.write(go[1], b"x")
-        os.waitpid(child, 0)
-        for fd in (*ready, *go):
-            os.close(fd)
-
-
-@pytest.mark.parametrize("slots", [0, 1, 65])
-def test_impossible_slots_are_refused_and_the_name_is_free_again(slots: int, namespace: Namespace) -> None:
-    with pytest.raises(ConfigurationError, match=f"slots={slots}: give 2 to 64"):
-        ServiceWriter("x", SMALL, slots=slots)
-    assert namespace.services() == []
-    with ServiceWriter("x", SMALL) as writer:
-        assert writer.sequence == 0
-
-
-def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
-        publish(writer, 1)
-        frame = reader.read()
-        writer.namespace.ring_path("x").unlink()
-
-        def newer() -> bool:
-            publish(writer, 2)
-            return reader.read().generation != frame.generation
-
-        wait_until(newer)
-
-
-def test_what_a_killed_creator_left_is_removed(namespace: Namespace) -> None:
-    namespace.create()
-    (namespace.path / ".x.0123abcd.tmp").write_bytes(b"half")
-    (namespace.path / ".xy.0123abcd.tmp").write_bytes(b"not ours")
-    with ServiceWriter("x", SMALL):
-        assert not (namespace.path / ".x.0123abcd.tmp").exists()
-    (namespace.path / ".xy.0123abcd.tmp").unlink()
-
-
 # -- waiting ------------------------------------------------------------------------------------------------------
 
 
@@ -350,56 +197,6 @@ def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
             if writer.sequence == 3:
                 writer.close()
         assert reader.read().sequence == 3
-
-
-# -- who is there -------------------------------------------------------------------------------------------------
-
-
-def test_readers_are_seen_while_they_live(namespace: Namespace) -> None:
-    with ServiceWriter("x", SMALL) as writer:
-        publish(writer, 1)
-        reader = ServiceReader[Frame]("x")
-        reader.read()
-        (record,) = living_readers(namespace)
-        assert (record.service, record.pid) == ("x", os.getpid())
-        reader.close()
-        assert list(living_readers(namespace)) == []
-
-
-def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: Namespace) -> None:
-    seen = threading.Event()
-
-    def read() -> None:
-        with ServiceReader[Frame]("x", timeout_s=30) as reader:
-            for _ in reader.frames(timeout_s=30):
-                if seen.is_set():
-                    return
-
-    thread = threading.Thread(target=read)
-    thread.start()
-    time.sleep(0.02)  # most likely it waits by now; the test holds either way
-    with ServiceWriter("x", SMALL) as writer:
-
-        def announced() -> bool:
-            publish(writer, 1)
-            return [record.service for record in living_readers(namespace)] == ["x"]
-
-        wait_until(announced)
-        for path in namespace.reader_files():
-            path.unlink()
-        wait_until(announced)  # again
-        seen.set()
-        publish(writer, 2)
-        thread.join(30)
-
-
-def test_a_dead_readers_announcement_is_swept(namespace: Namespace) -> None:
-    with ServiceWriter("x", SMALL):
-        dead = namespace.readers_path / "x.1.deadbeef"
-        dead.write_bytes(b"left by a killed reader")
-        assert list(living_readers(namespace)) == []
-    with ServiceWriter("x", SMALL):
-        assert not dead.exists()
 
 
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:

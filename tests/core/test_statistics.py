@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import threading
 import time
 from functools import partial
@@ -14,6 +13,7 @@ from skinware.memory.announcement import living_readers
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
+from tests.core.workers import kill, running
 
 SMALL = {"values": ("<i8", 4)}
 MS = 1_000_000
@@ -128,16 +128,15 @@ def _read_for_ever() -> None:
             pass
 
 
+@pytest.mark.usefixtures("process_server")
 def test_a_killed_reader_vanishes_by_itself(namespace: Namespace) -> None:
     with ServiceWriter("x", SMALL) as writer:
         writer.begin()
         writer.commit(now_ns())
-        process = multiprocessing.get_context("spawn").Process(target=_read_for_ever)
-        process.start()
-        wait_until(lambda: [r.pid for r in living_readers(namespace)] == [process.pid])
-        process.kill()
-        process.join()
-        assert list(living_readers(namespace)) == []
+        with running(_read_for_ever) as process:
+            wait_until(lambda: [r.pid for r in living_readers(namespace)] == [process.pid])
+            kill(process)
+            assert list(living_readers(namespace)) == []
     with ServiceWriter("x", SMALL):  # sweeps its file away
         assert list(namespace.reader_files()) == []
 

@@ -93,6 +93,19 @@ class Crew:
             self.kill(process)
 
 
+@contextlib.contextmanager
+def running(work: Callable[..., None], *arguments: Any) -> Iterator[BaseProcess]:
+    """A function in a process of its own, which is killed at the end, unless it was before."""
+    with Crew() as crew:
+        yield crew.start(work, *arguments)
+
+
+def kill(process: BaseProcess) -> None:
+    """SIGKILL, and wait until it is dead."""
+    process.kill()
+    process.join(PATIENCE_S)
+
+
 def _work_in(namespace: str, work: Callable[..., None], *arguments: Any) -> None:
     os.environ["SKINWARE_NAMESPACE"] = namespace  # the process server has that of the test that started it
     work(*arguments)

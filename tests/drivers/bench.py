@@ -6,6 +6,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import resources
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import msgspec
@@ -23,6 +25,7 @@ from skinware_drivers.virtual.emulator import Emulator
 from skinware_drivers.virtual.events import FrameFault
 
 MS = 1_000_000
+EXAMPLE_EDS = Path(str(resources.files("skinware_drivers") / "eds" / "skin_patch.eds"))
 T = TypeVar("T")
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import pytest
 
+from skinware_drivers.config import ConfigFile
 from skinware_drivers.icub.importer import Import, import_files
 from skinware_drivers.icub.notes import Note, Notes
 
@@ -28,6 +30,14 @@ def _real(name: str) -> Path:
     if not (DATA / name).is_dir():
         pytest.skip(f"the real files are not here: {DATA / name} (from robotology, BSD-3-Clause)")
     return DATA / name
+
+
+def configuration(text: str) -> ConfigFile:
+    """A configuration, as a driver reads it from a file."""
+    with NamedTemporaryFile("w", suffix=".toml") as file:
+        file.write(text)
+        file.flush()
+        return ConfigFile(Path(file.name))
 
 
 DEFAULTS = """

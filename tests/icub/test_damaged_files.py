@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.config import DriverConfig, convert
 from skinware_drivers.icub.importer import import_files
 from skinware_drivers.icub.notes import Notes
 from skinware_drivers.icub.positions import read_positions
-from tests.icub.conftest import DEFAULTS, WRAPPER, board_sets, device, triangle_sets
+from tests.icub.conftest import DEFAULTS, WRAPPER, board_sets, configuration, device, triangle_sets
 from tests.icub.test_parts import ETHERNET, OLD
 from tests.icub.test_positions import DRAWING, TRIANGLE, positions
 
@@ -34,8 +33,7 @@ def check(files: dict[str, bytes]) -> int:
             return 0
     for part in done.parts:
         text = part.configuration().replace('name = ""', 'name = "can0"')
-        config = convert(DriverConfig, tomllib.loads(text), part.name)
-        assert len(config.bus) == len(part.buses) > 0
+        assert len(configuration(text).settings.bus) == len(part.buses) > 0
         tomllib.loads(part.geometry())
     return len(done.parts)
 

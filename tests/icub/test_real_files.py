@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -10,9 +9,9 @@ import pytest
 from skinware.geometry import read_geometry
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp
-from skinware_drivers.config import DriverConfig, convert
 from skinware_drivers.icub.importer import Import, import_files
 from skinware_drivers.icub.notes import Notes
+from tests.icub.conftest import configuration
 
 
 @pytest.fixture
@@ -48,10 +47,9 @@ def test_what_is_written_is_what_the_driver_reads(all_files: tuple[Import, Notes
         text = part.configuration()
         for number in range(len(part.buses)):
             text = text.replace('name = ""', f'name = "can{number}"', 1)
-        config = convert(DriverConfig, tomllib.loads(text), part.name)
-        assert [convert(RoboskinOptions, bus.options, bus.name) for bus in config.bus] == [
-            b.options for b in part.buses
-        ]
+        written = configuration(text)
+        options = [written.options_of_bus(RoboskinOptions, bus.name) for bus in written.settings.bus]
+        assert options == [bus.options for bus in part.buses]
         path = tmp_path / "geometry.toml"
         path.write_text(part.geometry())
         places = read_geometry(path)

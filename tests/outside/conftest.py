@@ -5,9 +5,11 @@ from __future__ import annotations
 import pytest
 
 from tests.outside.stranger import Stranger
+from tests.sharing import common_folder
+from tests.wheel import built_wheel
 
 
 @pytest.fixture(scope="session")
 def stranger(tmp_path_factory: pytest.TempPathFactory) -> Stranger:
-    common = tmp_path_factory.getbasetemp().parent  # of all processes of pytest-xdist
-    return Stranger(tmp_path_factory.mktemp("stranger"), common / "mypy_cache")
+    folder, cache = tmp_path_factory.mktemp("stranger"), common_folder(tmp_path_factory) / "mypy_cache"
+    return Stranger(folder, built_wheel(tmp_path_factory), cache)

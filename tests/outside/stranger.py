@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import site
 import subprocess
-import sys
 import sysconfig
 import venv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from tests.commands import BIN
 
-ROOT = Path(__file__).parent.parent.parent
 PATIENCE_S = 300.0
 
 
@@ -28,13 +25,14 @@ class Stranger:
 
     Args:
         folder: new, for everything.
+        wheel: of Skinware.
         mypy_cache: may be shared with others.
 
     Attributes:
         home: an empty folder to work in.
     """
 
-    def __init__(self, folder: Path, mypy_cache: Path) -> None:
+    def __init__(self, folder: Path, wheel: Path, mypy_cache: Path) -> None:
         self.home = folder / "home"
         self._bin = folder / "env" / "bin"
         scratch = folder / "tmp"
@@ -59,7 +57,7 @@ class Stranger:
             "MYPY_CACHE_DIR": str(mypy_cache),
         }
         self._add_commands()
-        self.do("pip", "install", "--quiet", "--no-deps", str(built_wheel(folder / "wheel")), cwd=folder)
+        self.do("pip", "install", "--quiet", "--no-deps", str(wheel), cwd=folder)
 
     @property
     def environ(self) -> dict[str, str]:
@@ -68,7 +66,16 @@ class Stranger:
 
     def do(self, *command: str, cwd: Path | None = None) -> str:
         """Run a command to its end; its output. It must succeed."""
-        done = subprocess.run(
+        with self._started(command, cwd) as process:
+            try:
+                told, _ = process.communicate(timeout=PATIENCE_S)
+            finally:
+                process.kill()  # nothing happens to one that has ended
+        assert process.returncode == 0, f"{' '.join(command)}\n{told}"
+        return told
+
+    def _started(self, command: Sequence[str], cwd: Path | None) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             [self._bin / command[0], *command[1:]],
             cwd=cwd or self.home,
             env=self.environ,
@@ -76,10 +83,7 @@ class Stranger:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=PATIENCE_S,
         )
-        assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}"
-        return done.stdout
 
     def _add_commands(self) -> None:
         """The commands of packages that are installed beside: Python's run with this environment's."""
@@ -92,47 +96,10 @@ class Stranger:
     @contextmanager
     def running(self, *command: str, cwd: Path | None = None) -> Iterator[None]:
         """A command that is interrupted at the end; it must then end well."""
-        process = subprocess.Popen(
-            [self._bin / command[0], *command[1:]],
-            cwd=cwd or self.home,
-            env=self.environ,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        process = self._started(command, cwd)
         try:
             yield
         finally:
             process.send_signal(signal.SIGINT)
             output, _ = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, f"{' '.join(command)}\n{output}"
-
-
-def built_wheel(folder: Path) -> Path:
-    """A wheel of this repository as it is now."""
-    source = folder / "source"
-    source.mkdir(parents=True)
-    for part in ("skinware", "skinware_drivers"):
-        shutil.copytree(ROOT / part, source / part, ignore=shutil.ignore_patterns("__pycache__"))
-    for part in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / part, source)
-    subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pip",
-            "wheel",
-            "--quiet",
-            "--no-deps",
-            "--no-build-isolation",
-            "--wheel-dir",
-            folder,
-            source,
-        ],
-        check=True,
-        timeout=PATIENCE_S,
-        stdin=subprocess.DEVNULL,
-    )
-    (wheel,) = folder.glob("*.whl")
-    return wheel

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from skinware_drivers.testing.waiting import wait_until
-from tests.outside.stranger import ROOT, Stranger
+from tests.outside.stranger import Stranger
+from tests.wheel import ROOT
 
 pytestmark = pytest.mark.timeout(400)
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.outside.stranger import ROOT, Stranger
+from tests.outside.stranger import Stranger
 from tests.outside.walkthrough import Walkthrough, steps
+from tests.wheel import ROOT
 
 PAGES = ["docs/tutorials/first-can-driver.md", "docs/tutorials/first-serial-driver.md"]
 

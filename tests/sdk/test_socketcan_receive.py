@@ -10,7 +10,6 @@ import errno
 import socket
 import struct
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -18,87 +17,11 @@ import pytest
 from skinware import BusReason
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can import recvmmsg, socketcan
+from skinware_drivers.can import recvmmsg
 from skinware_drivers.can.socketcan import SocketCanBus
-from skinware_drivers.testing.waiting import wait_until
+from tests.sdk.cable import SO_RCVBUFFORCE, Cable, ChoosySocket, drain
 
-SO_RCVBUFFORCE = 33
-SO_TIMESTAMPNS = 35
-SO_TIMESTAMPING = 37
 RMEM_MAX = "/proc/sys/net/core/rmem_max"
-
-
-class ChoosySocket(socket.socket):
-    """A socket that knows how its buffer was asked for, and may refuse force."""
-
-    allowed = False
-
-    def setsockopt(self, level: int, option: int, value: int) -> None:  # type: ignore[override]
-        """Set an option."""
-        if option == SO_RCVBUFFORCE and not self.allowed:
-            raise PermissionError(errno.EPERM, "Operation not permitted")
-        super().setsockopt(level, option, value)
-
-
-class Cable:
-    """A socket to receive from, and one that sends to it."""
-
-    def __init__(self) -> None:
-        self.end = ChoosySocket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.end.bind(("127.0.0.1", 0))
-        self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.out.connect(self.end.getsockname())
-        self.end.connect(self.out.getsockname())
-
-    def put(self, identifier: int, payload: bytes = bytes(8)) -> None:
-        self.out.send(struct.pack("=IB3x8s", identifier, len(payload), payload))
-
-    def close(self) -> None:
-        self.end.close()
-        self.out.close()
-
-
-@pytest.fixture(autouse=True)
-def stamping() -> Iterator[None]:
-    """The kernel begins to stamp a while after the first socket has asked for it, and goes on as long as one does."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
-        end.bind(("127.0.0.1", 0))
-        end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-
-        def is_stamped_at_once() -> bool:
-            end.sendto(b"", end.getsockname())
-            sent_ns = time.time_ns()
-            pass_ms(5)
-            _, ((_, _, stamp),), _, _ = end.recvmsg(10, 100)
-            seconds, nanoseconds = struct.unpack("=qq", stamp)
-            return bool(seconds * 10**9 + nanoseconds < sent_ns + 2_000_000)
-
-        wait_until(is_stamped_at_once)
-        yield
-
-
-@pytest.fixture
-def cable() -> Iterator[Cable]:
-    made = Cable()
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def spare_cable() -> Iterator[Cable]:
-    made = Cable()
-    yield made
-    made.close()
-
-
-def drain(bus: SocketCanBus, batch: FrameBatch, ordinal: int = 0) -> None:
-    while bus.receive(batch, ordinal):
-        pass
-
-
-def pass_ms(duration_ms: int) -> None:
-    """Let time pass, so that moments before and after can be told apart."""
-    time.sleep(duration_ms / 1e3)
 
 
 def test_frames_arrive_whole_in_order_and_as_often_as_they_were_sent(cable: Cable) -> None:
@@ -195,48 +118,6 @@ def test_a_buffer_that_was_granted_needs_no_words(cable: Cable) -> None:
     assert bus.note == ""
 
 
-# Stamps
-
-
-def test_stamps_tell_when_a_frame_arrived_not_when_it_was_fetched(cable: Cable) -> None:
-    bus = SocketCanBus("can0")
-    bus.adopt(cable.end)
-    pass_ms(20)
-    before_ns = time.monotonic_ns()
-    for _ in range(10):
-        cable.put(0x123)
-    after_ns = time.monotonic_ns()
-    pass_ms(20)
-    batch = FrameBatch(10)
-    drain(bus, batch)
-    stamps = batch.time_ns[:10]
-    slack_ns = 5_000_000  # two clocks are read one after the other
-    assert before_ns - slack_ns <= stamps.min()
-    assert stamps.max() <= after_ns + slack_ns
-    assert np.all(np.diff(stamps) >= 0)
-
-
-@pytest.mark.parametrize("step_s", [3600, -3600, 0.5, -0.5])
-def test_a_step_of_the_wall_clock_bends_no_stamp(cable: Cable, monkeypatch: pytest.MonkeyPatch, step_s: float) -> None:
-    bus = SocketCanBus("can0")
-    bus.adopt(cable.end)
-    batch = FrameBatch(10)
-    real, bounds = time.time_ns, []
-    for number in range(4):  # the clock is set to and fro, each time when a frame has been stamped and not yet fetched
-        pass_ms(5)
-        before_ns = time.monotonic_ns()
-        cable.put(0x123)
-        bounds.append((before_ns, time.monotonic_ns()))
-        pass_ms(20)
-        step_ns = round(step_s * 1e9) * (number % 2 == 0)
-        monkeypatch.setattr(time, "time_ns", lambda step_ns=step_ns: real() + step_ns)
-        # what is fetched now was stamped by a clock that was set since then
-        drain(bus, batch)
-    slack_ns = 2_000_000  # two clocks are read one after the other
-    for (before_ns, after_ns), stamp in zip(bounds, batch.time_ns[:4].tolist(), strict=True):
-        assert before_ns - slack_ns <= stamp <= after_ns + slack_ns
-
-
 @pytest.mark.parametrize(
     ("query", "words"),
     [
@@ -250,52 +131,6 @@ def test_options_that_are_wrong_are_refused(query: dict[str, str], words: str) -
     with pytest.raises(ConfigurationError) as caught:
         SocketCanBus("can0", query)
     assert str(caught.value).startswith(words)
-
-
-def test_an_interface_without_stamps_of_its_own_says_so_where_they_were_asked_for(cable: Cable) -> None:
-    bus = SocketCanBus("lo", {"timestamps": "hardware", "buffer": "20000"})
-    bus.adopt(cable.end)
-    assert bus.note == "bus lo: its controller gives no time stamps; the kernel's are taken instead"
-    cable.put(0x123)
-    batch = FrameBatch(10)
-    drain(bus, batch)
-    assert batch.time_ns[0] > 0
-
-
-def test_stamping_with_hardware_takes_the_kernels_where_there_are_no_others(
-    cable: Cable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(socketcan, "has_hardware_stamps", lambda *_: True)
-    bus = SocketCanBus("can0")
-    bus.adopt(cable.end)
-    batch = FrameBatch(100)
-    for _ in range(3):
-        pass_ms(10)
-        before_ns = time.monotonic_ns()
-        for _ in range(10):
-            cable.put(0x123)
-        after_ns = time.monotonic_ns()
-        pass_ms(10)
-        first = batch.stop
-        drain(bus, batch)
-        stamps = batch.time_ns[first : batch.stop]
-        assert before_ns - 5_000_000 <= stamps.min()
-        assert stamps.max() <= after_ns + 5_000_000
-
-
-def test_what_another_bus_left_in_a_row_is_no_stamp_of_a_frame_that_has_none(
-    cable: Cable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(socketcan, "has_hardware_stamps", lambda *_: True)
-    bus = SocketCanBus("can0")
-    bus.adopt(cable.end)
-    cable.end.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, 0)
-    batch = FrameBatch(10)
-    recvmmsg.rows_of(batch).control[:] = 1  # a second of 1970
-    cable.put(0x123)
-    before_ns = time.monotonic_ns()
-    drain(bus, batch)
-    assert before_ns <= batch.time_ns[0] <= time.monotonic_ns()
 
 
 # What is no data

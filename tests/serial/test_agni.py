@@ -12,11 +12,11 @@ from skinware_drivers.serial.agni import AgniDriver, command
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
+from tests.serial.spoken import Spoken
 
 CONFIGURATION = bytes.fromhex("F0 C4 00 C0 F4")
 STOP = bytes.fromhex("F0 C4 00 00 34")
 START = bytes.fromhex("F0 C4 00 F1 C5")
-MS = 1_000_000
 
 
 def test_bytes_of_commands_are_those_of_the_vectors() -> None:
@@ -26,27 +26,17 @@ def test_bytes_of_commands_are_those_of_the_vectors() -> None:
 
 
 def test_the_emulated_device_byte_for_byte() -> None:
-    device = EmulatedAgni(EmulatedAgniOptions(sensors=(1, 2), pattern="cycle"))
-    now_ns = 10**12
-    device.skip(now_ns)
-
-    def said(sent: bytes, later_ms: int = 1) -> list[bytes]:
-        nonlocal now_ns
-        for at in range(len(sent)):  # byte by byte
-            device.receive(0, sent[at : at + 1], now_ns)
-        now_ns += later_ms * MS
-        return [frame.payload for frame in device.emit(now_ns)]
-
-    assert said(b"noise" + CONFIGURATION) == [message(0, bytes.fromhex("01 07 02 0302 0200 0302 0400"))]
-    assert said(CONFIGURATION[:-1] + b"\0") == [bytes.fromhex("F0 C4 FE F0 3A")]
-    assert said(command(0x99)) == [bytes.fromhex("F0 C4 FE F1 3B")]
-    assert said(command(0xF0)) == [bytes.fromhex("F0 C4 F0 C4")]
-    assert said(command(0xD0, bytes.fromhex("0200 01 1400 02 1400"))) == []
-    frames = said(START, 65)
+    device = Spoken(EmulatedAgni(EmulatedAgniOptions(sensors=(1, 2), pattern="cycle")))
+    assert device.answers(b"noise" + CONFIGURATION) == [message(0, bytes.fromhex("01 07 02 0302 0200 0302 0400"))]
+    assert device.answers(CONFIGURATION[:-1] + b"\0") == [bytes.fromhex("F0 C4 FE F0 3A")]
+    assert device.answers(command(0x99)) == [bytes.fromhex("F0 C4 FE F1 3B")]
+    assert device.answers(command(0xF0)) == [bytes.fromhex("F0 C4 F0 C4")]
+    assert device.answers(command(0xD0, bytes.fromhex("0200 01 1400 02 1400"))) == []
+    frames = device.answers(START, 65)
     assert len(frames) in (6, 8)
     for at, frame in enumerate(frames):
         assert frame == message(at % 2 + 1, frame[3:7] + (at // 2).to_bytes(2, "little") * (at % 2 + 1))
-    assert said(STOP, 100) == []
+    assert device.answers(STOP, 100) == []
 
 
 def test_a_device_that_streams_already_and_describes_itself() -> None:

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
-import os
 import socket
-import termios
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
-from serial import serialposix
 from serial.rfc2217 import PortManager
-from serial.tools import list_ports
 
-from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware.status import BusReason
+from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.registry import make_bus
@@ -29,19 +21,11 @@ from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.testing.waiting import wait_until
-from tests.serial.lines import ASK, DATA, FRAMING, Usb, data_frame, is_readable, line, opened, receive
+from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line, opened, receive
 
 PACKETS = Packet(
     sync=b"\xaa\xaa\xaa", length=Length(Field(4, 2), 8), maximum=60, checksum=CRC16_WEISS, identifier=Field(3)
 )
-
-
-@pytest.fixture
-def usb(monkeypatch: pytest.MonkeyPatch) -> Usb:
-    """The USB ports that the system lists; none at first."""
-    system = Usb()
-    monkeypatch.setattr(list_ports, "comports", lambda: system.ports)
-    return system
 
 
 # Frames
@@ -211,142 +195,6 @@ def test_what_cannot_be_sent_is_refused() -> None:
         bus.close()
         with pytest.raises(BusSendError, match="not open"):
             bus.send(ASK, b"who")
-
-
-# Ports that come and go
-
-
-def test_an_unplugged_port_says_so_and_can_be_opened_again() -> None:
-    with line() as device, opened(device.path) as bus:
-        device.write(data_frame(1)[:4])
-        receive(bus, 0)
-        device.unplug()
-        assert is_readable(bus, 10)
-        with pytest.raises(BusNotAvailable, match="unplugged"):
-            bus.receive(FrameBatch(8, 64), 0)
-        bus.close()
-        with pytest.raises(BusNotAvailable, match="no serial port"):
-            bus.open()
-        assert bus.fileno() == -1
-
-
-def test_a_device_is_found_again_under_another_name(usb: Usb) -> None:
-    bus = SerialBus("", {"serial_number": "A7"}, payload_size=64)
-    bus.use(FRAMING)
-    with pytest.raises(BusNotAvailable, match="serial number A7; there is none at all"):
-        bus.open()
-    for _ in range(2):
-        with line() as other, line() as device:
-            usb.ports.clear()
-            usb.plug(other.path, "B8")
-            usb.plug(device.path, "A7")
-            bus.open()
-            device.write(data_frame(3))
-            assert receive(bus, 1)[0][1][:1] == b"\3"
-            device.unplug()
-            assert is_readable(bus, 10)
-            with pytest.raises(BusNotAvailable):
-                bus.receive(FrameBatch(8, 64), 0)
-            bus.close()
-    usb.ports.clear()
-    usb.plug("/dev/ttyACM0", "B8")
-    with pytest.raises(BusNotAvailable, match=r"serial number A7; there are: /dev/ttyACM0 \(skin\)"):
-        bus.open()
-
-
-def test_ports_by_vendor_and_product(usb: Usb) -> None:
-    with line() as device:
-        usb.plug(device.path, "A7", 0x0483, 0x5700)
-        usb.plug("/dev/ttyUSB9", "A8", 0x0403, 0x6001)
-        bus = SerialBus("", {"vid_pid": "0483:5700"})
-        bus.open()
-        bus.close()
-        usb.plug("/dev/ttyACM7", "A9", 0x0483, 0x5700)
-        with pytest.raises(BusNotAvailable, match=r"2 serial ports have VID:PID 0483:5700: .*serial_number=A9"):
-            bus.open()
-        both = SerialBus("", {"vid_pid": "0483:5700", "serial_number": "A7"})
-        assert both.channel == "serial_number=A7&vid_pid=0483:5700"
-        both.open()
-        both.close()
-
-
-def test_a_second_program_on_the_port_is_told() -> None:
-    with line() as device, opened(device.path):
-        other = SerialBus(device.path)
-        with pytest.raises(BusNotAvailable, match=f"another program has it open.*fuser -v {device.path}"):
-            other.open()
-        other.close()
-    with line() as device:
-        with opened(device.path):
-            pass
-        with opened(device.path):  # and it is free again afterwards
-            pass
-
-
-@pytest.mark.parametrize(
-    ("number", "message", "reason"),
-    [
-        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER", BusReason.REFUSED),
-        (errno.EBUSY, "another program has it open", BusReason.REFUSED),
-        (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all", BusReason.INTERFACE_GONE),
-        (errno.EIO, "cannot be opened as a serial port", BusReason.FAILED),
-    ],
-)
-def test_refusals_say_what_to_do(
-    number: int, message: str, reason: BusReason, usb: Usb, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(self: serial.Serial) -> None:
-        raise serial.SerialException(number, os.strerror(number))
-
-    monkeypatch.setattr(serial.Serial, "open", refuse)
-    with pytest.raises(BusNotAvailable, match=message) as raised:
-        SerialBus("/dev/ttyS9").open()
-    assert raised.value.reason == reason
-
-
-@pytest.mark.parametrize("up", [True, False])
-def test_dtr_and_rts_get_their_levels_when_the_port_is_opened(up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pseudo terminal has no such wires: what pyserial asks the kernel for is looked at."""
-    asked: list[tuple[int, int]] = []
-
-    def ioctl(_fd: int, request: int, argument: bytes = b"") -> bytes:
-        asked.append((request, int.from_bytes(argument[:4], "little")))
-        return argument
-
-    monkeypatch.setattr(serialposix, "fcntl", SimpleNamespace(**{**vars(fcntl), "ioctl": ioctl}))
-    level = "yes" if up else "no"
-    with line() as device, opened(device.path, options={"dtr": level, "rts": level}):
-        wires = {argument: request for request, argument in asked if request in (termios.TIOCMBIS, termios.TIOCMBIC)}
-    wanted = termios.TIOCMBIS if up else termios.TIOCMBIC
-    assert wires == {termios.TIOCM_DTR: wanted, termios.TIOCM_RTS: wanted}
-
-
-def test_a_port_can_be_told_not_to_hang_up() -> None:
-    with line() as device:
-        settings = termios.tcgetattr(device.master)
-        settings[2] |= termios.HUPCL
-        termios.tcsetattr(device.master, termios.TCSANOW, settings)
-        for options, hangs_up in (({}, True), ({"hang_up": "no"}, False), ({}, False)):  # as it was, if not told
-            with opened(device.path, options=options):
-                pass
-            assert bool(termios.tcgetattr(device.master)[2] & termios.HUPCL) == hangs_up
-    with pytest.raises(ConfigurationError, match="hang_up=no is for ports of this machine"):
-        SerialBus("socket://localhost:1", {"hang_up": "no"}).open()
-
-
-def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:
-    file = tmp_path / "file"
-    file.write_text("")
-    with pytest.raises(BusNotAvailable, match="cannot be opened as a serial port"):
-        SerialBus(str(file)).open()
-    with pytest.raises(ConfigurationError, match="invalid URL"):
-        SerialBus("nonsense://x").open()
-    with pytest.raises(ConfigurationError, match="which serial port"):
-        SerialBus("").open()
-    with pytest.raises(ConfigurationError, match="not both"):
-        SerialBus("/dev/ttyUSB0", {"serial_number": "A7"}).open()
-    with pytest.raises(ConfigurationError, match="did you mean 'baudrate'"):
-        SerialBus("/dev/ttyUSB0", {"baudrat": "9600"})
 
 
 # Names, and pyserial's URLs

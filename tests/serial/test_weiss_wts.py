@@ -13,6 +13,7 @@ from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions, _
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
 from tests.sdk.driving import read_until, restarted_on_demand
+from tests.serial.spoken import Spoken
 
 START_10_MS = bytes.fromhex("AA AA AA 21 03 00 00 0A 00 DA B5")
 MATRIX = bytes.fromhex("AA AA AA 30 00 00 CA CF")
@@ -28,29 +29,19 @@ def test_bytes_of_commands_are_those_of_the_vectors() -> None:
 
 
 def test_the_emulated_sensor_byte_for_byte() -> None:
-    sensor = EmulatedWeissWts(EmulatedWeissWtsOptions(columns=2, rows=1, pattern="cycle"))
-    now_ns = 10**12
-    sensor.skip(now_ns)
-
-    def said(command: bytes, later_ms: int = 1) -> list[bytes]:
-        nonlocal now_ns
-        for at in range(len(command)):  # byte by byte
-            sensor.receive(0, command[at : at + 1], now_ns)
-        now_ns += later_ms * MS
-        return [frame.payload for frame in sensor.emit(now_ns)]
-
-    assert said(MATRIX) == [message(0x30, bytes.fromhex("0000 0200 0100 5401 5401 FF0F"))]
-    assert said(MATRIX[:-1] + b"\0") == [message(0x30, b"\x0b\0")]
-    assert said(message(0x77, b"")) == [message(0x77, b"\x0e\0")]
-    assert said(message(0x21, b"\0")) == [message(0x21, b"\x0d\0")]
-    first, *frames = said(START_10_MS, 55)
+    sensor = Spoken(EmulatedWeissWts(EmulatedWeissWtsOptions(columns=2, rows=1, pattern="cycle")))
+    assert sensor.answers(MATRIX) == [message(0x30, bytes.fromhex("0000 0200 0100 5401 5401 FF0F"))]
+    assert sensor.answers(MATRIX[:-1] + b"\0") == [message(0x30, b"\x0b\0")]
+    assert sensor.answers(message(0x77, b"")) == [message(0x77, b"\x0e\0")]
+    assert sensor.answers(message(0x21, b"\0")) == [message(0x21, b"\x0d\0")]
+    first, *frames = sensor.answers(START_10_MS, 55)
     assert first == message(0x21, b"\0\0")
     assert len(frames) in (5, 6)
     for cycle, frame in enumerate(frames):
         stamp = frame[6:10]
         assert frame == message(0x00, stamp + b"\0" + cycle.to_bytes(2, "little") * 2)
-    assert said(message(0x22, b""))[-1] == message(0x22, b"\0\0")
-    assert said(b"", 100) == []
+    assert sensor.answers(message(0x22, b""))[-1] == message(0x22, b"\0\0")
+    assert sensor.answers(b"", 100) == []
 
 
 def test_a_sensor_that_streams_already_and_its_operations() -> None:

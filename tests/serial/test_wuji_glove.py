@@ -13,9 +13,9 @@ from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
+from tests.serial.spoken import Spoken
 
 DEVICE_INFO = bytes.fromhex("AA 56 0A 00 01 01 01 00 A7 FA")
-MS = 1_000_000
 
 
 def test_bytes_of_commands_are_those_of_the_vector() -> None:
@@ -25,24 +25,14 @@ def test_bytes_of_commands_are_those_of_the_vector() -> None:
 
 
 def test_the_emulated_board_byte_for_byte() -> None:
-    board = EmulatedWujiGlove(EmulatedWujiGloveOptions(pattern="cycle", hand="right", invalid=(767,)))
-    now_ns = 10**12
-    board.skip(now_ns)
-
-    def said(command: bytes, later_ms: int = 1) -> list[bytes]:
-        nonlocal now_ns
-        for at in range(len(command)):  # byte by byte
-            board.receive(0, command[at : at + 1], now_ns)
-        now_ns += later_ms * MS
-        return [frame.payload for frame in board.emit(now_ns)]
-
+    board = Spoken(EmulatedWujiGlove(EmulatedWujiGloveOptions(pattern="cycle", hand="right", invalid=(767,))))
     info = b"EMULATED-1" + bytes(14) + bytes((1, 0, 0, 0, 1, 2, 3, 0))
-    assert said(DEVICE_INFO) == [message(0x57, b"\1\1\1\0\0" + info)]
-    assert said(DEVICE_INFO[:-1] + b"\0") == [message(0x57, b"\1\1\1\0\x11")]
-    assert said(message(0x56, b"\x99\1\2\0")) == [message(0x57, b"\x99\1\2\0\x12")]
-    assert said(message(0x56, b"\1\4\3\0")) == [message(0x57, b"\1\4\3\0\x13")]
-    assert said(message(0x56, b"\2\5\4\0\2\0\0\x64\0")) == [message(0x57, b"\2\5\4\0\0")]
-    answer, *frames = said(message(0x56, b"\1\4\5\0\1"), 45)
+    assert board.answers(DEVICE_INFO) == [message(0x57, b"\1\1\1\0\0" + info)]
+    assert board.answers(DEVICE_INFO[:-1] + b"\0") == [message(0x57, b"\1\1\1\0\x11")]
+    assert board.answers(message(0x56, b"\x99\1\2\0")) == [message(0x57, b"\x99\1\2\0\x12")]
+    assert board.answers(message(0x56, b"\1\4\3\0")) == [message(0x57, b"\1\4\3\0\x13")]
+    assert board.answers(message(0x56, b"\2\5\4\0\2\0\0\x64\0")) == [message(0x57, b"\2\5\4\0\0")]
+    answer, *frames = board.answers(message(0x56, b"\1\4\5\0\1"), 45)
     assert answer == message(0x57, b"\1\4\5\0\0")
     assert len(frames) in (4, 5)
     for cycle, frame in enumerate(frames):

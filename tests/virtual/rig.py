@@ -13,6 +13,7 @@ from skinware_drivers.virtual.touch import WireSource
 
 MS = 1_000_000
 START_NS = 5_000_000_000_000
+ENABLE_ALL = "50 00 0F 02 01 00 22"
 
 EventT = TypeVar("EventT", bound=msgspec.Struct)
 
@@ -39,7 +40,7 @@ class Rig:
     def configure(self, board: int = 7, *, skin_type: int = 0, period_ms: int = 50, start: bool = True) -> None:
         """What a host sends, with the idle value 240, shift 2 and offset 0x2200."""
         self.send(0x200 | board, f"4D {skin_type:02X} {period_ms:02X} F0")
-        self.send(0x200 | board, "50 00 0F 02 01 00 22")
+        self.send(0x200 | board, ENABLE_ALL)
         if start:
             self.send(0x200 | board, "07 00")
 

@@ -1,0 +1,65 @@
+"""Small services that tests of this folder make."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from skinware import ServiceWriter
+
+SMALL = {"values": ("<u8", 512)}
+
+
+def publish(writer: ServiceWriter, value: int) -> None:
+    """A frame whose every value is this."""
+    writer.begin()["values"][:] = value
+    writer.commit(time.monotonic_ns())
+
+
+def add(a: float, b: float) -> float:
+    """The sum of two numbers.
+
+    More about it.
+    """
+    return a + b
+
+
+def fail() -> None:
+    """Goes wrong."""
+    raise RuntimeError("the motor is hot")
+
+
+def no_json() -> object:
+    """Returns what cannot be sent."""
+    return object()
+
+
+def too_much() -> str:
+    """Returns more than a packet holds."""
+    return "x" * 100_000
+
+
+OPERATIONS: dict[str, Callable[..., object]] = {"add": add, "fail": fail, "no_json": no_json, "too_much": too_much}
+
+
+@contextmanager
+def on_request(**options: Any) -> Iterator[ServiceWriter]:
+    """A sporadic writer in a thread: every frame holds its own number."""
+    writer = ServiceWriter("x", SMALL, operations=OPERATIONS, **options)
+    writer.request_server()
+
+    def work() -> None:
+        for columns in writer.on_request():
+            columns["values"][:] = writer.sequence + 1
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield writer
+    finally:
+        writer.stop()
+        thread.join()
+        writer.close()

@@ -1,0 +1,193 @@
+"""How a service begins and ends, and who is there meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.errors import Closed, ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.memory.announcement import living_readers
+from skinware_drivers.testing.waiting import wait_until
+from tests.core.services import SMALL, publish
+from tests.core.workers import PATIENCE_S, PROCESSES, kill, running
+
+pytestmark = pytest.mark.usefixtures("process_server")
+
+
+def write_until_killed(published: Any, fill_only: bool) -> None:
+    writer = ServiceWriter("x", SMALL)
+    for value in range(1, 11):
+        publish(writer, value)
+    if fill_only:
+        writer.begin()["values"][:] = 99  # killed in the middle of filling
+    published.set()
+    while True:
+        time.sleep(1)
+
+
+@contextmanager
+def lone_writer(fill_only: bool = False) -> Iterator[Any]:
+    """A writer in a process of its own that has published ten frames."""
+    published = PROCESSES.Event()
+    with running(write_until_killed, published, fill_only) as process:
+        assert published.wait(PATIENCE_S)
+        yield process
+
+
+@pytest.mark.parametrize("fill_only", [False, True])
+def test_a_killed_writer_is_noticed_and_its_last_frame_stays(fill_only: bool) -> None:
+    with lone_writer(fill_only) as process, ServiceReader[Frame]("x") as reader:
+        frame = reader.read()
+        assert reader.alive
+        assert not frame.stale
+        kill(process)
+        assert not reader.alive
+        with pytest.raises(ServiceTimeout, match="dead or was stopped"):
+            reader.read(newer_than=frame, timeout_s=0.2)
+        last = reader.read()
+        assert last.stale
+        assert set(last.column("values").tolist()) == {10}
+        with ServiceReader[Frame]("x") as late:
+            assert late.read().sequence == 10
+        with ServiceWriter("x", SMALL) as writer:
+            publish(writer, 1)
+            assert reader.read(newer_than=last).column("values")[0] == 1
+            assert reader.alive
+
+
+def test_another_structure_is_told_and_old_data_stays_readable() -> None:
+    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
+        last = reader.read()
+        kill(process)
+        with ServiceWriter("x", {"values": ("<u8", 3)}) as writer:
+            publish(writer, 5)
+            with pytest.raises(StructureChanged, match="reattach"):
+                reader.read(newer_than=last)
+            assert reader.structure_changed
+            assert len(reader.read().column("values")) == 512
+            reader.reattach()
+            assert reader.read(newer_than=last).column("values").tolist() == [5, 5, 5]
+
+
+def test_a_stopped_process_is_alive_but_silent() -> None:
+    with lone_writer() as process, ServiceReader[Frame]("x") as reader:
+        os.kill(process.pid, signal.SIGSTOP)
+        frame = reader.read()
+        with pytest.raises(ServiceTimeout, match="lives, but is silent"):
+            reader.read(newer_than=frame, timeout_s=0.1)
+        kill(process)
+    ServiceWriter("x", SMALL).close()
+
+
+def test_a_forked_child_neither_writes_nor_keeps_the_writer_alive() -> None:
+    writer = ServiceWriter("x", SMALL)
+    publish(writer, 1)
+    ready, go = os.pipe(), os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            writer.begin()
+            verdict = b"wrote"
+        except Closed:
+            verdict = b"refus"
+        os.write(ready[1], verdict)
+        os.read(go[0], 1)
+        os._exit(0)
+    try:
+        assert os.read(ready[0], 5) == b"refus"
+        with ServiceReader[Frame]("x") as reader:
+            assert reader.alive
+            writer.close()
+            assert not reader.alive
+        ServiceWriter("x", SMALL).close()
+    finally:
+        os.write(go[1], b"x")
+        os.waitpid(child, 0)
+        for fd in (*ready, *go):
+            os.close(fd)
+
+
+@pytest.mark.parametrize("slots", [0, 1, 65])
+def test_impossible_slots_are_refused_and_the_name_is_free_again(slots: int, namespace: Namespace) -> None:
+    with pytest.raises(ConfigurationError, match=f"slots={slots}: give 2 to 64"):
+        ServiceWriter("x", SMALL, slots=slots)
+    assert namespace.services() == []
+    with ServiceWriter("x", SMALL) as writer:
+        assert writer.sequence == 0
+
+
+def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        frame = reader.read()
+        writer.namespace.ring_path("x").unlink()
+
+        def newer() -> bool:
+            publish(writer, 2)
+            return reader.read().generation != frame.generation
+
+        wait_until(newer)
+
+
+def test_what_a_killed_creator_left_is_removed(namespace: Namespace) -> None:
+    namespace.create()
+    (namespace.path / ".x.0123abcd.tmp").write_bytes(b"half")
+    (namespace.path / ".xy.0123abcd.tmp").write_bytes(b"not ours")
+    with ServiceWriter("x", SMALL):
+        assert not (namespace.path / ".x.0123abcd.tmp").exists()
+    (namespace.path / ".xy.0123abcd.tmp").unlink()
+
+
+def test_readers_are_seen_while_they_live(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        publish(writer, 1)
+        reader = ServiceReader[Frame]("x")
+        reader.read()
+        (record,) = living_readers(namespace)
+        assert (record.service, record.pid) == ("x", os.getpid())
+        reader.close()
+        assert list(living_readers(namespace)) == []
+
+
+def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: Namespace) -> None:
+    seen = threading.Event()
+
+    def read() -> None:
+        with ServiceReader[Frame]("x", timeout_s=30) as reader:
+            for _ in reader.frames(timeout_s=30):
+                if seen.is_set():
+                    return
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    time.sleep(0.02)  # most likely it waits by now; the test holds either way
+    with ServiceWriter("x", SMALL) as writer:
+
+        def announced() -> bool:
+            publish(writer, 1)
+            return [record.service for record in living_readers(namespace)] == ["x"]
+
+        wait_until(announced)
+        for path in namespace.reader_files():
+            path.unlink()
+        wait_until(announced)  # again
+        seen.set()
+        publish(writer, 2)
+        thread.join(30)
+
+
+def test_a_dead_readers_announcement_is_swept(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL):
+        dead = namespace.readers_path / "x.1.deadbeef"
+        dead.write_bytes(b"left by a killed reader")
+        assert list(living_readers(namespace)) == []
+    with ServiceWriter("x", SMALL):
+        assert not dead.exists()

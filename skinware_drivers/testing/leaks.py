@@ -13,13 +13,14 @@ class Belongings:
     """What this process has at one moment."""
 
     def __init__(self) -> None:
-        gc.collect()
+        gc.freeze()  # so that garbage is sought only among what comes after it: after every test, that takes its time
         self._threads = set(threading.enumerate())
         self._descriptors = _descriptors()
 
     def left_since(self) -> list[str]:
         """What has come since then and is still there, in words; empty if nothing is."""
         gc.collect()
+        gc.unfreeze()
         left = [f"thread {thread.name!r}" for thread in set(threading.enumerate()) - self._threads]
         left += [f"descriptor {number} ({target})" for number, target in sorted(_descriptors() - self._descriptors)]
         left += [f"process {process.name}" for process in multiprocessing.active_children()]

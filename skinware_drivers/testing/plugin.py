@@ -5,7 +5,6 @@ Nothing of Skinware is imported before a fixture is used: test runs of others th
 
 from __future__ import annotations
 
-import gc
 import itertools
 import os
 import secrets
@@ -91,7 +90,6 @@ def namespace(monkeypatch: pytest.MonkeyPatch) -> Iterator[Namespace]:
     monkeypatch.setenv("SKINWARE_NAMESPACE", f"test-{os.getpid()}-{secrets.token_hex(4)}")
     place = Namespace()
     before = Belongings()
-    gc.freeze()  # garbage is sought after every test: only among what is new
     yield place
     try:
         left = before.left_since() + files_left(place.path)

@@ -24,7 +24,8 @@ Floats = npt.NDArray[np.floating[Any]]
 _PART_NS = NS_PER_S
 """One point is kept for each such part of the window: the one that came with the least delay."""
 _RECENT_PARTS = 10
-"""The offset is that of the least delay among so many."""
+"""The offset is that of the least delay among the last so many in which anything came: what was held up is then known as
+late, also after a pause."""
 _LEAST_SPAN_NS = 2 * NS_PER_S
 """Before that, the device's clock is taken to go as ours."""
 _JUMP_NS = NS_PER_S / 20
@@ -62,7 +63,8 @@ class DeviceClock:
         self._unit_ns = unit_s * NS_PER_S
         self._modulo = modulo
         self._maximum_drift = maximum_drift
-        self._points: deque[tuple[int, float, float]] = deque(maxlen=max(3, round(window_s * NS_PER_S / _PART_NS)))
+        self._window_parts = max(3, round(window_s * NS_PER_S / _PART_NS))
+        self._points: deque[tuple[int, float, float]] = deque(maxlen=self._window_parts)
         self._origin_ns = 0
         self._ticks = 0
         self._stamp = -1
@@ -165,8 +167,9 @@ class DeviceClock:
                 self._fit_slope()
             elif above[best] < self._points[-1][2] - self._slope * self._points[-1][1]:
                 self._points[-1] = point
-        recent = self._points[-1][0] - _RECENT_PARTS
-        self._offset_ns = min(y - self._slope * x for part, x, y in self._points if part > recent)
+        oldest = self._points[-1][0] - self._window_parts
+        recent = [point for point in list(self._points)[-_RECENT_PARTS:] if point[0] > oldest]
+        self._offset_ns = min(y - self._slope * x for _, x, y in recent)
 
     def _is_far_behind(self) -> bool:
         """Whether the newest whole part says that the clock does not go."""

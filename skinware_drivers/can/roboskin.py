@@ -176,10 +176,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         """Ask for the version by unicast: a silent board that answers has restarted, if it should not be silent."""
         if patch.key in self._disabled:
             return False
-        try:
-            await self._version(link, board_of(patch))
-        except HandshakeTimeout:
-            return False
+        await self._version(link, board_of(patch))
         return True
 
     async def revive(self, link: Link, patch: Patch) -> None:

@@ -24,8 +24,8 @@ Floats = npt.NDArray[np.floating[Any]]
 _PART_NS = NS_PER_S
 """One point is kept for each such part of the window: the one that came with the least delay."""
 _RECENT_PARTS = 10
-"""The offset is that of the least delay among the last so many in which anything came: what was held up is known as late,
-also after a pause."""
+"""The offset is that of the least delay among the last so many in which anything came: what was held up is known as
+late, also after a pause."""
 _LEAST_SPAN_NS = 2 * NS_PER_S
 """Before that, the device's clock is taken to go as ours."""
 _JUMP_NS = NS_PER_S / 20

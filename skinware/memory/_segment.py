@@ -245,8 +245,8 @@ def current_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
 
 def _not_found(namespace: Namespace, name: str) -> str:
     others = namespace.services()
-    there_are = f"it has: {', '.join(others)}" if others else "it has none; start a driver (skin-driver --bus ...)"
-    return f"no service {name!r} in namespace {namespace.name!r}; {there_are}"
+    there_are = f"; it has: {', '.join(others)}" if others else ", nor another; start a driver (skin-driver --bus ...)"
+    return f"no service {name!r} in namespace {namespace.name!r}{there_are}"
 
 
 def _header(name: str, layout: Layout, digest: bytes, kind: str, period_ns: int) -> npt.NDArray[np.void]:

@@ -168,6 +168,7 @@ def command(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
     from skinware.memory.namespace import Namespace
+    from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
     from skinware_drivers.running.intake import DEFAULT_LATENCY_S
@@ -179,6 +180,7 @@ def command(
     file = _read(config)
     settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
+    is_named = bool(driver_name or settings.driver)
     driver_name = driver_name or settings.driver or DEFAULT_DRIVER
     driver_type = short_name(driver_name)
     driver = load_driver(driver_name)
@@ -200,7 +202,13 @@ def command(
 
     def bus_of(bus_name: str, adapter: AnyAdapter, file: ConfigFile) -> Bus:
         with file.blamed_for(bus_name):
-            return make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_name)
+            bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_name)
+            if not is_named and not bus.fits(adapter.medium):
+                raise ConfigurationError(
+                    f"{bus.name} is {kind_of_bus(bus.medium)}: say with --driver what hangs there. Without it, that is"
+                    f" {driver_name}, on {kind_of_bus(adapter.medium)}{bus.instead(adapter.medium)}"
+                )
+            return bus
 
     async def read_buses_again() -> None:
         if config is not None and not buses:  # what the command line names is not the file's to change

@@ -42,6 +42,10 @@ from skinware_drivers.registry import load_driver
             ["--bus", "virtual:anyskin", "--driver", "xela"],
             r"bus virtual:anyskin is a serial line; XelaDriver needs a CAN bus; emulators that fit:.* virtual:xela$",
         ),
+        (
+            ["--bus", "./port"],
+            r"\./port is a serial line: say with --driver what hangs there. Without it, that is roboskin",
+        ),
         (["--bus", "./port", "--driver", "xela"], r"\./port is a serial line; XelaDriver needs a CAN bus, as vcan0"),
     ],
 )

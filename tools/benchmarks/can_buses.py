@@ -47,12 +47,13 @@ class Result(NamedTuple):
         return 100 * (self.sent - self.received) / max(1, self.sent)
 
 
-def run(kind: str, rate_hz: float, seconds: float, busy: bool, n_buses: int, n_boards: int) -> Result:
+def run(
+    kind: str, rate_hz: float, seconds: float, busy: bool, n_buses: int, n_boards: int, latency_ms: float = 5.0
+) -> Result:
     """Send to a receiver, and ask it what it got."""
+    settings = [kind, "busy" if busy else "idle", str(n_buses), str(n_boards), str(latency_ms)]
     receiver = subprocess.Popen(
-        [sys.executable, HERE / "can_receivers.py", kind, "busy" if busy else "idle", str(n_buses), str(n_boards)],
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, HERE / "can_receivers.py", *settings], stdout=subprocess.PIPE, text=True
     )
     assert receiver.stdout is not None
     ports = receiver.stdout.readline().split()
@@ -88,11 +89,11 @@ def compare_receivers(arguments: argparse.Namespace) -> None:
 def many_buses(arguments: argparse.Namespace) -> None:
     """Thirty buses into one writer buffer."""
     print("\nbuses: 30 buses x 8,000 frames/s (14 boards each) into one writer buffer")
-    for _ in range(arguments.rounds):
-        result = run("ours", 8000, arguments.seconds, False, 30, 14)
+    for latency_ms in [5.0, 20.0] * arguments.rounds:
+        result = run("ours", 8000, arguments.seconds, False, 30, 14, latency_ms)
         print(
-            f"  {result.sent:,} sent, {result.sent - result.received} lost ({result.counted_lost} counted),"
-            f" cpu {100 * result.cpu:.0f} %, {result.us_per_frame:.2f} us/frame",
+            f"  --latency {latency_ms:2.0f}: {result.sent:,} sent, {result.sent - result.received} lost"
+            f" ({result.counted_lost} counted), cpu {100 * result.cpu:.0f} %, {result.us_per_frame:.2f} us/frame",
             flush=True,
         )
 

@@ -1,4 +1,4 @@
-"""Receivers of the CAN benchmark, each in a process of its own: ``can_receivers.py KIND SECONDS BUSY BUSES BOARDS``.
+"""Receivers of the CAN benchmark, each in a process of its own: ``can_receivers.py KIND BUSY BUSES BOARDS LATENCY_MS``.
 
 Prints the ports that it listens on, a line; then, when nothing has come for a while, what it received, as JSON.
 ``busy`` adds a thread that computes in pure Python all the time, as a control loop in the same process would.
@@ -103,12 +103,13 @@ class Measured:
         print(json.dumps({"frames": list(frames), "lost": lost, "wall_s": wall_s, "cpu_s": cpu_s}), flush=True)
 
 
-def driver(n_buses: int, n_boards: int) -> None:
+def driver(n_buses: int, n_boards: int, latency_ms: float) -> None:
     """The product: a driver with one writer buffer over all buses."""
     StreamingBoards.n_boards = n_boards
     buses = [LoopbackBus() for _ in range(n_buses)]
     options = RoboskinOptions()
-    runner = Runner("roboskin", [(f"bus{i}", StreamingBoards(options), b) for i, b in enumerate(buses)], name="bench")
+    lines = [(f"bus{i}", StreamingBoards(options), bus) for i, bus in enumerate(buses)]
+    runner = Runner("roboskin", lines, name="bench", latency_s=latency_ms / 1e3)
     print(*[bus.receiver.getsockname()[1] for bus in buses], flush=True)
     measured = Measured()
 
@@ -181,11 +182,12 @@ def one_by_one(kind: str) -> None:
 def main() -> None:
     """Entry point."""
     kind, busy, n_buses, n_boards = sys.argv[1], sys.argv[2] == "busy", int(sys.argv[3]), int(sys.argv[4])
+    latency_ms = float(sys.argv[5])
     logging.disable()  # boards begin and end
     if busy:
         threading.Thread(target=spin, daemon=True).start()
     if kind == "ours":
-        driver(n_buses, n_boards)
+        driver(n_buses, n_boards, latency_ms)
     else:
         one_by_one(kind)
     sys.stdout.flush()

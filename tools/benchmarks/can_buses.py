@@ -29,6 +29,7 @@ from skinware.errors import ServiceTimeout
 HERE = Path(__file__).parent
 KINDS = ("ours", "recv", "notifier", "socket")
 NAMES = {"ours": "driver", "recv": "python-can recv", "notifier": "python-can Notifier", "socket": "socket.recv"}
+GRACE_S = 10.0  # for what is received after the last frame was sent
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -51,7 +52,7 @@ def run(
     kind: str, rate_hz: float, seconds: float, busy: bool, n_buses: int, n_boards: int, latency_ms: float = 5.0
 ) -> Result:
     """Send to a receiver, and ask it what it got."""
-    settings = [kind, "busy" if busy else "idle", str(n_buses), str(n_boards), str(latency_ms)]
+    settings = [kind, "busy" if busy else "idle", *map(str, (n_buses, n_boards, latency_ms, seconds + GRACE_S))]
     receiver = subprocess.Popen(
         [sys.executable, HERE / "can_receivers.py", *settings], stdout=subprocess.PIPE, text=True
     )

@@ -1,12 +1,14 @@
-"""Receivers of the CAN benchmark, each in a process of its own: ``can_receivers.py KIND BUSY BUSES BOARDS LATENCY_MS``.
+"""Receivers of the CAN benchmark: ``can_receivers.py KIND BUSY BUSES BOARDS LATENCY_MS SECONDS``, each a process.
 
-Prints the ports that it listens on, a line; then, when nothing has come for a while, what it received, as JSON.
+Prints the ports that it listens on, a line; then, when nothing has come for a while, or so many seconds after the first
+frame, what it received, as JSON: who is that far behind has lost the rest.
 ``busy`` adds a thread that computes in pure Python all the time, as a control loop in the same process would.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import os
@@ -15,7 +17,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import can
 from decode import SocketBus, sockets
@@ -29,6 +31,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.running.runner import Runner
 
 QUIET_S = 1.0
+NOTED_EVERY = 64
 
 
 class LoopbackBus(SocketCanBus):
@@ -73,23 +76,18 @@ def spin() -> None:
         number += 1
 
 
-def wait_for_quiet(count: Callable[[], int]) -> None:
-    """Until frames have come, and then none for a while."""
-    last, since = 0, time.monotonic()
-    while True:
-        time.sleep(0.05)
-        if count() != last:
-            last, since = count(), time.monotonic()
-        elif last and time.monotonic() - since > QUIET_S:
-            return
-
-
 class Measured:
     """Processor time from the first frame on."""
 
-    def __init__(self) -> None:
+    def __init__(self, longest_s: float) -> None:
         self.began: tuple[float, float] | None = None
         self.ended = (0.0, 0.0)
+        self._longest_s = longest_s
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the time is over."""
+        return self.began is not None and time.monotonic() - self.began[0] > self._longest_s
 
     def note(self) -> None:
         """Called as frames come."""
@@ -103,7 +101,7 @@ class Measured:
         print(json.dumps({"frames": list(frames), "lost": lost, "wall_s": wall_s, "cpu_s": cpu_s}), flush=True)
 
 
-def driver(n_buses: int, n_boards: int, latency_ms: float) -> None:
+def driver(n_buses: int, n_boards: int, latency_ms: float, measured: Measured) -> None:
     """The product: a driver with one writer buffer over all buses."""
     StreamingBoards.n_boards = n_boards
     buses = [LoopbackBus() for _ in range(n_buses)]
@@ -111,7 +109,6 @@ def driver(n_buses: int, n_boards: int, latency_ms: float) -> None:
     lines = [(f"bus{i}", StreamingBoards(options), bus) for i, bus in enumerate(buses)]
     runner = Runner("roboskin", lines, name="bench", latency_s=latency_ms / 1e3)
     print(*[bus.receiver.getsockname()[1] for bus in buses], flush=True)
-    measured = Measured()
 
     def frames() -> int:
         return sum(bus.counters.frames for bus in buses)
@@ -119,7 +116,7 @@ def driver(n_buses: int, n_boards: int, latency_ms: float) -> None:
     async def run() -> None:
         running = asyncio.create_task(runner.run())
         last, since = 0, time.monotonic()
-        while not running.done() and (not last or time.monotonic() - since < QUIET_S):
+        while not (running.done() or measured.is_over) and (not last or time.monotonic() - since < QUIET_S):
             await asyncio.sleep(0.05)
             if frames() != last:
                 last, since = frames(), time.monotonic()
@@ -132,29 +129,29 @@ def driver(n_buses: int, n_boards: int, latency_ms: float) -> None:
     measured.report([c.frames for c in counters], sum(c.lost for c in counters))
 
 
-def one_by_one(kind: str) -> None:
+def one_by_one(kind: str, measured: Measured) -> None:
     """python-can, by ``recv`` or Notifier, and the plain socket."""
     sender, receiver = sockets()
     sender.close()
     print(receiver.getsockname()[1], flush=True)
-    measured, frames = Measured(), 0
+    frames = 0
     if kind == "socket":
         receiver.setblocking(True)
-        while select.select([receiver], [], [], QUIET_S if frames else None)[0]:
-            while True:
-                try:
+        while not measured.is_over and select.select([receiver], [], [], QUIET_S if frames else None)[0]:
+            with contextlib.suppress(BlockingIOError):
+                while frames % NOTED_EVERY or not measured.is_over:
                     receiver.recv(16, socket.MSG_DONTWAIT)
-                except BlockingIOError:
-                    break
-                frames += 1
+                    frames += 1
+                    if frames % NOTED_EVERY == 1:
+                        measured.note()
             measured.note()
         measured.report([frames], 0)
         return
     bus = SocketBus(receiver)
     if kind == "recv":
-        while bus.recv(QUIET_S if frames else None) is not None:
+        while (frames % NOTED_EVERY or not measured.is_over) and bus.recv(QUIET_S if frames else None) is not None:
             frames += 1
-            if frames % 64 == 1:
+            if frames % NOTED_EVERY == 1:
                 measured.note()
         measured.report([frames], 0)
         bus.shutdown()
@@ -169,7 +166,7 @@ def one_by_one(kind: str) -> None:
     listener = Counting()
     notifier = can.Notifier(bus, [listener])
     last, since = 0, time.monotonic()
-    while not last or time.monotonic() - since < QUIET_S:
+    while not measured.is_over and (not last or time.monotonic() - since < QUIET_S):
         time.sleep(0.05)
         if listener.count != last:
             last, since = listener.count, time.monotonic()
@@ -182,14 +179,14 @@ def one_by_one(kind: str) -> None:
 def main() -> None:
     """Entry point."""
     kind, busy, n_buses, n_boards = sys.argv[1], sys.argv[2] == "busy", int(sys.argv[3]), int(sys.argv[4])
-    latency_ms = float(sys.argv[5])
+    latency_ms, measured = float(sys.argv[5]), Measured(float(sys.argv[6]))
     logging.disable()  # boards begin and end
     if busy:
         threading.Thread(target=spin, daemon=True).start()
     if kind == "ours":
-        driver(n_buses, n_boards, latency_ms)
+        driver(n_buses, n_boards, latency_ms, measured)
     else:
-        one_by_one(kind)
+        one_by_one(kind, measured)
     sys.stdout.flush()
     os._exit(0)  # a busy thread does not end
 

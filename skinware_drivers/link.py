@@ -73,6 +73,7 @@ class Link:
         self._wanted: Sequence[Filter] | None = None
         self._waiters: list[tuple[tuple[Match, ...], asyncio.Queue[Reply]]] = []
         self._late: deque[tuple[int, tuple[Match, ...]]] = deque()  # until when their answers are no strangers
+        self._questions = 0
         self._heard: Counter[Heard] | None = None
 
     @property
@@ -87,8 +88,8 @@ class Link:
 
     @property
     def is_awaiting(self) -> bool:
-        """Whether somebody waits for an answer."""
-        return bool(self._waiters)
+        """Whether a question is open. Who follows frames, perhaps for ever, has asked none."""
+        return self._questions > 0
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:
         """Send one frame; waits while the interface's queue is full.
@@ -134,16 +135,18 @@ class Link:
         self._bus.narrow(fewest([*self._wanted, *awaited]))
 
     @contextmanager
-    def _waiting(self, matches: tuple[Match, ...], *, may_be_late: bool = False) -> Iterator[asyncio.Queue[Reply]]:
+    def _waiting(self, matches: tuple[Match, ...], *, is_question: bool = False) -> Iterator[asyncio.Queue[Reply]]:
         queue: asyncio.Queue[Reply] = asyncio.Queue()
         entry = (matches, queue)
         self._waiters.append(entry)
+        self._questions += is_question
         self._tell_bus()
         try:
             yield queue
         finally:
             self._waiters.remove(entry)
-            if may_be_late:
+            self._questions -= is_question
+            if is_question:
                 self._late.append((now_ns() + _LATE_NS, matches))
             self._tell_bus()
 
@@ -158,7 +161,7 @@ class Link:
             HandshakeTimeout: no answer in time.
             BusSendError: as ``send``.
         """
-        with self._waiting((reply,), may_be_late=True) as queue:
+        with self._waiting((reply,), is_question=True) as queue:
             for _ in range(tries):
                 await self.send(identifier, payload)
                 # not wait_for: that of Python 3.11 forgets cancellations
@@ -175,7 +178,7 @@ class Link:
         Raises:
             BusSendError: as ``send``.
         """
-        with self._waiting((reply,), may_be_late=True) as queue:
+        with self._waiting((reply,), is_question=True) as queue:
             await self.send(identifier, payload)
             await asyncio.sleep(duration_s)
         return [queue.get_nowait() for _ in range(queue.qsize())]

@@ -65,6 +65,24 @@ def test_who_follows_hears_everything_that_matches_in_order_until_it_stops() -> 
     asyncio.run(scenario())
 
 
+def test_an_answer_is_awaited_while_a_question_is_open_and_not_while_somebody_follows() -> None:
+    async def scenario() -> None:
+        link = Link(Nowhere())  # type: ignore[arg-type]
+        with link.follow(Match(0x700)):
+            assert not link.is_awaiting
+            asking = asyncio.create_task(link.request(0x100, b"", Match(0x101), timeout_s=60))
+            await asyncio.sleep(0)
+            assert link.is_awaiting
+            offer(link, (0x101, b"\x01"))
+            await asking
+            assert not link.is_awaiting
+            with pytest.raises(HandshakeTimeout):
+                await link.request(0x100, b"", Match(0x101), timeout_s=0)
+            assert not link.is_awaiting
+
+    asyncio.run(scenario())
+
+
 def test_an_answer_that_comes_too_late_is_no_stranger() -> None:
     async def scenario() -> None:
         link = Link(Nowhere())  # type: ignore[arg-type]

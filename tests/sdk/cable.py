@@ -39,6 +39,13 @@ class Cable:
     def put(self, identifier: int, payload: bytes = bytes(8)) -> None:
         self.out.send(struct.pack("=IB3x8s", identifier, len(payload), payload))
 
+    def put_ten(self) -> tuple[int, int]:
+        """Send ten frames; when, by CLOCK_MONOTONIC: before the first and after the last, ns."""
+        before_ns = time.monotonic_ns()
+        for _ in range(10):
+            self.put(0x123)
+        return before_ns, time.monotonic_ns()
+
     def close(self) -> None:
         self.end.close()
         self.out.close()

@@ -20,10 +20,7 @@ def test_stamps_tell_when_a_frame_arrived_not_when_it_was_fetched(cable: Cable) 
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
     pass_ms(20)
-    before_ns = time.monotonic_ns()
-    for _ in range(10):
-        cable.put(0x123)
-    after_ns = time.monotonic_ns()
+    before_ns, after_ns = cable.put_ten()
     pass_ms(20)
     batch = FrameBatch(10)
     drain(bus, batch)
@@ -74,10 +71,7 @@ def test_stamping_with_hardware_takes_the_kernels_where_there_are_no_others(
     batch = FrameBatch(100)
     for _ in range(3):
         pass_ms(10)
-        before_ns = time.monotonic_ns()
-        for _ in range(10):
-            cable.put(0x123)
-        after_ns = time.monotonic_ns()
+        before_ns, after_ns = cable.put_ten()
         pass_ms(10)
         first = batch.stop
         drain(bus, batch)

@@ -7,7 +7,6 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skinware_drivers.adapter import NoOptions, Notice, Watch
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.layout import (
         Bits,
@@ -26,9 +25,11 @@ if TYPE_CHECKING:
         Values,
     )
     from skinware_drivers.link import Link, Match
+    from skinware_drivers.notice import Notice
     from skinware_drivers.operations import operation
-    from skinware_drivers.options import check_options
+    from skinware_drivers.options import NoOptions, check_options
     from skinware_drivers.polling import Poll
+    from skinware_drivers.watch import Watch
 
 __all__ = [
     "Bits",
@@ -60,7 +61,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("layout", "description", "link", "adapter", "operations", "options", "polling")
+_MODULES = ("layout", "description", "link", "notice", "watch", "operations", "options", "polling")
 
 
 def get_include() -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import enum
 from abc import ABC
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -13,59 +12,14 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, StructureError
 from skinware.sensor_types import SensorType
-from skinware.status import Status
 from skinware_drivers.bus import Bus, kind_of_bus
-from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
-from skinware_drivers.options import HasOptions
+from skinware_drivers.notice import Notice
+from skinware_drivers.options import HasOptions, NoOptions, OptionsT
 from skinware_drivers.polling import Poll
-
-
-class NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a driver that has none."""
-
-
-OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
-
-
-class Notice(enum.Enum):
-    """What a device says of itself beside its data."""
-
-    RESTARTED = "restarted"
-    """It lost its configuration: ``revive`` is called for it, and for it alone."""
-    CHANGED = "changed"
-    """It is not what it was described as (another device was plugged in, new firmware): ``join`` is called."""
-    LOST = "lost"
-    """It is not there, or not in a state to send: stale, until data comes."""
-    SUSPECT = "suspect"
-    """It reports an error: all its values are suspect, until it is sound or was set up anew."""
-    SOUND = "sound"
-    """The error is over."""
-
-
-class Watch:
-    """Looks at every update of all buses, to mark values that the wire alone does not call doubtful.
-
-    Attributes:
-        module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
-    """
-
-    def __init__(self, tables: SkinTables) -> None:
-        self.tables = tables
-        self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
-
-    def look(self, updates: Updates) -> None:
-        """Called with updates that were just shown, if the wire may have flagged one of them."""
-
-    def suspect(self, patch: int) -> None:
-        """Called when a patch reports an error."""
-        self.module_status[self.tables.structure.module_patch == patch] |= np.uint8(Status.SUSPECT)
-
-    def forget(self, patch: int) -> None:
-        """Called when a patch was set up anew, or reports no error any more: what was held against it is over."""
-        self.module_status[self.tables.structure.module_patch == patch] = 0
+from skinware_drivers.watch import Watch
 
 
 class Adapter(HasOptions[OptionsT], ABC):

@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 import skinware
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import check_name
-from skinware_drivers.options import nearest_name
+from skinware_drivers.options.names import SOURCE_SUFFIX, is_file, nearest_name
 
-_SUFFIX = ".py"
 _OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__file__))
 _PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first
 
@@ -61,7 +60,7 @@ def load(kind: Kind, name: str) -> type[Any]:
     if name not in known:
         raise ConfigurationError(
             f"there is no {kind.word} {name!r}{nearest_name(name, known)}. One of yours: give its file, as"
-            f" ./{name}{_SUFFIX}, or install its package: pip install -e ."
+            f" ./{name}{SOURCE_SUFFIX}, or install its package: pip install -e ."
         )
     entry = known[name]
     with _blamed(f"{kind.word} {name!r} ({entry.value})", _is_theirs):
@@ -71,14 +70,9 @@ def load(kind: Kind, name: str) -> type[Any]:
     return loaded
 
 
-def is_file(name: str) -> bool:
-    """Whether a name is that of a file, not of something that is registered."""
-    return name.endswith(_SUFFIX)
-
-
 def short_name(name: str) -> str:
     """What people are shown of a name: of a file only what it is called, without folder and ending."""
-    return os.path.basename(name).removesuffix(_SUFFIX) if is_file(name) else name
+    return os.path.basename(name).removesuffix(SOURCE_SUFFIX) if is_file(name) else name
 
 
 def _class_in(name: str, kind: Kind) -> type[Any]:
@@ -139,4 +133,4 @@ def _blamed(what: str, is_theirs: Callable[[str], bool]) -> Iterator[None]:
         raise ConfigurationError(f"{what} cannot be loaded: {type(error).__name__}: {text}{where}") from error
 
 
-__all__ = ["Kind", "is_file", "load", "short_name"]
+__all__ = ["Kind", "load", "short_name"]

@@ -19,7 +19,7 @@ import pytest
 
 import skinware
 from skinware import realtime, threads
-from skinware_drivers.config import ConfigFile
+from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from tests.commands import PATIENCE_S, running
 

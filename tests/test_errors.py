@@ -21,9 +21,9 @@ from skinware.errors import SkinwareError
 from skinware.memory import _fences
 from skinware.realtime import Profile
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.config import ConfigFile
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.link import Link, Match
+from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import make_bus
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.sdk.driving import Chatter

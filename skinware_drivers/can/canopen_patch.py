@@ -23,7 +23,6 @@ from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
-from skinware_drivers.adapter import Notice
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.pdo_map import PdoMap, Tpdo, default_tpdos, tpdo_numbers
@@ -31,6 +30,7 @@ from skinware_drivers.can.sdo import SdoAborted, SdoClient
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match, Reply
+from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options, nearest_name
 from skinware_drivers.polling import Poll
 

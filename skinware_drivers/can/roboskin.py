@@ -19,7 +19,6 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
 from skinware.status import Status
-from skinware_drivers.adapter import Watch
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.roboskin_boards import BoardOperations
 from skinware_drivers.can.roboskin_layout import (
@@ -54,6 +53,7 @@ from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
+from skinware_drivers.watch import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

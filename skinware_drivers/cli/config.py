@@ -191,7 +191,7 @@ def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
     """Name and object of the driver for a bus that has none running."""
-    from skinware_drivers.config import ConfigFile
+    from skinware_drivers.options.file import ConfigFile
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
     file = ConfigFile(config)

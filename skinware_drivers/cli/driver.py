@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
     from skinware_drivers.bus_names import BusPlace
-    from skinware_drivers.config import ConfigFile, DriverConfig
+    from skinware_drivers.options.file import ConfigFile, DriverConfig
     from skinware_drivers.running.runner import PublishMode, Runner
 
 
@@ -347,7 +347,7 @@ def _refuse_twice(bus_names: Sequence[str]) -> None:
 
 
 def _read(path: Path | None) -> ConfigFile:
-    from skinware_drivers.config import ConfigFile
+    from skinware_drivers.options.file import ConfigFile
 
     return ConfigFile(path)
 

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import PatchState
-from skinware_drivers.adapter import Watch
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.publisher import Publisher
+from skinware_drivers.watch import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

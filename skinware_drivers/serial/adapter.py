@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from skinware_drivers.adapter import Adapter, OptionsT
+from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.options import OptionsT
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE

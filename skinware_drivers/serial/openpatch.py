@@ -18,10 +18,10 @@ from msgspec import Meta
 from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.sensor_types import SensorType
-from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.answers import Answers, Refused

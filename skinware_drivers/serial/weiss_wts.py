@@ -25,10 +25,10 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
-from skinware_drivers.adapter import Notice
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter

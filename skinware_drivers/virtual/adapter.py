@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from skinware_drivers.adapter import Adapter, OptionsT
+from skinware_drivers.adapter import Adapter
+from skinware_drivers.options import OptionsT
 
 
 class VirtualAdapter(Adapter[OptionsT]):

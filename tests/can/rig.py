@@ -12,11 +12,11 @@ from contextlib import contextmanager
 import numpy as np
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.driving import Driving, driving_lines
 
 TIP_IDENTIFIER = 0x473

@@ -198,8 +198,8 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any) -> None:
     """Fingertips of board 1 send the slices, one per cycle, the last one for ever."""
     from skinware_drivers.can.socketcan import SocketCanBus
     from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
-    from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-    from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+    from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+    from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
     def source(_board: int, triangle: int, cycle: int, _time_ns: int) -> Sequence[int]:
         values = slices[min(cycle, len(slices) - 1)]

@@ -26,8 +26,8 @@ from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device

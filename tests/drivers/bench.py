@@ -14,12 +14,13 @@ import msgspec
 import numpy as np
 
 from skinware import Status
-from skinware_drivers.adapter import AnyAdapter, Notice
+from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
+from skinware_drivers.notice import Notice
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.emulator import Emulator
 from skinware_drivers.virtual.events import FrameFault

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, Stamp, Values
 from skinware_drivers.link import Link
+from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
 from skinware_drivers.virtual.press import on_a_grid

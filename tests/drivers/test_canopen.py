@@ -13,12 +13,12 @@ import pytest
 
 from skinware import DriverFrame, DriverReader, PatchState, Status
 from skinware.errors import ConfigurationError, HandshakeTimeout
-from skinware_drivers.adapter import Notice
 from skinware_drivers.can.canopen_patch import CanopenDriver, CanopenOptions, MappingChanged
+from skinware_drivers.notice import Notice
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
+from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
 from skinware_drivers.virtual.events import CommandReceived, ErrorReported
 from tests.drivers.bench import EXAMPLE_EDS, Bench, Case, play
 from tests.sdk.driving import Driving, driving_lines, read_until

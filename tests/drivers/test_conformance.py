@@ -23,20 +23,20 @@ from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
-from skinware_drivers.virtual.agni import EmulatedAgni
-from skinware_drivers.virtual.anyskin import EmulatedAnySkin
-from skinware_drivers.virtual.barrett import EmulatedBarrett
-from skinware_drivers.virtual.canopen_patch import EmulatedCanopen
-from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
+from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
+from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
+from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
+from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
+from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
+from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.xela import EmulatedXela
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
-from skinware_drivers.virtual.skintalk import EmulatedSkintalk
-from skinware_drivers.virtual.tactile_glove import EmulatedTactileGlove
-from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
-from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove
-from skinware_drivers.virtual.xela import EmulatedXela
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 
 

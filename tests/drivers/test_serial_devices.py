@@ -21,9 +21,9 @@ from skinware_drivers.serial.framing import MANY_BYTES
 from skinware_drivers.serial.skintalk import SkintalkDriver, SkintalkOptions
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver, TactileGloveOptions
 from skinware_drivers.testing.driving import EmulatedSkin, driving_lines
-from skinware_drivers.virtual.anyskin import EmulatedAnySkin, EmulatedAnySkinOptions
-from skinware_drivers.virtual.skintalk import EmulatedSkintalk, EmulatedSkintalkOptions
-from skinware_drivers.virtual.tactile_glove import EmulatedTactileGlove, EmulatedTactileGloveOptions
+from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin, EmulatedAnySkinOptions
+from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk, EmulatedSkintalkOptions
+from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove, EmulatedTactileGloveOptions
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.lines import line
 

@@ -17,10 +17,10 @@ from skinware_drivers.finding.guess import known_drivers
 from skinware_drivers.finding.looking import Answer, ask_port, can_ask
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.testing.carrying import emulated_on_a_pty
-from skinware_drivers.virtual.agni import EmulatedAgni
-from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
-from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
-from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
+from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from tests.finding.fakes import see_only
 from tests.serial.lines import Line, line, opened
 

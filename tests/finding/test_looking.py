@@ -23,11 +23,11 @@ from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.looking import Answer, HeardOnBus, ask, ask_port, listen_on
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
+from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
+from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.hardware import EmulatedHardware
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
-from skinware_drivers.virtual.xela import EmulatedXela, EmulatedXelaOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 
 DRIVERS: dict[str, type[AnyAdapter]] = {"roboskin": RoboskinDriver}

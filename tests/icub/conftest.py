@@ -7,9 +7,9 @@ from tempfile import NamedTemporaryFile
 
 import pytest
 
-from skinware_drivers.config import ConfigFile
 from skinware_drivers.icub.importer import Import, import_files
 from skinware_drivers.icub.notes import Note, Notes
+from skinware_drivers.options.file import ConfigFile
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

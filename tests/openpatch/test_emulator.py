@@ -20,7 +20,7 @@ from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.openpatch import OpenPatchDriver, OpenPatchOptions
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
+from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch, EmulatedOpenPatchOptions, stuff, unstuff
 from tests.openpatch import wire
 from tests.sdk.driving import driving_lines, read_until, restarted_on_demand
 

@@ -21,8 +21,8 @@ from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import CommandReceived
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 SILENCE_NS = 600_000_000
 """How long boards may be silent in tests: a busy machine lets the threads of a test wait for longer than 0.2 s."""

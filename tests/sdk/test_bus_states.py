@@ -15,16 +15,16 @@ import pytest
 from skinware import BusReason, BusState, DriverFrame, DriverReader, Status
 from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
+from skinware_drivers.options import NoOptions
 from skinware_drivers.running import bus_line, bus_news
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import TroubledBus, driving, emulated, hardware_of, read_until
 
 pytestmark = pytest.mark.usefixtures("hurry")

@@ -8,8 +8,8 @@ import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.emulator import Emulator, EmulatorOptions
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 

@@ -13,12 +13,12 @@ import pytest
 from skinware import BusState, DriverReader
 from skinware.errors import BusSendError, ConfigurationError
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
+from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Poll, Poller
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import WireFrame

@@ -14,8 +14,8 @@ from skinware_drivers.can.roboskin import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.events import BoardSilenced
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.conftest import HURRIED_WAIT_S
 from tests.sdk.driving import (
     Chatter,

@@ -8,8 +8,8 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.config import ConfigFile
-from skinware_drivers.toml_lines import Keys, line_of
+from skinware_drivers.options.file import ConfigFile
+from skinware_drivers.options.toml_lines import Keys, line_of
 
 TEXT = """\
 driver = "roboskin"

@@ -10,7 +10,7 @@ from skinware import PatchState
 from skinware.errors import RequestFailed
 from skinware_drivers.serial.agni import AgniDriver, command
 from skinware_drivers.testing.driving import emulated_skin
-from skinware_drivers.virtual.agni import EmulatedAgni, EmulatedAgniOptions, message
+from skinware_drivers.virtual.devices.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 

@@ -16,11 +16,11 @@ from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.agni import EmulatedAgni
-from skinware_drivers.virtual.weiss_wts import EmulatedWeissWts
-from skinware_drivers.virtual.weiss_wts import message as weiss_message
-from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove
-from skinware_drivers.virtual.wuji_glove import message as wuji_message
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
+from skinware_drivers.virtual.devices.weiss_wts import message as weiss_message
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.wuji_glove import message as wuji_message
 from tests.sdk.driving import Driving, driving_lines
 
 FRAMES = [

@@ -16,9 +16,9 @@ from skinware import DriverFrame, DriverReader
 from skinware.cli.info import command as info
 from skinware.errors import ConfigurationError
 from skinware.status import BusReason, BusState, Status
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import OWN_BUS_COUNTERS
+from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import LengthTable, Packet

@@ -11,7 +11,7 @@ from skinware import PatchState, Status
 from skinware.errors import RequestFailed
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_skin
-from skinware_drivers.virtual.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 

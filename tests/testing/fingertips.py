@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
+from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 NODES = (1, 2)

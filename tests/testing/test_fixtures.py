@@ -14,9 +14,10 @@ import pytest
 
 from skinware import PatchState, Status
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import AnyAdapter, NoOptions
+from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.openpatch import OpenPatchDriver
@@ -25,8 +26,8 @@ from skinware_drivers.testing import lab
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.driving import EmulatedSkin
 from skinware_drivers.testing.waiting import read_until
+from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from skinware_drivers.virtual.openpatch import EmulatedOpenPatch
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
 

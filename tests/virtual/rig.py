@@ -7,9 +7,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
-from skinware_drivers.virtual.touch import WireSource
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import WireSource
 
 MS = 1_000_000
 START_NS = 5_000_000_000_000

@@ -11,6 +11,7 @@ import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.events import (
     BoardDied,
     BoardRestarted,
@@ -21,7 +22,6 @@ from skinware_drivers.virtual.events import (
     spoilt_bursts,
 )
 from skinware_drivers.virtual.hardware import WireFrame, load_emulator
-from skinware_drivers.virtual.xela import EmulatedXela, EmulatedXelaOptions
 
 from .rig import MS, START_NS
 

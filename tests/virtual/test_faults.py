@@ -12,8 +12,8 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.events import JsonLinesLog, damaged_cycles
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS, START_NS, Rig, cycles, is_data
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware_drivers.virtual.firmware import Arithmetic, ArrayI, Sample
+from skinware_drivers.virtual.roboskin.firmware import Arithmetic, ArrayI, Sample
 
 BASE = 0x9000
 

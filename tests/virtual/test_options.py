@@ -15,8 +15,8 @@ from skinware_drivers.options import (
     option_text,
     options_from_strings,
 )
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.touch import DEFAULT_CDC_OFFSET, Touch
+from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 from .rig import Rig, cycles
 

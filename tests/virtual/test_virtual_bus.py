@@ -14,8 +14,8 @@ from skinware.errors import BusError, BusNotAvailable, BusSendError, Configurati
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 
 from .rig import MS
 
@@ -122,7 +122,7 @@ def test_a_batch_without_room_takes_nothing_and_nothing_is_lost(make_bus: MakeBu
     assert bus.receive(batch, 0) == 0
     assert is_readable(bus)
     other.receive(FrameBatch(0), 0)
-    assert is_readable(other)  # nothing was fetched, and something is due
+    assert is_readable(other, 5)  # nothing was fetched, and something is due
     got = frames_of(batch)
     rest = FrameBatch(1000)
     bus.receive(rest, 0)

@@ -32,11 +32,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from skinware import Namespace
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.adapter import NoOptions
 from skinware_drivers.bus import FrameBatch, wire_dtype
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Bits, Frame, Layout, Values
+from skinware_drivers.options import NoOptions
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus

@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.firmware import CHANNELS, NO_ACK, NOT_CONNECTED, TRIANGLES, ArrayI
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.firmware import CHANNELS, NO_ACK, NOT_CONNECTED, TRIANGLES, ArrayI
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 
 WRONG_LENGTHS = (0, 1, 2, 3, 4, 5, 7)
 """Neither 8 nor the 6 of old firmware."""

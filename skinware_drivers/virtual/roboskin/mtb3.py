@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from skinware_drivers.virtual import events
-from skinware_drivers.virtual.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, Board
-from skinware_drivers.virtual.inertial import MTB3_UNITS, Units
+from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, DATA, EVERY_BOARD, OLD_DATA, POLLING, Board
+from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, Units
 
 _SHORTEST = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}
 """Bytes of each command. Shorter ones are ignored here; real boards read what their buffer happens to hold."""

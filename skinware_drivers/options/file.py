@@ -29,9 +29,9 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
-from skinware_drivers.loading import is_file
-from skinware_drivers.options import nearest_name, options_from_strings
-from skinware_drivers.toml_lines import Keys, line_of
+from skinware_drivers.options.names import is_file, nearest_name
+from skinware_drivers.options.texts import options_from_strings
+from skinware_drivers.options.toml_lines import Keys, line_of
 
 T = TypeVar("T", bound=msgspec.Struct)
 _KEYS_IN_ERROR = re.compile(r"\.(\w+)|\[(\d+)\]")

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.faults import BoardFaults
-from skinware_drivers.virtual.firmware import (
+from skinware_drivers.virtual.roboskin.faults import BoardFaults
+from skinware_drivers.virtual.roboskin.firmware import (
     CHANNELS,
     FINGERTIP,
     TRIANGLES,
@@ -19,7 +19,7 @@ from skinware_drivers.virtual.firmware import (
     Sample,
     triangle_payloads,
 )
-from skinware_drivers.virtual.touch import DEFAULT_CDC_OFFSET, Touch
+from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD, DEFAULT_SHIFT = 0, 245, 2
 """icub-firmware:emBODY/eBcode/arch-arm/embot/app/embot_app_application_theSkin.cpp"""

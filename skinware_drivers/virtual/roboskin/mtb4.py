@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from skinware_drivers.virtual.boards import BOOTLOADER, EVERY_BOARD, POLLING, Board
-from skinware_drivers.virtual.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
-from skinware_drivers.virtual.inertial import MTB4_UNITS, Units
-from skinware_drivers.virtual.touch import DEFAULT_CDC_OFFSET
+from skinware_drivers.virtual.roboskin.boards import BOOTLOADER, EVERY_BOARD, POLLING, Board
+from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
+from skinware_drivers.virtual.roboskin.inertial import MTB4_UNITS, Units
+from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET
 
 _SHORTEST = {0x07: 2, 0x1C: 3, 0x32: 2, 0x33: 8, 0x35: 2, 0x4C: 1, 0x4D: 4, 0x4F: 3, 0x50: 7}
 """Bytes of each command. Shorter ones are ignored here; real boards read what their buffer happens to hold."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from skinware_drivers.bus import EXTENDED_FLAG
-from skinware_drivers.virtual.boards import Board, BoardParts
-from skinware_drivers.virtual.faults import BoardFaults
 from skinware_drivers.virtual.foreign import ForeignTraffic
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.mtb3 import Mtb3
-from skinware_drivers.virtual.mtb4 import Mtb4
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
-from skinware_drivers.virtual.touch import Touch, WireSource, cycle_pattern
+from skinware_drivers.virtual.roboskin.boards import Board, BoardParts
+from skinware_drivers.virtual.roboskin.faults import BoardFaults
+from skinware_drivers.virtual.roboskin.mtb3 import Mtb3
+from skinware_drivers.virtual.roboskin.mtb4 import Mtb4
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.touch import Touch, WireSource, cycle_pattern
 from skinware_drivers.virtual.wire import Wire
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.firmware import CHANNELS, TRIANGLES, ArrayI
+from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values that go on the wire, 0-255, whatever is felt."""

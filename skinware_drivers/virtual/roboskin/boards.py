@@ -9,12 +9,12 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from skinware_drivers.virtual import events
-from skinware_drivers.virtual.converters import Acquisition, Converters
-from skinware_drivers.virtual.faults import BoardFaults, Fate, TriangleState
-from skinware_drivers.virtual.firmware import TRIANGLES
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.inertial import InertialSensors, Units
-from skinware_drivers.virtual.touch import Touch, WireSource
+from skinware_drivers.virtual.roboskin.converters import Acquisition, Converters
+from skinware_drivers.virtual.roboskin.faults import BoardFaults, Fate, TriangleState
+from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
+from skinware_drivers.virtual.roboskin.inertial import InertialSensors, Units
+from skinware_drivers.virtual.roboskin.touch import Touch, WireSource
 from skinware_drivers.virtual.wire import Transmission, Transmitter
 
 POLLING, OLD_DATA, DATA, INERTIAL, BOOTLOADER = 2, 3, 4, 5, 7

@@ -2,7 +2,8 @@
 
 The boards are silent until a host starts them (or the option ``streaming`` says that one did). What each kind of
 board does is in :mod:`.mtb3` and :mod:`.mtb4`, what it computes in :mod:`.firmware`, what it feels in
-:mod:`.touch`, what goes wrong in :mod:`.faults`, and what is written down about it in :mod:`.events`.
+:mod:`.touch`, what goes wrong in :mod:`.faults`, and what is written down about it in
+:mod:`skinware_drivers.virtual.events`.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from typing import TYPE_CHECKING, ClassVar
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.roboskin_options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.stage import Actor, Stage
 
 if TYPE_CHECKING:  # what needs numpy is imported when the boards are made: commands show these options fast
-    from skinware_drivers.virtual.boards import Board
-    from skinware_drivers.virtual.faults import TriangleState
-    from skinware_drivers.virtual.touch import WireSource
+    from skinware_drivers.virtual.roboskin.boards import Board
+    from skinware_drivers.virtual.roboskin.faults import TriangleState
+    from skinware_drivers.virtual.roboskin.touch import WireSource
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))
 """What a host sends to a board: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""
@@ -32,7 +33,7 @@ class EmulatedRoboskin(Stage):
 
     Args:
         options: which boards, and what is wrong with them.
-        log: takes the :mod:`.events`; a list will do.
+        log: takes the :mod:`skinware_drivers.virtual.events`; a list will do.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; the 12
             values 0-255 that it returns go on the wire instead of what the pattern feels. Flags stay true.
     """
@@ -95,7 +96,7 @@ class EmulatedRoboskin(Stage):
 
     def power_up(self, now_ns: int) -> Sequence[Actor]:
         """Make the boards and whatever else is on the bus."""
-        from skinware_drivers.virtual.patch import make_boards, make_foreign_traffic
+        from skinware_drivers.virtual.roboskin.patch import make_boards, make_foreign_traffic
 
         options = self._options
         self._boards = make_boards(options, self.wire, self.log, self.counts, self._source, now_ns)

@@ -1,0 +1,126 @@
+"""Options as people write them: texts of bus queries and command lines become typed, checked structs, and back.
+
+Lists are written with commas, whole numbers also as ranges: ``7,8,9`` or ``7-9``; and any of them as ``0x710``.
+"""
+
+from __future__ import annotations
+
+import re
+import types
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import msgspec.structs
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.options.names import nearest_name
+
+OptionsT = TypeVar("OptionsT", bound=msgspec.Struct)
+
+_HEXADECIMAL = re.compile(r"0[xX][0-9a-fA-F]+")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+_LONGEST_RANGE = 1 << 16
+_ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "str": "a text"}
+
+
+def options_from_strings(options_class: type[OptionsT], strings: Mapping[str, str]) -> OptionsT:
+    """Make options from ``key=value`` texts.
+
+    Args:
+        options_class: the struct to make.
+        strings: texts by option name. A yes/no option with an empty text is on.
+
+    Raises:
+        ConfigurationError: an option is unknown (the message gives the nearest right name), missing, or its
+            text is not what the option takes.
+    """
+    fields = {field.encode_name: field for field in msgspec.structs.fields(options_class)}
+    hints = get_type_hints(options_class, include_extras=True)
+    values: dict[str, Any] = {}
+    for name, text in strings.items():
+        if name not in fields:
+            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, fields)}")
+        hint = hints[fields[name].name]
+        try:
+            values[fields[name].name] = msgspec.convert(_split(text, plain_type(hint)), hint, strict=False)
+        except (msgspec.ValidationError, ValueError) as error:
+            raise ConfigurationError(f"option {name}={text}: {_reason(error)}") from None
+    for name, field in fields.items():
+        if field.required and field.name not in values:
+            raise ConfigurationError(f"option {name!r} must be given")
+    return options_class(**values)
+
+
+def check_options(options: msgspec.Struct) -> None:
+    """Hold every field against its type and limits; for ``__post_init__``, which msgspec's limits do not reach.
+
+    Raises:
+        ConfigurationError: a field has a value that its annotation does not allow.
+    """
+    hints = get_type_hints(type(options), include_extras=True)
+    for field in msgspec.structs.fields(type(options)):
+        value = getattr(options, field.name)
+        try:
+            msgspec.convert(value, hints[field.name])
+        except msgspec.ValidationError as error:
+            message = f"option {field.encode_name}={option_text(value)}: {_reason(error)}"
+            raise ConfigurationError(message) from None
+
+
+def option_text(value: Any) -> str:
+    """A value as a person would write it in a bus query: ``7,8``, ``yes``, ``0.01``."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return ""
+    if isinstance(value, list | tuple):
+        return ",".join(option_text(item) for item in value)
+    return str(value)
+
+
+def plain_type(hint: Any) -> Any:
+    """The type under ``Annotated`` and beside ``None``."""
+    if get_origin(hint) is Annotated:
+        return plain_type(get_args(hint)[0])
+    if get_origin(hint) in (Union, types.UnionType):
+        others = [other for other in get_args(hint) if other is not type(None)]
+        return plain_type(others[0]) if len(others) == 1 else hint
+    return hint
+
+
+def _split(text: str, plain: Any) -> Any:
+    """A text as msgspec can convert it: lists split, ranges of whole numbers written out, words for yes and no."""
+    if plain is bool:
+        word = text.strip().lower()
+        return {"": True, "yes": True, "on": True, "no": False, "off": False}.get(word, word)
+    if plain is int:
+        return _number(text.strip())
+    if get_origin(plain) not in (list, tuple):
+        return text.strip()
+    items = [item.strip() for item in text.split(",") if item.strip()]
+    if plain_type(get_args(plain)[0]) is not int:
+        return items
+    numbers: list[str | int] = []
+    for item in items:
+        match = _RANGE.fullmatch(item)
+        if match is None:
+            numbers.append(_number(item))
+            continue
+        first, last = int(match[1]), int(match[2])
+        if not 0 <= last - first < _LONGEST_RANGE:
+            raise ValueError(f"the range {item} does not go upwards, or is too long")
+        numbers.extend(range(first, last + 1))
+    return numbers
+
+
+def _number(text: str) -> str | int:
+    """A whole number that is written as 0x710 too."""
+    return int(text, 16) if _HEXADECIMAL.fullmatch(text) else text
+
+
+def _reason(error: Exception) -> str:
+    """What msgspec says, in words for people, without its path to a value that the message already names."""
+    text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
+    asked = re.compile(r"Expected `(\w+)(.*?)`(?:, got `\w+`)?")
+    return asked.sub(lambda match: f"give {_ASKED.get(match[1], match[1])}{match[2]}", text).replace("`", "")

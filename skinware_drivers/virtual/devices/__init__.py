@@ -1,0 +1,1 @@
+"""The devices that emulators ship for, one file each; each says only what is its own."""

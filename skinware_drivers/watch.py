@@ -1,0 +1,33 @@
+"""A driver's look at every update, for what the wire alone does not call doubtful."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.status import Status
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.description import SkinTables
+
+
+class Watch:
+    """Looks at every update of all buses, to mark values that the wire alone does not call doubtful.
+
+    Attributes:
+        module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
+    """
+
+    def __init__(self, tables: SkinTables) -> None:
+        self.tables = tables
+        self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
+
+    def look(self, updates: Updates) -> None:
+        """Called with updates that were just shown, if the wire may have flagged one of them."""
+
+    def suspect(self, patch: int) -> None:
+        """Called when a patch reports an error."""
+        self.module_status[self.tables.structure.module_patch == patch] |= np.uint8(Status.SUSPECT)
+
+    def forget(self, patch: int) -> None:
+        """Called when a patch was set up anew, or reports no error any more: what was held against it is over."""
+        self.module_status[self.tables.structure.module_patch == patch] = 0

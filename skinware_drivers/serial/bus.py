@@ -16,7 +16,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.framing import Encoding, Framed, Framer, Framing, Unframed
+from skinware_drivers.serial.framing import Encoding, Framed, Framer, Framing, Unframed, fill_rows
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
 from skinware_drivers.serial.ports import Port, PtyPort
 
@@ -70,7 +70,7 @@ class SerialBus(Bus):
         self._event = -1
         self._woken = False
         self._unsent = b""
-        self._backlog: list[tuple[Framed, npt.NDArray[np.int64]]] = []
+        self._backlog: list[tuple[list[Framed], npt.NDArray[np.int64]]] = []
         self._framer: Framer = self._framing.framer()
         self._reads: list[tuple[int, int]] = []
         self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
@@ -131,7 +131,7 @@ class SerialBus(Bus):
             framed, time_ns = self._backlog[0]
             count = min(len(framed), batch.free)
             rows = slice(batch.stop, batch.stop + count)
-            framed[:count].copy_to(batch.wire[rows])
+            fill_rows(batch.wire[rows], framed[:count])
             batch.time_ns[rows], batch.bus[rows] = time_ns[:count], ordinal
             batch.stop += count
             taken += count
@@ -201,13 +201,10 @@ class SerialBus(Bus):
         framed = framer.feed(chunk)
         self.counters.errors += counters.checksum_errors + counters.refused - damaged
         self._reads.append((framer.position, time_ns))
-        if len(framed):
-            fits = framed.length <= self.payload_size
-            if not fits.all():
-                self.counters.refused += int((~fits).sum())
-                framed = framed[fits]
-        if len(framed):
-            self._backlog.append((framed, self._times(framed, known, time_ns)))
+        fitting = [frame for frame in framed if len(frame.body) <= self.payload_size]
+        self.counters.refused += len(framed) - len(fitting)
+        if fitting:
+            self._backlog.append((fitting, self._times(fitting, known, time_ns)))
         self._forget_reads()
         if time_ns > self._told_ns + _SPAN_NS:
             self._tell_garbled(time_ns)
@@ -218,12 +215,12 @@ class SerialBus(Bus):
         self._is_garbled = now.skipped_bytes - before.skipped_bytes > now.frame_bytes - before.frame_bytes
         self._told, self._told_ns = replace(now), time_ns
 
-    def _times(self, framed: Framed, known: int, time_ns: int) -> npt.NDArray[np.int64]:
+    def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
         """(n,) int64 ns: when the last byte of each frame was read."""
-        if int(framed.end[0]) > known:
+        if framed[0].end > known:
             return np.full(len(framed), time_ns)
         ends, times = zip(*self._reads, strict=True)  # some were held back behind a false beginning
-        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, framed.end)]
+        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
         return found
 
     def _forget_reads(self) -> None:

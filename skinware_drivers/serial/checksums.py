@@ -1,8 +1,4 @@
-"""Checksums of frames: exclusive or, sums and cyclic redundancy checks, of one frame or of many at once.
-
-A cyclic redundancy check is linear: that of a frame is the exclusive or of what each of its bytes contributes, which
-depends on nothing but the byte and its distance from the end. So one table lookup per byte serves all frames of a
-buffer at once, and no byte waits for the one before it.
+"""Checksums of frames: exclusive or, sums and cyclic redundancy checks.
 
 The parameters of a CRC are those of the usual catalogues (width, polynomial, initial value, reflected input and
 output, final exclusive or) and can be checked with its value for ``b"123456789"``.
@@ -13,22 +9,14 @@ from __future__ import annotations
 import binascii
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
-
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.gather import Bytes, Indices, by_width, flush_right, windows
 
-Words = npt.NDArray[np.uint32]
 Order = Literal["little", "big"]
-
-_BLOCK = 64  # bytes whose contributions are looked up in one table
-_LONG = 256  # bytes; from here on a call per frame, where the standard library has one, beats lookups for all
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,29 +37,6 @@ class Checksum(ABC):
     @abstractmethod
     def of(self, data: bytes) -> int:
         """Of one piece of data."""
-
-    @abstractmethod
-    def of_rows(self, rows: Bytes, length: Indices) -> Words:
-        """Of the last ``length`` bytes of each row; those before them are zero."""
-
-    def of_many(self, data: Bytes, start: Indices, stop: Indices) -> Words:
-        """(n,) uint32 of the bytes from each start to each stop, of which none is before the start.
-
-        ``data`` begins at least as many bytes before the first piece as the longest piece has.
-        """
-        length = stop - start
-        sums = np.zeros(len(start), np.uint32)
-        for group, width in by_width(length):
-            sums[group] = self.of_rows(flush_right(data, stop[group], length[group], width), length[group])
-        return sums
-
-    def read_many(self, data: Bytes, at: Indices) -> Words:
-        """(n,) uint32 as sent, at each position."""
-        columns = windows(data, at, self.size).T.astype(np.uint32)
-        value: Words = np.zeros(len(at), np.uint32)
-        for column in columns if self.order == "big" else columns[::-1]:
-            value = value << np.uint32(8) | column
-        return value
 
     def to_bytes(self, data: bytes) -> bytes:
         """As it is sent for some data."""
@@ -100,11 +65,6 @@ class Xor(Checksum):
             value ^= byte
         return value
 
-    def of_rows(self, rows: Bytes, length: Indices) -> Words:  # noqa: ARG002
-        """Of the last ``length`` bytes of each row."""
-        value: Words = np.bitwise_xor.reduce(rows, axis=1, dtype=np.uint8, initial=self.init).astype(np.uint32)
-        return value
-
 
 @dataclass(frozen=True, kw_only=True)
 class Sum(Checksum):
@@ -129,12 +89,6 @@ class Sum(Checksum):
         """Of one piece of data."""
         value = self.init + sum(data)
         return (-value if self.negative else value) & ((1 << self.width) - 1)
-
-    def of_rows(self, rows: Bytes, length: Indices) -> Words:  # noqa: ARG002
-        """Of the last ``length`` bytes of each row."""
-        value = rows.sum(axis=1, dtype=np.int64) + self.init
-        sums: Words = ((-value if self.negative else value) & ((1 << self.width) - 1)).astype(np.uint32)
-        return sums
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,25 +127,7 @@ class Crc(Checksum):
         """Of one piece of data."""
         if self.native is not None:
             return self.native(data)
-        if len(data) > _LONG:
-            row = np.frombuffer(data, np.uint8)[None]
-            return int(self.of_rows(row, np.array([len(data)]))[0])
         return self._finish(self._after(data, self._first_state))
-
-    def of_rows(self, rows: Bytes, length: Indices) -> Words:
-        """Of the last ``length`` bytes of each row; those before them are zero."""
-        state = self._state_after_zeros(int(length.max(initial=0)))[length]
-        if rows.size:
-            state ^= self._contribution(rows)
-        return self._finish_many(state)
-
-    def of_many(self, data: Bytes, start: Indices, stop: Indices) -> Words:
-        """(n,) uint32 of the bytes from each start to each stop."""
-        native = self.native
-        if native is None or int((stop - start).sum()) < _LONG * len(start):
-            return super().of_many(data, start, stop)
-        view = data.data
-        return np.array([native(view[a:b]) for a, b in zip(start.tolist(), stop.tolist(), strict=True)], np.uint32)
 
     @cached_property
     def native(self) -> Callable[[bytes | memoryview], int] | None:
@@ -234,87 +170,10 @@ class Crc(Checksum):
             state = (state << 8 & mask) ^ table[(state >> shift ^ byte) & 0xFF]
         return state
 
-    def _step(self, state: int, byte: int) -> int:
-        return self._after(bytes([byte]), state)
-
     def _finish(self, state: int) -> int:
         if self.reflected_in != self.reflected_out:
             state = _reversed(state, self.width)
         return state ^ self.xor_out
-
-    def _finish_many(self, state: Words) -> Words:
-        if self.reflected_in != self.reflected_out:
-            bits = [
-                (state >> np.uint32(bit) & np.uint32(1)) << np.uint32(self.width - 1 - bit) for bit in range(self.width)
-            ]
-            state = np.bitwise_or.reduce(bits)
-        return state ^ np.uint32(self.xor_out)
-
-    # Many at once
-
-    def _contribution(self, rows: Bytes) -> Words:
-        """What the bytes of each row contribute: blocks first, then pairs of blocks, pairs of pairs ..."""
-        n, width = rows.shape
-        blocks = 1 << (-(-width // _BLOCK) - 1).bit_length()
-        if blocks > 1:
-            whole = np.zeros((n, blocks * _BLOCK), np.uint8)
-            whole[:, blocks * _BLOCK - width :] = rows
-            rows, width = whole.reshape(n * blocks, _BLOCK), _BLOCK
-        columns = np.ascontiguousarray(rows.T)  # numpy would keep their order otherwise, which costs four times as much
-        columns_at = columns + (np.arange(_BLOCK - width, _BLOCK)[:, None] << 8)
-        state: Words = np.bitwise_xor.reduce(self._block_table.take(columns_at), axis=0).astype(np.uint32)
-        level = 0
-        while len(state) > n:
-            state = self._after_blocks(state[0::2], level) ^ state[1::2]
-            level += 1
-        return state
-
-    @cached_property
-    def _block_table(self) -> npt.NDArray[np.uint16] | Words:
-        """(block * 256,): contribution of each byte value, by place in a block."""
-        table = np.zeros((_BLOCK, 256), np.uint16 if self.width <= 16 else np.uint32)
-        basis = [self._step(0, 1 << bit) for bit in range(8)]
-        for place in range(_BLOCK - 1, -1, -1):
-            table[place] = _spanned(basis)
-            basis = [self._step(state, 0) for state in basis]
-        return table.ravel()
-
-    def _after_blocks(self, state: Words, level: int) -> Words:
-        """What 2**level blocks of zeros make of each register."""
-        tables = self._zero_tables
-        while len(tables) <= level:  # twice as many zeros: the table applied to itself
-            step = tables[-1]
-            tables.append([self._look_up(step, table) for table in step])
-        return self._look_up(tables[level], state)
-
-    @staticmethod
-    def _look_up(tables: list[Words], state: Words) -> Words:
-        after: Words = tables[0][state & 0xFF]
-        for number, table in enumerate(tables[1:], 1):
-            after = after ^ table[state >> np.uint32(8 * number) & 0xFF]
-        return after
-
-    @cached_property
-    def _zero_tables(self) -> list[list[Words]]:
-        """For 1, 2, 4 ... blocks of zeros and each byte of the register: what they make of it."""
-        tables = []
-        for low in range(0, self.width, 8):
-            basis = [1 << bit if bit < self.width else 0 for bit in range(low, low + 8)]
-            for _ in range(_BLOCK):
-                basis = [self._step(state, 0) for state in basis]
-            tables.append(np.array(_spanned(basis), np.uint32))
-        return [tables]
-
-    @cached_property
-    def _after_zeros(self) -> list[int]:
-        return [self._first_state]
-
-    def _state_after_zeros(self, most: int) -> Words:
-        """(at least most + 1,): the register after so many bytes of zeros, to which the contributions add."""
-        known = self._after_zeros
-        while len(known) <= most:
-            known.append(self._step(known[-1], 0))
-        return np.array(known[: most + 1], np.uint32)
 
 
 class _WeissCrc(Crc):
@@ -349,14 +208,6 @@ def _reflected_table(crc: Crc) -> list[int]:
 
 def _reversed(value: int, width: int) -> int:
     return int(f"{value:0{width}b}"[::-1], 2)
-
-
-def _spanned(basis: Sequence[int]) -> list[int]:
-    """All 256 sums of eight vectors over the field of two elements."""
-    values = [0]
-    for vector in basis:
-        values += [value ^ vector for value in values]
-    return values
 
 
 XOR = Xor()

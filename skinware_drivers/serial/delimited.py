@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
-import numpy as np
-
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.checksums import Checksum
-from skinware_drivers.serial.framing import NOTHING, Field, Framed, Framer, Framing, check_body
+from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
 from skinware_drivers.serial.stuffing import Stuffing
 
 
@@ -88,38 +86,27 @@ class DelimitedFramer(Framer):
         self._shortest = framing.minimum_body + framing.overhead
         self._longest = framing.maximum_body + framing.overhead
         self._longest_segment = framing.stuffing.longest(self._longest)
-        self._padding = bytes(self._longest_segment + 8)
         self._delimiter = bytes([framing.stuffing.delimiter])
         trusts_first = framing.checksum is not None if framing.trusts_first is None else framing.trusts_first
         self._decode = framing.stuffing.decode
         self._checksum_size = framing.checksum.size if framing.checksum is not None else 0
         self._discarding = not trusts_first  # everything up to the next delimiter
 
-    def _find_few(self, stream: bytes) -> tuple[Framed, int]:
+    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         *segments, rest = stream.split(self._delimiter)
         ends = list(accumulate([len(segment) + 1 for segment in segments], initial=self._before))
         if self._discarding and segments:
             self._discarding = False
             self.counters.skipped_bytes += len(segments[0]) + 1
-            segments[0] = b""
-            ends[0] = -1
-        found = [
-            (content, begin, end)
-            for segment, (begin, end) in zip(segments, pairwise(ends), strict=True)
-            if begin >= 0 and (content := self._content(segment)) is not None
-        ]
-        done = len(stream) - self._keep(len(rest))
-        if not found:
-            return NOTHING, done
-        self.counters.frame_bytes += sum([end - begin for _, begin, end in found])
-        framing, first = self._framing, self._framing.body_start
-        field = framing.identifier
-        framed = Framed.of_bodies(
-            [content[first:] for content, _, _ in found],
-            [0] * len(found) if field is None else [field.of(content) for content, _, _ in found],
-            [end for _, _, end in found],
-        )
-        return framed, done
+            del segments[0], ends[0]
+        first, field = self._framing.body_start, self._framing.identifier
+        found: list[Framed] = []
+        for segment, (begin, end) in zip(segments, pairwise(ends), strict=True):
+            content = self._content(segment)
+            if content is not None:
+                self.counters.frame_bytes += end - begin
+                found.append(Framed(0 if field is None else field.of(content), content[first:], end))
+        return found, len(stream) - self._keep(len(rest))
 
     def _content(self, segment: bytes) -> bytes | None:
         """Header and body of a segment; None, and counted, if it is no frame."""
@@ -140,49 +127,6 @@ class DelimitedFramer(Framer):
             self.counters.refused += 1
         self.counters.skipped_bytes += len(segment) + 1
         return None
-
-    def _find_many(self, stream: bytes) -> tuple[Framed, int]:
-        counters, framing = self.counters, self._framing
-        data = np.frombuffer(b"".join((self._padding, stream, self._padding)), np.uint8)
-        begin = len(self._padding)
-        segment_stop = np.flatnonzero(data[begin : begin + len(stream)] == framing.stuffing.delimiter) + begin
-        if not len(segment_stop):
-            return NOTHING, len(stream) - self._keep(len(stream))
-        segment_start = np.concatenate([[begin], segment_stop[:-1] + 1])
-        rest = begin + len(stream) - int(segment_stop[-1]) - 1
-        if self._discarding:
-            self._discarding = False
-            segment_start, segment_stop = segment_start[1:], segment_stop[1:]
-        frame_bytes, idle_bytes = 0, 0
-        size = segment_stop - segment_start
-        fits = size <= self._longest_segment
-        if not fits.all():
-            counters.refused += int((~fits).sum())
-            segment_start, segment_stop = segment_start[fits], segment_stop[fits]
-        data, start, stop, right = framing.stuffing.decode_many(data, segment_start, segment_stop)
-        size = stop - start
-        fits = right & (size >= self._shortest) & (size <= self._longest)
-        if not fits.all():
-            idle = right & (size == 0) & (self._shortest > 0)
-            idle_bytes = int((segment_stop - segment_start + 1)[idle].sum())
-            counters.refused += int((~fits & ~idle).sum())
-            segment_start, segment_stop = segment_start[fits], segment_stop[fits]
-            start, stop = start[fits], stop[fits]
-        if framing.checksum is not None and len(start):
-            stop = stop - framing.checksum.size
-            good = framing.checksum.read_many(data, stop) == framing.checksum.of_many(data, start, stop)
-            if not good.all():
-                counters.checksum_errors += int((~good).sum())
-                segment_start, segment_stop = segment_start[good], segment_stop[good]
-                start, stop = start[good], stop[good]
-        frame_bytes = int((segment_stop - segment_start + 1).sum())
-        counters.frame_bytes += frame_bytes
-        counters.idle_bytes += idle_bytes
-        counters.skipped_bytes += len(stream) - rest - frame_bytes - idle_bytes
-        identifier = framing.identifier.of_many(data, start) if framing.identifier is not None else start * 0
-        body = start + framing.body_start
-        found = Framed(data, body, stop - body, identifier, segment_stop + (1 - begin + self._before))
-        return found, len(stream) - self._keep(rest)
 
     def _keep(self, rest: int) -> int:
         """How many of the bytes behind the last delimiter are kept; none of a frame that is too long already."""

@@ -8,8 +8,7 @@ A :class:`Framing` is a declaration: how frames lie in a stream, and which part 
   ``bytes_in == frame_bytes + idle_bytes + skipped_bytes + framer.pending``.
 * What is held back is bounded by the longest frame of the declaration.
 
-Few bytes are looked through frame by frame in plain Python, many with numpy for all frames together: what pays
-is told by ``MANY_BYTES``. Both ways find the same frames.
+Frames are looked for one by one, in plain Python over ``bytes`` methods: docs/decisions/0009 says why.
 """
 
 from __future__ import annotations
@@ -18,16 +17,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.counters import FramerCounters
-from skinware_drivers.serial.gather import Bytes, Indices, copy_rows
-
-MANY_BYTES = 2048
-"""From here on numpy is faster than plain Python, also when neither is in the processor's caches."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +52,6 @@ class Field:
             return frame[start + self.offset] & self.mask
         return int.from_bytes(frame[start + self.offset : start + self.end], self.order) & self.mask
 
-    def of_many(self, data: Bytes, start: Indices) -> Indices:
-        """(n,) int64: its value in the frames that begin at each start."""
-        value = np.zeros(len(start), np.int64)
-        places = range(self.offset, self.end)
-        for place in places if self.order == "big" else reversed(places):
-            value = value << 8 | data[start + place]
-        return value & self.mask
-
     def put(self, frame: bytearray, value: int) -> None:
         """Write its value into the frame; the bits outside the mask stay.
 
@@ -78,52 +65,27 @@ class Field:
         frame[self.offset : self.end] = (kept | value).to_bytes(self.size, self.order)
 
 
-@dataclass(frozen=True)
-class Framed:
-    """Frames that were found, in the order of the stream.
+class Framed(NamedTuple):
+    """A frame that was found.
 
     Attributes:
-        data: the bytes that the bodies lie in; behind the last body it goes on for the length of the longest.
-        start: (n,) int64, where each body begins in ``data``.
-        length: (n,) int64, bytes of each body.
-        identifier: (n,) int64.
-        end: (n,) int64, bytes of the stream up to the end of the frame.
+        identifier: number that tells kinds of frame apart; 0 where the framing has none.
+        body: what it carries.
+        end: bytes of the stream up to the end of the frame.
     """
 
-    data: Bytes
-    start: Indices
-    length: Indices
-    identifier: Indices
-    end: Indices
-
-    def __len__(self) -> int:
-        return len(self.start)
-
-    def __getitem__(self, part: slice | npt.NDArray[np.bool_]) -> Framed:
-        return Framed(self.data, self.start[part], self.length[part], self.identifier[part], self.end[part])
-
-    def copy_to(self, wire: npt.NDArray[np.void]) -> None:
-        """Fill (n,) rows of a batch; their payloads are long enough."""
-        wire["identifier"] = self.identifier
-        wire["length"] = self.length
-        copy_rows(self.data, self.start, self.length, wire["payload"])
-
-    def bodies(self) -> list[bytes]:
-        """The body of every frame."""
-        return [self.data[a : a + n].tobytes() for a, n in zip(self.start.tolist(), self.length.tolist(), strict=True)]
-
-    @classmethod
-    def of_bodies(cls, bodies: Sequence[bytes], identifier: Sequence[int], end: Sequence[int]) -> Framed:
-        """Frames that were found one by one."""
-        sizes = [len(body) for body in bodies]
-        data = np.frombuffer(b"".join((*bodies, bytes(max(sizes)))), np.uint8)
-        table = np.array([[0, *accumulate(sizes[:-1])], sizes, identifier, end], np.int64)
-        return cls(data, *table)
+    identifier: int
+    body: bytes
+    end: int
 
 
-_NONE = np.zeros(0, np.int64)
-NOTHING = Framed(np.zeros(0, np.uint8), _NONE, _NONE, _NONE, _NONE)
-"""No frame at all."""
+def fill_rows(wire: npt.NDArray[np.void], frames: Sequence[Framed]) -> None:
+    """Fill (n,) rows of a batch with frames whose bodies fit into their payloads."""
+    width = wire["payload"].shape[1]
+    wire["identifier"] = [frame.identifier for frame in frames]
+    wire["length"] = [len(frame.body) for frame in frames]
+    payloads = b"".join([frame.body.ljust(width, b"\0") for frame in frames])
+    wire["payload"] = np.frombuffer(payloads, np.uint8).reshape(len(frames), width)
 
 
 class Encoding(ABC):
@@ -175,27 +137,23 @@ class Framer(ABC):
         """Bytes that may still become part of a frame."""
         return len(self._rest)
 
-    def feed(self, chunk: bytes) -> Framed:
-        """Take the next bytes of the stream; gives the frames that they complete."""
+    def feed(self, chunk: bytes) -> list[Framed]:
+        """Take the next bytes of the stream; gives the frames that they complete, in the order of the stream."""
         self.counters.bytes_in += len(chunk)
         stream = self._rest + chunk if self._rest else chunk
         if len(stream) < self._wanted:
             self._rest = stream
-            return NOTHING
+            return []
         self._wanted = 0
-        found, done = self._find_many(stream) if len(stream) >= MANY_BYTES else self._find_few(stream)
+        found, done = self._find(stream)
         self._rest = stream[done:]
         self._before += done
         self.counters.frames += len(found)
         return found
 
     @abstractmethod
-    def _find_few(self, stream: bytes) -> tuple[Framed, int]:
-        """The frames of a stream, one by one, and how many of its bytes are done with (and counted)."""
-
-    @abstractmethod
-    def _find_many(self, stream: bytes) -> tuple[Framed, int]:
-        """The same, all at once."""
+    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
+        """The frames of a stream, and how many of its bytes are done with (and counted)."""
 
 
 @dataclass(frozen=True)
@@ -222,13 +180,12 @@ class _Pieces(Framer):
         super().__init__()
         self._size = size
 
-    def _find_few(self, stream: bytes) -> tuple[Framed, int]:
+    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         self.counters.frame_bytes += len(stream)
         pieces = [stream[at : at + self._size] for at in range(0, len(stream), self._size)]
-        ends = [self._before + min(at + self._size, len(stream)) for at in range(0, len(stream), self._size)]
-        return Framed.of_bodies(pieces, [0] * len(pieces), ends) if pieces else NOTHING, len(stream)
-
-    _find_many = _find_few
+        ends = accumulate(map(len, pieces), initial=self._before)
+        next(ends)
+        return [Framed(0, piece, end) for piece, end in zip(pieces, ends, strict=True)], len(stream)
 
 
 def check_body(identifier: int, payload: bytes, field: Field | None, minimum: int, maximum: int) -> None:

@@ -1,14 +1,17 @@
-"""Frames that begin with a known pattern and say, or are known to have, a length: how they are declared and sent."""
+"""Frames that begin with a known pattern and say, or are known to have, a length."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.checksums import Checksum
-from skinware_drivers.serial.framing import Field, Framer, Framing, check_body
+from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
+
+_GOOD, _REFUSED, _INCOMPLETE = range(3)
 
 Pattern = Sequence[int | Collection[int]]
 """What each byte is, or which values it can have."""
@@ -140,8 +143,6 @@ class Packet(Framing):
 
     def framer(self) -> Framer:
         """Something to feed a stream to."""
-        from skinware_drivers.serial.packet_framer import PacketFramer  # which needs what is declared here
-
         return PacketFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
@@ -200,4 +201,124 @@ def _first(pattern: Pattern) -> bytes:
     return bytes(values_of(what)[0] for what in pattern)
 
 
-__all__ = ["Length", "LengthTable", "Packet", "Pattern", "values_of"]
+class PacketFramer(Framer):
+    """Finds the frames of a stream by their beginnings."""
+
+    def __init__(self, framing: Packet) -> None:
+        super().__init__()
+        self._framing = framing
+        self._begin = re.compile(_prefixes([values_of(what) for what in framing.sync]), re.DOTALL)
+        self._whole_sync = re.compile(b"".join(_one_of(values_of(what)) for what in framing.sync), re.DOTALL)
+        self._whole_trailer = re.compile(b"".join(_one_of(values_of(what)) for what in framing.trailer), re.DOTALL)
+        self._known_from = len(framing.sync)  # bytes from which on the length is known
+        if isinstance(framing.length, Length):
+            self._known_from = max(self._known_from, framing.length.field.end)
+        elif isinstance(framing.length, LengthTable):
+            self._known_from = max(self._known_from, framing.length.offset + 1)
+        self._look_ahead = 0
+        if framing.confirmed:
+            self._look_ahead = framing.longest if framing.trailer else len(framing.sync)
+        self._bare = framing.checksum.size if framing.bare_when_empty and framing.checksum else 0
+        self._checksum_at = framing.checksum_place(0)  # from the end, if negative
+        self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end
+        self._confirms_each = framing.confirmed == "each"
+        self._follows_at = -1  # place in the stream at which a frame would follow the last one at once
+
+    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
+        found: list[tuple[int, int, bool]] = []
+        done = self._search(stream, 0, found)
+        framing, field = self._framing, self._framing.identifier
+        first, behind, bare = framing.body_start, framing.behind, self._bare
+        return [
+            Framed(
+                0 if field is None else field.of(stream, place),
+                stream[place + first : place + total - behind + (bare if is_bare else 0)],
+                self._before + place + total,
+            )
+            for place, total, is_bare in found
+        ], done
+
+    def _search(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
+        """Judge what may be a beginning, from ``place`` on, until one cannot be judged yet; gives its place."""
+        counters, size = self.counters, len(stream)
+        while True:
+            match = self._begin.search(stream, place)
+            begin = size if match is None else match.start()
+            counters.skipped_bytes += begin - place
+            place = begin
+            if size - place < self._known_from or place == size:
+                return place
+            total, is_bare = self._total(stream, place)
+            follows = not self._look_ahead or (not self._confirms_each and self._before + place == self._follows_at)
+            if total:
+                if size - place < total:
+                    self._wanted = total
+                    return place
+                form = self._form(stream, place, total, follows)
+                if form == _INCOMPLETE:
+                    self._wanted = total + self._look_ahead
+                    return place
+                if form == _GOOD:
+                    if is_bare or self._has_checksum(stream, place, total):
+                        counters.frame_bytes += total
+                        found.append((place, total, is_bare))
+                        place += total
+                        self._follows_at = self._before + place
+                        continue
+                    counters.checksum_errors += 1
+                else:
+                    counters.refused += 1
+            else:
+                counters.refused += 1
+            counters.skipped_bytes += 1
+            place += 1
+
+    def _total(self, stream: bytes, place: int) -> tuple[int, bool]:
+        """Bytes of the frame that begins here, 0 if it cannot be; and whether it has no checksum."""
+        framing = self._framing
+        if isinstance(framing.length, int):
+            return framing.length, False
+        if isinstance(framing.length, LengthTable):
+            total, is_bare = framing.length.total.get(stream[place + framing.length.offset], 0), False
+        else:
+            says = framing.length.field.of(stream, place)
+            is_bare = says == 0 and self._bare > 0
+            total = says + framing.length.more - (self._bare if is_bare else 0)
+        return (total if framing.shortest <= total <= framing.longest else 0), is_bare
+
+    def _form(self, stream: bytes, place: int, total: int, follows: bool) -> int:
+        """Whether the frame ends as it should and, if it must, is followed by another."""
+        n = len(self._framing.trailer)
+        if n and not self._whole_trailer.match(stream, place + total - n):
+            return _REFUSED
+        if follows:
+            return _GOOD
+        if len(stream) - place < total + self._look_ahead:
+            return _INCOMPLETE
+        if not self._whole_sync.match(stream, place + total):
+            return _REFUSED
+        return _GOOD if not n or self._whole_trailer.match(stream, place + 2 * total - n) else _REFUSED
+
+    def _has_checksum(self, stream: bytes, place: int, total: int) -> bool:
+        checksum = self._framing.checksum
+        if checksum is None:
+            return True
+        end = place + total
+        at = (end if self._checksum_at < 0 else place) + self._checksum_at
+        covered = stream[place + self._covered_from : end + self._covered_to]
+        return checksum.of(covered) == int.from_bytes(stream[at : at + checksum.size], checksum.order)
+
+
+def _one_of(values: Sequence[int]) -> bytes:
+    return b"[" + b"".join(re.escape(bytes([value])) for value in values) + b"]"
+
+
+def _prefixes(pattern: Sequence[Sequence[int]]) -> bytes:
+    """Regular expression of the pattern, or of its beginning at the end of the stream."""
+    if not pattern:
+        return b""
+    rest = _prefixes(pattern[1:])
+    return _one_of(pattern[0]) + (b"(?:\\Z|" + rest + b")" if rest else b"")
+
+
+__all__ = ["Length", "LengthTable", "Packet", "PacketFramer", "Pattern"]

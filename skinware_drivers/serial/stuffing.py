@@ -8,30 +8,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import NamedTuple
-
-import numpy as np
-import numpy.typing as npt
-
-from skinware_drivers.serial.gather import Bytes, Indices
-
-_FEW_FRAMES = 64  # so many are followed one by one: the others of a buffer are done with
-
-
-class Unstuffed(NamedTuple):
-    """Many frames, decoded.
-
-    Attributes:
-        data: buffer that they lie in.
-        start: (n,) first byte of each.
-        stop: (n,) one past its last byte.
-        right: (n,) bool; the others have a form that cannot be.
-    """
-
-    data: Bytes
-    start: Indices
-    stop: Indices
-    right: npt.NDArray[np.bool_]
 
 
 class Stuffing(ABC):
@@ -54,16 +30,6 @@ class Stuffing(ABC):
     @abstractmethod
     def decode(self, segment: bytes) -> bytes | None:
         """What a segment between delimiters says; None: it has a form that cannot be."""
-
-    @abstractmethod
-    def decode_many(self, data: Bytes, start: Indices, stop: Indices) -> Unstuffed:
-        """What many segments say.
-
-        Args:
-            data: the buffer; before the first segment and behind the last it goes on with zeros.
-            start: (n,) first byte of each, ascending.
-            stop: (n,) where its delimiter is.
-        """
 
 
 class Lines(Stuffing):
@@ -88,11 +54,6 @@ class Lines(Stuffing):
     def decode(self, segment: bytes) -> bytes:
         """The line without its carriage return."""
         return segment.removesuffix(b"\r")
-
-    def decode_many(self, data: Bytes, start: Indices, stop: Indices) -> Unstuffed:
-        """The lines without their carriage returns."""
-        stop = stop - ((data[stop - 1] == 0x0D) & (stop > start))
-        return Unstuffed(data, start, stop, np.ones(len(start), bool))
 
 
 class Cobs(Stuffing):
@@ -135,35 +96,6 @@ class Cobs(Stuffing):
                 parts.append(b"\0")
         return b"".join(parts) if place == size else None
 
-    def decode_many(self, data: Bytes, start: Indices, stop: Indices) -> Unstuffed:
-        """All segments together go from zero to zero, until few of them are left."""
-        decoded = data.copy()
-        right = np.ones(len(start), bool)
-        which, place, end = np.arange(len(start)), start, stop
-        dropped: list[Indices] = []
-        while len(which) > _FEW_FRAMES:
-            code = data[place]
-            place = place + code
-            right[which[place > end]] = False
-            goes_on = np.flatnonzero(place < end)
-            which, place, end, code = which[goes_on], place[goes_on], end[goes_on], code[goes_on]
-            decoded[place] = 0
-            dropped.append(place[code == 0xFF])
-        zeros: list[int] = []
-        no_zeros: list[int] = []
-        view = data.data
-        for number, at, stop_at in zip(which.tolist(), place.tolist(), end.tolist(), strict=True):
-            while at < stop_at:
-                code_here = view[at]
-                at += code_here
-                if at < stop_at:
-                    (no_zeros if code_here == 0xFF else zeros).append(at)
-            right[number] = at == stop_at
-        decoded[zeros] = 0
-        dropped.append(np.array(no_zeros, np.int64))
-        content_start = np.minimum(start + 1, stop)
-        return _without(decoded, np.sort(np.concatenate(dropped)), content_start, stop, right)
-
 
 class Escaped(Stuffing):
     """Some bytes are replaced by an escape byte and another byte.
@@ -190,10 +122,6 @@ class Escaped(Stuffing):
         self._opening = bytes([delimiter] * opening)
         self._sent = [(escape, sent[escape]), *((byte, code) for byte, code in sent.items() if byte != escape)]
         self._meaning = {code: byte for byte, code in {**(accepted or {}), **sent}.items()}
-        self._meaning_of = np.zeros(256, np.uint8)
-        self._is_meant = np.zeros(256, bool)
-        for code, byte in self._meaning.items():
-            self._meaning_of[code], self._is_meant[code] = byte, True
 
     def longest(self, size: int) -> int:
         """Every byte escaped."""
@@ -214,30 +142,6 @@ class Escaped(Stuffing):
                 return None
             parts += (bytes([self._meaning[part[0]]]), part[1:])
         return b"".join(parts)
-
-    def decode_many(self, data: Bytes, start: Indices, stop: Indices) -> Unstuffed:
-        """All escapes of the buffer together."""
-        right = np.ones(len(start), bool)
-        escape = np.flatnonzero(data[: stop[-1]] == self._escape) if len(stop) else start
-        if not len(escape):
-            return Unstuffed(data, start, stop, right)
-        code = data[escape + 1]
-        wrong = escape[~self._is_meant[code]]
-        right[np.searchsorted(stop, wrong)] = False
-        decoded = data.copy()
-        decoded[escape + 1] = self._meaning_of[code]
-        return _without(decoded, escape, start, stop, right)
-
-
-def _without(data: Bytes, dropped: Indices, start: Indices, stop: Indices, right: npt.NDArray[np.bool_]) -> Unstuffed:
-    """The same with some bytes (ascending) left out."""
-    if not len(dropped):
-        return Unstuffed(data, start, stop, right)
-    kept = np.ones(len(data), bool)
-    kept[dropped] = False
-    start = start - np.searchsorted(dropped, start)
-    stop = stop - np.searchsorted(dropped, stop)
-    return Unstuffed(data[kept], start, stop, right)
 
 
 LINES = Lines()

@@ -71,7 +71,7 @@ def decode_stream(adapter: SerialAdapter[Any], stream: str | bytes) -> Shown:
         stream: the bytes, or their hexadecimal digits.
     """
     framed = adapter.framing.framer().feed(_bytes(stream))
-    return decode_frames(adapter, list(zip(framed.identifier.tolist(), framed.bodies(), strict=True)))
+    return decode_frames(adapter, [(frame.identifier, frame.body) for frame in framed])
 
 
 def _bytes(data: str | bytes) -> bytes:

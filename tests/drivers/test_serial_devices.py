@@ -17,7 +17,6 @@ from skinware import DriverFrame, DriverReader, PatchState, Status
 from skinware.status import BusState
 from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.framing import MANY_BYTES
 from skinware_drivers.serial.skintalk import SkintalkDriver, SkintalkOptions
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver, TactileGloveOptions
 from skinware_drivers.testing.driving import EmulatedSkin, driving_lines
@@ -44,7 +43,7 @@ def is_fresh(frame: DriverFrame) -> bool:
 
 def found(driver: Any, stream: bytes) -> list[tuple[int, bytes]]:
     framed = driver.framing.framer().feed(stream)
-    return list(zip(framed.identifier.tolist(), framed.bodies(), strict=True))
+    return [(frame.identifier, frame.body) for frame in framed]
 
 
 def spoken(hardware: Any, duration_ms: int) -> bytes:
@@ -126,9 +125,8 @@ def test_flipped_bits_and_garbage_are_survived_and_accounted_for(driver: Any, ha
     del dirty[501:508]
     dirty[900:900] = rng.randbytes(300)
     whole, pieces = driver.framing.framer(), driver.framing.framer()
-    at_once = whole.feed(bytes(dirty)).bodies()
-    one_by_one = [body for i in range(0, len(dirty), 7) for body in pieces.feed(bytes(dirty[i : i + 7])).bodies()]
-    assert len(dirty) > MANY_BYTES
+    at_once = [frame.body for frame in whole.feed(bytes(dirty))]
+    one_by_one = [frame.body for i in range(0, len(dirty), 7) for frame in pieces.feed(bytes(dirty[i : i + 7]))]
     assert at_once == one_by_one
     counters = whole.counters
     assert counters == pieces.counters

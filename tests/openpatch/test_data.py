@@ -55,9 +55,7 @@ def test_of_a_damaged_stream_only_whole_messages_are_shown(samples: list[int], m
     found, rest = [], bytes(stream)
     while rest:
         size = more.draw(st.integers(1, 200))
-        found += [
-            (i, body) for f in [framer.feed(rest[:size])] for i, body in zip(f.identifier, f.bodies(), strict=True)
-        ]
+        found += [(frame.identifier, frame.body) for frame in framer.feed(rest[:size])]
         rest = rest[size:]
     assert all(identifier == 0x80 and body in sent for identifier, body in found)
     state = decoded(wire.Said(), found).state

@@ -52,7 +52,7 @@ class Talk:
         self.now_ns += duration_ms * MS
         framed = self.framer.feed(b"".join(frame.payload for frame in self.patch.emit(self.now_ns)))
         assert self.framer.counters.skipped_bytes == self.framer.pending == 0
-        return list(zip(framed.identifier.tolist(), framed.bodies(), strict=True))
+        return [(frame.identifier, frame.body) for frame in framed]
 
     def ask(self, request: int, *arguments: int) -> list[tuple[int, bytes]]:
         self.patch.receive(0, wire.frame(request, bytes((9, *arguments))), self.now_ns)

@@ -60,10 +60,7 @@ def test_the_drivers_framing_reads_and_makes_every_vector() -> None:
     for side in (host, patch):
         framer = OpenPatchDriver.framing.framer()
         found = framer.feed(b"".join(side))
-        again = [
-            OpenPatchDriver.framing.encode(identifier, body)
-            for identifier, body in zip(found.identifier.tolist(), found.bodies(), strict=True)
-        ]
+        again = [OpenPatchDriver.framing.encode(frame.identifier, frame.body) for frame in found]
         assert again == side
         assert framer.counters.skipped_bytes == 0
 

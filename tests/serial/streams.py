@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple
 from itertools import pairwise
-from typing import NamedTuple
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-from skinware_drivers.serial import framing as framing_module
 from skinware_drivers.serial.delimited import Delimited
-from skinware_drivers.serial.framing import Framer, Framing
+from skinware_drivers.serial.framing import Framed, Framer, Framing
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.serial.stuffing import LINES
 from tests.serial.framings import Example
@@ -21,22 +19,14 @@ BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 """For machines that do other things too."""
 
 
-class Found(NamedTuple):
-    """A frame that was found."""
-
-    identifier: int
-    body: bytes
-    end: int
-
-
-def feed(framer: Framer, chunks: Iterable[bytes]) -> list[Found]:
+def feed(framer: Framer, chunks: Iterable[bytes]) -> list[Framed]:
     """What a framer finds in a stream; holds its books against what came in after every chunk."""
-    found: list[Found] = []
+    found: list[Framed] = []
     fed = 0
     for chunk in chunks:
         frames = framer.feed(chunk)
         fed += len(chunk)
-        found += map(Found, frames.identifier.tolist(), frames.bodies(), frames.end.tolist())
+        found += frames
         counters = framer.counters
         accounted = counters.frame_bytes + counters.idle_bytes + counters.skipped_bytes
         assert counters.bytes_in == fed == accounted + framer.pending, counters
@@ -60,23 +50,10 @@ def cut(stream: bytes, places: Sequence[int]) -> list[bytes]:
     return [stream[a:b] for a, b in pairwise(edges)]
 
 
-def outcome(
-    framing: Framing, chunks: Iterable[bytes], many_bytes: int | None = None
-) -> tuple[list[Found], tuple[int, ...], int]:
-    """Everything that can be seen of a framer after a stream.
-
-    Args:
-        framing: what to look for.
-        chunks: the stream.
-        many_bytes: from how many bytes on it works with numpy; default: as always.
-    """
-    before = framing_module.MANY_BYTES
-    framing_module.MANY_BYTES = before if many_bytes is None else many_bytes
-    try:
-        framer = framing.framer()
-        found = feed(framer, chunks)
-    finally:
-        framing_module.MANY_BYTES = before
+def outcome(framing: Framing, chunks: Iterable[bytes]) -> tuple[list[Framed], tuple[int, ...], int]:
+    """Everything that can be seen of a framer after a stream."""
+    framer = framing.framer()
+    found = feed(framer, chunks)
     return found, astuple(framer.counters), framer.pending
 
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Framed
 from skinware_drivers.serial.packets import Packet
 from tests.serial.framings import EXAMPLES, Example
-from tests.serial.streams import BUSY, Found, cut, feed, frames, noise, outcome, streams
+from tests.serial.streams import BUSY, cut, feed, frames, noise, outcome, streams
 
-ALWAYS, NEVER = 0, 1 << 60
 names = st.sampled_from(list(EXAMPLES))
 
 
@@ -36,22 +35,17 @@ def test_what_is_encoded_is_found_again(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     sent = data.draw(st.lists(frames(example), min_size=1, max_size=6))
     stream = starting(example) + b"".join(frame for _, _, frame in sent) + ending(example)
-    for many_bytes in (ALWAYS, NEVER):
-        found, _, _ = outcome(example.framing, [stream], many_bytes)
-        assert isinstance(found, list)
-        assert [(f.identifier, f.body) for f in found[: len(sent)]] == [(i, body) for i, body, _ in sent]
+    found, _, _ = outcome(example.framing, [stream])
+    assert [(f.identifier, f.body) for f in found[: len(sent)]] == [(i, body) for i, body, _ in sent]
 
 
 @settings(BUSY, max_examples=120)
 @given(name=names, data=st.data())
-def test_chunking_and_the_way_of_working_change_nothing(name: str, data: st.DataObject) -> None:
+def test_chunking_changes_nothing(name: str, data: st.DataObject) -> None:
     example = EXAMPLES[name]
     stream = data.draw(streams(example))
     chunks = cut(stream, data.draw(st.lists(st.integers(0, max(1, len(stream))), max_size=8)))
-    whole = outcome(example.framing, [stream], NEVER)
-    assert outcome(example.framing, [stream], ALWAYS) == whole
-    assert outcome(example.framing, chunks, ALWAYS) == whole
-    assert outcome(example.framing, chunks, NEVER) == whole
+    assert outcome(example.framing, chunks) == outcome(example.framing, [stream])
 
 
 @settings(BUSY, max_examples=20)
@@ -60,7 +54,7 @@ def test_a_trickle_of_single_bytes_gives_the_same(name: str, data: st.DataObject
     example = EXAMPLES[name]
     stream = data.draw(streams(example))[:400]
     single = [stream[i : i + 1] for i in range(len(stream))]
-    assert outcome(example.framing, single, NEVER) == outcome(example.framing, [stream], ALWAYS)
+    assert outcome(example.framing, single) == outcome(example.framing, [stream])
 
 
 CHECKED = [
@@ -83,7 +77,7 @@ def test_whole_frames_behind_noise_are_found(name: str, data: st.DataObject) -> 
         identifier, body, frame = data.draw(frames(example))
         stream += frame
         ends[len(stream)] = identifier, body
-    found: list[Found] = feed(framing.framer(), [stream, bytes(2 * framing.maximum_body + 64)])
+    found: list[Framed] = feed(framing.framer(), [stream, bytes(2 * framing.maximum_body + 64)])
     places = {f.end: (f.identifier, f.body) for f in found}
     missing = {end for end, frame in ends.items() if places.get(end) != frame}
     for end in missing:  # noise that goes on into a frame and is a good frame itself takes its place
@@ -116,21 +110,19 @@ def test_after_a_bad_checksum_the_search_goes_on_one_byte_behind_the_false_begin
     assert framer.counters.skipped_bytes == len(damaged)
 
 
-@pytest.mark.parametrize("many_bytes", [ALWAYS, NEVER])
-def test_lengths_that_cannot_be_are_refused_at_once(many_bytes: int) -> None:
+def test_lengths_that_cannot_be_are_refused_at_once() -> None:
     framing = EXAMPLES["weiss_wts"].framing
     good = framing.encode(5, b"abc")
-    found, counters, pending = outcome(framing, [b"\xaa\xaa\xaa\x00\xff\xff" + good], many_bytes)
-    assert found == [Found(5, b"abc", 6 + len(good))]
+    found, counters, pending = outcome(framing, [b"\xaa\xaa\xaa\x00\xff\xff" + good])
+    assert found == [Framed(5, b"abc", 6 + len(good))]
     assert (counters, pending) == ((6 + len(good), len(good), 0, 6, 1, 0, 1), 0)
 
 
-@pytest.mark.parametrize("many_bytes", [ALWAYS, NEVER])
-def test_a_line_that_never_ends_is_not_kept(many_bytes: int) -> None:
+def test_a_line_that_never_ends_is_not_kept() -> None:
     framing = EXAMPLES["lines"].framing
     framer_sees = [b"\n", b"x" * 1000, b"y" * 5000, b"z\nright\r\n"]
-    found, counters, pending = outcome(framing, framer_sees, many_bytes)
-    assert found == [Found(0, b"right", 6010)]
+    found, counters, pending = outcome(framing, framer_sees)
+    assert found == [Framed(0, b"right", 6010)]
     assert (counters, pending) == ((6010, 7, 0, 6003, 1, 0, 1), 0)
 
 

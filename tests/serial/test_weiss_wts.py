@@ -25,7 +25,7 @@ def test_bytes_of_commands_are_those_of_the_vectors() -> None:
     framing = WeissWtsDriver.framing
     for wire, command, payload in ((START_10_MS, 0x21, b"\0\x0a\0"), (MATRIX, 0x30, b"")):
         assert framing.encode(command, payload) == wire == message(command, payload)
-    assert framing.framer().feed(START_10_MS).bodies() == [b"\0\x0a\0"]
+    assert [frame.body for frame in framing.framer().feed(START_10_MS)] == [b"\0\x0a\0"]
 
 
 def test_the_emulated_sensor_byte_for_byte() -> None:

@@ -21,7 +21,7 @@ DEVICE_INFO = bytes.fromhex("AA 56 0A 00 01 01 01 00 A7 FA")
 def test_bytes_of_commands_are_those_of_the_vector() -> None:
     assert WujiGloveDriver.commands is not None
     assert WujiGloveDriver.commands.encode(0, b"\1\1\1\0") == DEVICE_INFO == message(0x56, b"\1\1\1\0")
-    assert WujiGloveDriver.framing.framer().feed(DEVICE_INFO).bodies() == []
+    assert WujiGloveDriver.framing.framer().feed(DEVICE_INFO) == []
 
 
 def test_the_emulated_board_byte_for_byte() -> None:

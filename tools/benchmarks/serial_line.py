@@ -40,6 +40,7 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.framing import fill_rows
 from tests.serial.framings import EXAMPLES
 
 NAME = "cobs_crc"
@@ -96,7 +97,7 @@ def ours(name: str, stream: bytes, chunk: int) -> int:
     found = 0
     for at in range(0, len(stream), chunk):
         framed = framer.feed(stream[at : at + chunk])
-        framed.copy_to(rows[: len(framed)])
+        fill_rows(rows[: len(framed)], framed)
         found += len(framed)
     return found
 
@@ -110,7 +111,7 @@ def ours_decoded(stream: bytes, chunk: int) -> int:
         framed = framer.feed(stream[at : at + chunk])
         decoder.put_back(batch)
         rows = slice(batch.stop, batch.stop + len(framed))
-        framed.copy_to(batch.wire[rows])
+        fill_rows(batch.wire[rows], framed)
         batch.time_ns[rows], batch.bus[rows] = at, 0
         batch.stop = rows.stop
         decoder.state.show(decoder.decode(batch)[0])

@@ -51,11 +51,10 @@ class Result(NamedTuple):
 def run(
     kind: str, rate_hz: float, seconds: float, busy: bool, n_buses: int, n_boards: int, latency_ms: float = 5.0
 ) -> Result:
-    """Send to a receiver, and ask it what it got."""
-    settings = [kind, "busy" if busy else "idle", *map(str, (n_buses, n_boards, latency_ms, seconds + GRACE_S))]
-    receiver = subprocess.Popen(
-        [sys.executable, HERE / "can_receivers.py", *settings], stdout=subprocess.PIPE, text=True
-    )
+    """Send to a receiver, one of ``KINDS`` or a program of the same form, and ask it what it got."""
+    command = [sys.executable, HERE / "can_receivers.py", kind, "busy" if busy else "idle"] if kind in KINDS else [kind]
+    settings = map(str, (n_buses, n_boards, latency_ms, seconds + GRACE_S))
+    receiver = subprocess.Popen([*command, *settings], stdout=subprocess.PIPE, text=True)
     assert receiver.stdout is not None
     ports = receiver.stdout.readline().split()
     time.sleep(1.0)  # the driver builds its tables

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from skinware import _names
 from skinware.errors import StructureError
 from skinware.sensor_types import SensorType
 
@@ -33,10 +34,13 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     ("patch_bus", "<u4"),
     ("module_patch", "<u4"),
     ("module_kind", "|S16"),
+    ("module_name", "|S32"),
     ("sensor_uid", "<u8"),
     ("sensor_type", "<u4"),
     ("sensor_module", "<u4"),
 )
+_OPTIONAL = ("module_name",)
+"""Columns that files of earlier versions do not have."""
 
 
 class Structure:
@@ -49,6 +53,7 @@ class Structure:
         patch_bus: (n_patches,) uint32, index into ``buses``.
         module_patch: (n_modules,) uint32, index of the module's patch.
         module_kind: (n_modules,) bytes; hardware-specific (``triangle``, ``fingertip``).
+        module_name: (n_modules,) bytes; within its patch (``triangle 3``), empty where the driver gives none.
         sensor_uid: (n_sensors,) uint64, unique per type.
         sensor_type: (n_sensors,) uint32, id of a type in ``types``.
         sensor_module: (n_sensors,) uint32, index of the sensor's module.
@@ -71,6 +76,7 @@ class Structure:
         sensor_type: npt.ArrayLike,
         sensor_module: npt.ArrayLike,
         dtype: npt.DTypeLike,
+        module_name: npt.ArrayLike | None = None,
     ) -> None:
         self.types: tuple[SensorType, ...] = tuple(types)
         self.buses: tuple[str, ...] = tuple(buses)
@@ -78,6 +84,9 @@ class Structure:
         self.patch_bus: npt.NDArray[np.uint32] = _column("patch_bus", patch_bus)
         self.module_patch: npt.NDArray[np.uint32] = _column("module_patch", module_patch)
         self.module_kind: npt.NDArray[np.bytes_] = _column("module_kind", module_kind)
+        self.module_name: npt.NDArray[np.bytes_] = _column(
+            "module_name", [b""] * len(self.module_kind) if module_name is None else module_name
+        )
         self.sensor_uid: npt.NDArray[np.uint64] = _column("sensor_uid", sensor_uid)
         self.sensor_type: npt.NDArray[np.uint32] = _column("sensor_type", sensor_type)
         self.sensor_module: npt.NDArray[np.uint32] = _column("sensor_module", sensor_module)
@@ -120,6 +129,41 @@ class Structure:
     def _position(self) -> dict[tuple[int, int], int]:
         pairs = zip(self.sensor_type.tolist(), self.sensor_uid.tolist(), strict=True)
         return {pair: position for position, pair in enumerate(pairs)}
+
+    @cached_property
+    def patch_names(self) -> tuple[str, ...]:
+        """Name of every patch, as people know it: ``board 8``; of those that share one ``board 8 on can0``."""
+        return _names.patch_names(_texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()])
+
+    @cached_property
+    def module_names(self) -> tuple[str, ...]:
+        """Name of every module, as people know it: ``board 8, triangle 3``.
+
+        Where the driver gives none, its kind and a number, both as they are in the patch; the only module of a patch
+        is called as the patch.
+        """
+        return _names.module_names(
+            _texts(self.module_name), _texts(self.module_kind), self.module_patch.tolist(), self.patch_names
+        )
+
+    def sensor_name(self, position: int) -> str:
+        """Name of a sensor's place, as people know it: ``board 8, triangle 3, taxel 5``.
+
+        All axes of a taxel have one name. Taxels are counted by uid from the lowest of their module, which is 0; the
+        only one of a module is called as the module. Temperatures, accelerations and angular rates have the name of
+        their type instead of ``taxel``.
+
+        Args:
+            position: in a frame.
+        """
+        module, type_id = int(self.sensor_module[position]), int(self.sensor_type[position])
+        of_module = self.module_index(module)
+        return _names.sensor_name(
+            self.module_names[module],
+            next(t.name for t in self.types if t.id == type_id),
+            int(self.sensor_uid[position] - self.sensor_uid[of_module].min()),
+            is_only=int((self.sensor_type[of_module] == type_id).sum()) == 1,
+        )
 
     def type(self, name: str) -> SensorType:
         """The driver's sensor type of this name.
@@ -201,6 +245,8 @@ class Structure:
             StructureError: a column is missing, or the tables contradict each other.
         """
         for name, code in _COLUMNS:
+            if name in _OPTIONAL and name not in columns:
+                continue
             if name not in columns or columns[name].dtype != np.dtype(code):
                 raise StructureError(f"structure column {name!r} is missing or not {code}")
         fields = ("id", "name", "unit", "scale", "offset", "minimum", "maximum")
@@ -209,7 +255,7 @@ class Structure:
             SensorType(name.decode(), identifier, unit.decode(), scale, offset, minimum, maximum)
             for identifier, name, unit, scale, offset, minimum, maximum in rows
         ]
-        own = [name for name, _ in _COLUMNS if not name.startswith(("type_", "bus_"))]
+        own = [name for name, _ in _COLUMNS if not name.startswith(("type_", "bus_")) and name in columns]
         return cls(
             types=types,
             buses=[name.decode() for name in columns["bus_name"].tolist()],
@@ -241,7 +287,7 @@ class Structure:
         if not self.n_sensors:
             raise StructureError("a skin needs at least one sensor")
         _same_length("patch", self.patch_name, self.patch_bus)
-        _same_length("module", self.module_patch, self.module_kind)
+        _same_length("module", self.module_patch, self.module_kind, self.module_name)
         _same_length("sensor", self.sensor_uid, self.sensor_type, self.sensor_module)
         _within("patch", "bus", self.patch_bus, len(self.buses))
         _within("module", "patch", self.module_patch, self.n_patches)
@@ -295,6 +341,10 @@ def _column(name: str, data: npt.ArrayLike) -> npt.NDArray[Any]:
     if given.size and (int(given.min()) < 0 or int(given.max()) > bounds.max):
         raise StructureError(f"{name} has a value outside 0 to {bounds.max}")
     return _frozen(given.astype(wanted))
+
+
+def _texts(column: npt.NDArray[np.bytes_]) -> list[str]:
+    return [text.decode(errors="replace") for text in column.tolist()]
 
 
 def _frozen(array: npt.NDArray[_T]) -> npt.NDArray[_T]:

@@ -36,11 +36,13 @@ class Module:
         channels: what each channel is; None = not a sensor, its values are dropped.
         key: how frames name it within its patch.
         kind: hardware-specific, for people and geometry.
+        name: within its patch, for people (``triangle 3``); empty: its kind, and a number where the patch has several.
     """
 
     channels: Sequence[Sensor | None]
     key: int = 0
     kind: str = ""
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,7 @@ class SkinTables:
             patch_bus=old.patch_bus,
             module_patch=old.module_patch,
             module_kind=old.module_kind,
+            module_name=old.module_name,
             sensor_uid=old.sensor_uid,
             sensor_type=old.sensor_type,
             sensor_module=old.sensor_module,
@@ -130,6 +133,7 @@ def assemble(
     patch_bus: list[int] = []
     module_patch: list[int] = []
     module_kind: list[str] = []
+    module_name: list[str] = []
     uids: list[int] = []
     sensor_type: list[int] = []
     sensor_module: list[int] = []
@@ -156,6 +160,7 @@ def assemble(
                 channels.append(row)
                 module_patch.append(len(patch_name))
                 module_kind.append(module.kind)
+                module_name.append(module.name)
             patch_name.append(patch.name)
             patch_bus.append(bus)
     structure = Structure(
@@ -165,6 +170,7 @@ def assemble(
         patch_bus=patch_bus,
         module_patch=module_patch,
         module_kind=module_kind,
+        module_name=module_name,
         sensor_uid=np.array(uids, np.uint64),
         sensor_type=sensor_type,
         sensor_module=sensor_module,

@@ -174,4 +174,5 @@ def triangle_module(board: int, triangle: int, kind: str, thermal: Sequence[int]
     """A triangle; uid = board << 16 | triangle << 8 | channel."""
     uid = board << 16 | triangle << 8
     names = ["temperature" if channel in thermal else "pressure" for channel in range(CHANNELS)]
-    return Module([Sensor(name, uid | channel) for channel, name in enumerate(names)], key=triangle, kind=kind)
+    channels = [Sensor(name, uid | channel) for channel, name in enumerate(names)]
+    return Module(channels, key=triangle, kind=kind, name=f"{kind} {triangle}")

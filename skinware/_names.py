@@ -1,0 +1,52 @@
+"""Names of patches, modules and sensors as people know them: ``board 8``, ``board 8, triangle 3, taxel 5``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+_BY_TYPE = ("temperature", "acceleration", "angular_rate")
+"""Sensors of these types are called by their type; all others are taxels."""
+
+
+def patch_names(names: Sequence[str], owners: Sequence[str]) -> tuple[str, ...]:
+    """The names of all patches; where several have one name, with what they are on: ``board 8 on can0``."""
+    count = Counter(names)
+    return tuple(f"{name} on {owner}" if count[name] > 1 else name for name, owner in zip(names, owners, strict=True))
+
+
+def module_names(
+    own_names: Sequence[str], kinds: Sequence[str], patches: Sequence[int], names_of_patches: Sequence[str]
+) -> tuple[str, ...]:
+    """The names of all modules, each after that of its patch.
+
+    One without a name of its own has its kind and, among several of that kind in its patch, a number from 0; the only
+    module of a patch is called as the patch.
+    """
+    in_patch = Counter(patches)
+    of_kind = Counter(zip(patches, kinds, strict=True))
+    seen: Counter[tuple[int, str]] = Counter()
+    names = []
+    for own, kind, patch in zip(own_names, kinds, patches, strict=True):
+        number = seen[patch, kind]
+        seen[patch, kind] += 1
+        if not own and in_patch[patch] > 1:
+            own = kind or "module"
+            own = f"{own} {number}" if of_kind[patch, kind] > 1 else own
+        names.append(", ".join(filter(None, (names_of_patches[patch], own))))
+    return tuple(names)
+
+
+def sensor_name(module: str, type_name: str, number: int, is_only: bool) -> str:
+    """The name of a sensor's place.
+
+    Args:
+        module: name of its module.
+        type_name: its type.
+        number: its uid, counted from the lowest in the module.
+        is_only: the module has no other of that type.
+    """
+    by_type = type_name.startswith(_BY_TYPE)
+    if is_only:
+        return f"{module}, {type_name}" if by_type else module
+    return f"{module}, {type_name if by_type else 'taxel'} {number}"

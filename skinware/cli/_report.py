@@ -102,6 +102,7 @@ def _newest(service: ServiceReader[FrameT]) -> FrameT | None:
 
 def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
     life = life_of(service, frame)
+    statistics = service.writer_statistics
     return {
         "name": service.name,
         "kind": service.kind,
@@ -112,9 +113,10 @@ def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
         "rate_hz": rate_now_hz(life, service.rate_hz()),
         "sequence": frame.sequence if frame else 0,
         "age_ms": round(frame.age_ns / 1e6, 3) if frame else None,
-        "missed_periods": service.missed_periods,
+        "missed_periods": statistics.missed_periods,
+        "before_boot": statistics.before_boot,
         "generation": service.generation,
-        "statistics": _times(service.writer_statistics),
+        "statistics": _times(statistics),
     }
 
 

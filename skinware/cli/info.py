@@ -195,6 +195,8 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
         parts += [rate_text(entry["rate_hz"]), f"newest data {age} old", f"frame {count_text(entry['sequence'])}"]
     if entry["missed_periods"]:
         parts.append(f"{plural(entry['missed_periods'], 'period')} missed")
+    if entry["before_boot"]:
+        parts.append(f"{plural(entry['before_boot'], 'frame')} stamped before this machine booted")
     parts.append(f"pid {entry['pid']}")
     return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 

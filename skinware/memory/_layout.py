@@ -99,14 +99,15 @@ STATISTICS = np.dtype(
         ("cpu_best_ns", "<u8"),
         ("cpu_worst_ns", "<u8"),
         ("cpu_total_ns", "<u8"),
-        ("reserved", "<u8"),
+        ("before_boot", "<u8"),
         ("age", "<u8", (HISTOGRAM_BUCKETS,)),
         ("lateness", "<u8", (HISTOGRAM_BUCKETS,)),
     ]
 )
-"""Wall: time from ``begin`` to ``commit``; CPU: from publication to publication; how old the data was when published;
-how late periods began. Bucket k of a histogram counts values of 2**(k-1) to 2**k - 1 ns, the last one all above. Not
-covered by the slot protocol: a reader may see some of these words a frame ahead of others."""
+"""Wall: time from ``begin`` to ``commit``; CPU: from publication to publication; how many stamps lay before boot; how
+old the data was when published; how late periods began. Bucket k of a histogram counts values of 2**(k-1) to
+2**k - 1 ns, the last one all above. Not covered by the slot protocol: a reader may see some of these words a frame
+ahead of others."""
 
 COLUMN_OFFSET = STATISTICS_OFFSET + STATISTICS.itemsize
 COLUMN = _packed(

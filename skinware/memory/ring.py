@@ -8,6 +8,7 @@ sleeps: load the wake word; fence; look at latest and state. docs/reference/shar
 from __future__ import annotations
 
 import mmap
+import operator
 import time
 from typing import Any, Generic, TypeVar
 
@@ -30,8 +31,10 @@ _STATE = _layout.STATE_OFFSET // 4
 _SEQUENCE, _ACQUIRED, _PUBLISHED, _FLAGS = range(4)  # 8-byte words of a slot's header
 _HEADER_WORDS = _layout.SLOT.itemsize // 8
 _STATISTICS = slice(_layout.STATISTICS_OFFSET // 8, _layout.COLUMN_OFFSET // 8)
-_TIMED, _WALL, _CPU, _AGE = 0, 1, 4, 8  # words of the statistics: count, two times (best, worst, total), histograms
+# words of the statistics: a count, two times (best, worst, total), another count, histograms
+_TIMED, _WALL, _CPU, _BEFORE_BOOT, _AGE = 0, 1, 4, 7, 8
 _LATENESS = _AGE + _layout.HISTOGRAM_BUCKETS
+_MOST_NS, _ALL_FLAGS = (1 << 63) - 1, (1 << 64) - 1
 
 
 class Frame:
@@ -279,8 +282,11 @@ class RingWriter:
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish what was filled in since ``begin`` and wake all readers with one system call.
 
+        If it raises, nothing has changed: the newest frame is the one before, and the one begun may be committed still.
+
         Args:
-            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns.
+            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
+                machine booted) it counts as 0, and in ``WriterStatistics.before_boot``.
             flags: bits for the service's own use.
 
         Returns:
@@ -289,11 +295,19 @@ class RingWriter:
         Raises:
             Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
             ServiceError: there was no ``begin`` before it: the slot holds an old frame.
+            TypeError: ``acquired_ns`` or ``flags`` is no integer.
+            ValueError: ``acquired_ns`` does not fit 63 bits, or ``flags`` 64.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         if not self._begun_ns:
             raise ServiceError(f"{self.segment.path}: commit without begin would publish an old frame as a new one")
+        acquired_ns, flags = operator.index(acquired_ns), operator.index(flags)
+        if acquired_ns > _MOST_NS or not 0 <= flags <= _ALL_FLAGS:
+            raise ValueError(f"{self.segment.path}: a frame has 63 bits for acquired_ns ({acquired_ns}), 64 for flags")
+        if acquired_ns < 0:
+            acquired_ns = 0
+            self._statistics[_BEFORE_BOOT] += 1
         sequence = self.sequence + 1
         words = self._slot_words[sequence % self._count]
         published_ns = now_ns()

@@ -79,6 +79,7 @@ class WriterStatistics(msgspec.Struct):
     Attributes:
         published: frames.
         missed_periods: periods that passed unused.
+        before_boot: frames whose ``acquired_ns`` lay before this machine booted, and counts as 0.
         wall: from ``begin`` to ``commit``.
         cpu: from one publication to the next, on a processor.
         age: how old the newest data of a frame was when it was published.
@@ -87,6 +88,7 @@ class WriterStatistics(msgspec.Struct):
 
     published: int
     missed_periods: int
+    before_boot: int
     wall: Spread
     cpu: Spread
     age: Histogram
@@ -105,6 +107,7 @@ def read_statistics(data: npt.NDArray[np.uint8]) -> WriterStatistics:
     return WriterStatistics(
         int(control["latest"]),
         int(control["missed_periods"]),
+        int(words["before_boot"]),
         spread("wall"),
         spread("cpu"),
         Histogram(words["age"].tolist()),

@@ -139,8 +139,11 @@ class ServiceWriter:
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish the frame: one system call wakes every reader.
 
+        If it raises, readers have the frame before, and ``commit`` or ``begin`` may be called again.
+
         Args:
-            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns.
+            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
+                machine booted) it counts as 0, and is counted in the statistics (``before_boot``).
             flags: bits for the service's own use.
 
         Returns:
@@ -149,6 +152,8 @@ class ServiceWriter:
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
             ServiceError: there was no ``begin`` before it, or the service was restructured since.
+            TypeError: ``acquired_ns`` or ``flags`` is no integer.
+            ValueError: ``acquired_ns`` does not fit 63 bits, or ``flags`` 64.
         """
         return self._ring.commit(acquired_ns, flags)
 

@@ -27,6 +27,8 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
 
 _NO_KIND = 255
+_EARLIEST_NS = 1
+"""CLOCK_MONOTONIC begins with the machine, and 0 means never."""
 
 Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
@@ -137,7 +139,9 @@ class Decoder:
                 rows = np.flatnonzero(kind == number)
                 entry[rows] = compiled.name_modules(entry[rows], payload[rows])
         new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
-        self.device_stamps.tell(kind[new], entry[new], payload[new], batch.time_ns[first:last][new])
+        time_ns = batch.time_ns[first:last][new]
+        self.device_stamps.tell(kind[new], entry[new], payload[new], time_ns)
+        self._keep_after_boot(bus[new], time_ns)
         is_module = entry < self._n_modules
         is_foreign = ~is_module
         is_foreign[wrong] = False
@@ -171,6 +175,13 @@ class Decoder:
         self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
         standard = identifier < STANDARD_IDENTIFIERS
         np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
+
+    def _keep_after_boot(self, bus: npt.NDArray[np.uint16], time_ns: Indices) -> None:
+        """Stamps from before this machine booted (a clock that was set) become the earliest ones, and are counted."""
+        early = time_ns < _EARLIEST_NS
+        if early.any():
+            time_ns[early] = _EARLIEST_NS
+            self.state.bus_counters[:, 3] += np.bincount(bus[early], minlength=len(self.state.bus_counters))
 
     # -- compiling ----------------------------------------------------------------------------------------------
 

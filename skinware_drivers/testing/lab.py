@@ -1,6 +1,7 @@
 """The CAN lab: a guest kernel that has CAN, over this machine's own files, for a machine whose kernel has none.
 
     python -m skinware_drivers.testing.lab check                  what is missing here; exit status 1 if anything is
+    python -m skinware_drivers.testing.lab packages               Debian's packages that it needs
     python -m skinware_drivers.testing.lab run [-T S] -- COMMAND  boot, run COMMAND in this folder, exit as it did
     python -m skinware_drivers.testing.lab --kernel rt ...        the same with a PREEMPT_RT kernel
 
@@ -24,21 +25,28 @@ from pathlib import Path
 
 MODULES = "can-raw vcan vxcan slcan can-gw kvaser_pci"
 CONTROLLERS = "-object can-bus,id=canbus0" + " -device kvaser_pci,canbus=canbus0" * 2
-PACKAGES = "qemu-system-x86 {image} iproute2 kmod"
+PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
+COMMANDS = ("ip", "modprobe", "file")
+"""Commands that are needed here or in the guest, beside those that every machine has; virtme-ng asks ``file``."""
 IMAGES = {"plain": "linux-image-amd64", "rt": "linux-image-rt-amd64"}
 """Kernels that can be chosen, and Debian's packages of them."""
 
 
 def find_kernel(flavour: str) -> Path | None:
-    """The newest installed kernel of a flavour that has CAN modules."""
+    """The newest installed kernel of a flavour that has all modules of the lab."""
     kernels = [
-        Path("/boot") / f"vmlinuz-{folder.name}"
-        for folder in Path("/lib/modules").glob("*")
-        if (folder / "kernel/drivers/net/can/vcan.ko").exists()
-        or (folder / "kernel/drivers/net/can/vcan.ko.xz").exists()
+        Path("/boot") / f"vmlinuz-{folder.name}" for folder in Path("/lib/modules").glob("*") if _has_modules(folder)
     ]
     present = [kernel for kernel in kernels if kernel.exists() and ("-rt-" in kernel.name) == (flavour == "rt")]
     return max(present, key=lambda kernel: [int(part) for part in _numbers(kernel.name)], default=None)
+
+
+def _has_modules(folder: Path) -> bool:
+    try:
+        known = (folder / "modules.dep").read_text()
+    except OSError:
+        return False
+    return all(f"/{module}.ko" in known for module in MODULES.split())
 
 
 def _numbers(text: str) -> list[str]:
@@ -50,18 +58,33 @@ def find_vng() -> str | None:
     return shutil.which("vng", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}")
 
 
+def find_busybox() -> str | None:
+    """A statically linked busybox, where virtme-ng looks for one: it begins the guest's boot."""
+    for name in ("busybox-static", "busybox.static", "busybox"):
+        if busybox := _which(name):
+            told = subprocess.run(["file", "-L", busybox], capture_output=True, text=True).stdout
+            return busybox if "statically linked" in told or "static-pie linked" in told else None
+    return None
+
+
 def missing(flavour: str) -> list[str]:
     """What this machine lacks, a line each; empty if the lab can run."""
     lacks = []
-    if shutil.which("qemu-system-x86_64") is None:
+    if _which("qemu-system-x86_64") is None:
         lacks.append("qemu-system-x86_64")
     if find_kernel(flavour) is None:
         kind = "a PREEMPT_RT kernel" if flavour == "rt" else "a kernel"
         lacks.append(f"{kind} with CAN modules in /boot and /lib/modules")
-    lacks += [f"the command {name}" for name in ("ip", "modprobe") if shutil.which(name, path=_path()) is None]
+    lacks += [f"the command {name}" for name in COMMANDS if _which(name) is None]
+    if _which("file") is None or find_busybox() is None:
+        lacks.append("a statically linked busybox")
     if find_vng() is None:
         lacks.append("virtme-ng (pip install virtme-ng)")
     return lacks
+
+
+def _which(command: str) -> str | None:
+    return shutil.which(command, path=_path())
 
 
 def _path() -> str:
@@ -75,7 +98,7 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
         export PATH={shlex.quote(_path())} SKINWARE_CAN_LAB=1 SKINWARE_CAN_LAB_KERNEL={flavour}
         export PYTHONDONTWRITEBYTECODE=1 HOME=/tmp HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
         modprobe -a {MODULES}
-        sysctl -q -w net.core.netdev_max_backlog=100000
+        echo 100000 >/proc/sys/net/core/netdev_max_backlog
         ip link set lo up
         mountpoint -q /dev/shm || mount -t tmpfs tmpfs /dev/shm
         cd {shlex.quote(str(folder))}
@@ -139,12 +162,16 @@ def report(flavour: str, lacks: list[str]) -> int:
     if not lacks:
         sys.stdout.write(f"the CAN lab can run: {find_kernel(flavour)}\n")
         return 0
-    packages = PACKAGES.format(image=IMAGES[flavour])
     sys.stderr.write(
         f"the CAN lab cannot run here; missing: {', '.join(lacks)}\n"
-        f"install: apt-get install --no-install-recommends {packages}\n"
+        f"install: apt-get install --no-install-recommends {packages(flavour)}\n"
     )
     return 1
+
+
+def packages(flavour: str) -> str:
+    """Debian's packages that the lab needs, for the command line of apt-get."""
+    return PACKAGES.format(image=IMAGES[flavour])
 
 
 def main(folder: Path) -> int:
@@ -153,12 +180,16 @@ def main(folder: Path) -> int:
     parser.add_argument("--kernel", choices=IMAGES, default="plain", help="which kernel to boot (default: plain)")
     actions = parser.add_subparsers(dest="action", required=True)
     actions.add_parser("check")
+    actions.add_parser("packages")
     running = actions.add_parser("run")
     running.add_argument("-T", "--timeout", type=float, default=1800.0, help="seconds before the guest is stopped")
     running.add_argument("command", nargs="+")
     arguments = parser.parse_args()
     if arguments.action == "check":
         return report(arguments.kernel, missing(arguments.kernel))
+    if arguments.action == "packages":
+        sys.stdout.write(f"{packages(arguments.kernel)}\n")
+        return 0
     return run(arguments.kernel, arguments.command, arguments.timeout, folder)
 
 

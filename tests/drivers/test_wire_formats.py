@@ -100,13 +100,13 @@ def test_a_uskin_whose_identifiers_are_row_and_column(identifier: int, taxel: in
 @pytest.mark.parametrize("frame", [(0x720, "00" * 8), (0x70F, "00" * 8), (0x510, "00" * 8), (0x8000_0710, "00" * 8)])
 def test_what_is_no_taxel_is_unknown(frame: tuple[int, str]) -> None:
     decoder = decoded(XelaDriver(XelaOptions()), frame)
-    assert decoder.state.bus_counters.tolist() == [[1, 0, 0]]
+    assert decoder.state.bus_counters[:, :3].tolist() == [[1, 0, 0]]
     assert seen(decoder) == []
 
 
 def test_a_uskin_frame_of_another_length_is_not_shown() -> None:
     decoder = decoded(XelaDriver(XelaOptions()), (0x710, "00" * 7), (0x711, ""))
-    assert decoder.state.bus_counters.tolist() == [[0, 2, 0]]
+    assert decoder.state.bus_counters[:, :3].tolist() == [[0, 2, 0]]
     assert seen(decoder) == []
 
 
@@ -186,7 +186,7 @@ def test_frames_of_different_fingers_make_no_whole() -> None:
 def test_a_barrett_palm_in_the_format_of_the_ten_strongest() -> None:
     adapter = BarrettDriver(BarrettOptions(format="top10"))
     decoder = decoded(adapter, (0x5C8, "C0007F" + "123456789A"))
-    assert decoder.state.bus_counters.tolist() == [[0, 0, 0]]
+    assert decoder.state.bus_counters[:, :3].tolist() == [[0, 0, 0]]
     # bits 23, 22 and 6 to 0 of C0007F are nine cells: 0, 1 and 17 to 23
     assert values(decoder, *range(72, 96)) == [1, 2, *[0] * 15, 3, 4, 5, 6, 7, 8, 9]
 

@@ -220,6 +220,25 @@ def test_what_a_bus_counts_and_notes_is_told(caplog: pytest.LogCaptureFixture, m
     assert caplog.text.count("a buffer is small") == 2
 
 
+def test_frames_stamped_before_boot_are_counted_and_end_nothing() -> None:
+    bus = emulated(boards=(7,))
+    receive = bus.receive
+
+    def receive_too_early(batch: FrameBatch, ordinal: int) -> int:
+        first = batch.stop
+        count = receive(batch, ordinal)
+        batch.time_ns[first : batch.stop] -= 1 << 62
+        return count
+
+    bus.receive = receive_too_early  # type: ignore[method-assign]
+    with driving(bus, wait=False) as running, DriverReader("roboskin", timeout_s=30) as reader:
+        frame = read_until(reader, lambda f: reader.bus_counters(f)[0]["before_boot"] > 100)
+        assert (frame.status == Status.STALE).all()  # heard, and nobody knows when
+        assert (frame.module_time_ns == 1).all()
+        running.do(lambda: setattr(bus, "receive", receive))
+        read_until(reader, lambda f: not f.status.any())
+
+
 class Talkative(RoboskinDriver):
     """Sends thousands of frames to set its boards up, while they send data already."""
 

@@ -9,6 +9,7 @@ from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Cycle, DeviceTime, Frame, Identifier, Layout, Stamp, Values
 
@@ -98,6 +99,16 @@ def test_a_patch_that_was_set_up_anew_has_a_clock_that_begins_anew() -> None:
     assert one_frame(compiled, BEGIN_NS + 800 * MS, 10) == BEGIN_NS + 10 * MS  # late
     compiled.forget(0)
     assert one_frame(compiled, BEGIN_NS + 900 * MS, 20) == BEGIN_NS + 900 * MS
+
+
+def test_a_stamp_before_boot_becomes_the_earliest_and_is_counted_on_its_bus() -> None:
+    compiled = decoder(Layout([Frame("one", [Identifier(1)], [8], Values(0, "<u2", 2))]), n_buses=2)
+    batch = FrameBatch(8, 8, compiled.headroom)
+    for bus, time_ns in ((0, 5), (1, -5), (1, -1 << 62), (1, 0), (1, 6)):
+        batch.append(bus, time_ns, 1, bytes(8))
+    updates, _ = compiled.decode(batch)
+    assert updates.newest_ns.tolist() == [1, 1, 1, 5, 6]
+    assert compiled.state.bus_counters[:, BUS_COUNTERS.index("before_boot")].tolist() == [0, 3]
 
 
 def test_times_that_cannot_be() -> None:

@@ -7,6 +7,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from skinware_drivers.bus import EXTENDED_FLAG
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.layout import (
         Bits,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from skinware_drivers.watch import Watch
 
 __all__ = [
+    "EXTENDED_FLAG",
     "Bits",
     "Byte",
     "Cycle",
@@ -61,7 +63,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("layout", "description", "link", "notice", "watch", "operations", "options", "polling")
+_MODULES = ("bus", "layout", "description", "link", "notice", "watch", "operations", "options", "polling")
 
 
 def get_include() -> str:

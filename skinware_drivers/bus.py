@@ -14,12 +14,18 @@ from typing import ClassVar, NamedTuple, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BusSendError
+from skinware.errors import BusSendError, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 
 EXTENDED_FLAG = 0x8000_0000
-"""Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h)."""
+"""Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h).
+
+Wherever an identifier is a number, one of 29 bits has this bit set: ``EXTENDED_FLAG | 0x18DA00F1``. As text it is what
+candump writes (:func:`identifier_text`).
+"""
+LARGEST_STANDARD, LARGEST_IDENTIFIER = 0x7FF, 0x1FFF_FFFF
+"""The largest identifiers of 11 and of 29 bits, without the flag."""
 REMOTE_FLAG = 0x4000_0000
 """Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
 ERROR_FLAG = 0x2000_0000
@@ -37,6 +43,29 @@ _MEDIA = {
 
 
 _WayT = TypeVar("_WayT")
+
+
+def identifier_text(identifier: int) -> str:
+    """An identifier as candump writes it: three digits for one of 11 bits, eight for one of 29."""
+    if identifier & EXTENDED_FLAG:
+        return f"{identifier & LARGEST_IDENTIFIER:08X}"
+    return f"{identifier:03X}"
+
+
+def check_identifier(identifier: int) -> None:
+    """Refuse a CAN identifier that no frame has.
+
+    Raises:
+        ConfigurationError: it has more than 11 bits without ``EXTENDED_FLAG``, or more than 29 with it.
+    """
+    largest = LARGEST_IDENTIFIER if identifier & EXTENDED_FLAG else LARGEST_STANDARD
+    if not 0 <= identifier & ~EXTENDED_FLAG <= largest:
+        raise ConfigurationError(
+            f"identifier {identifier:X} has more than 11 bits; one of 29 bits is written EXTENDED_FLAG |"
+            f" 0x{identifier:X}"
+            if 0 <= identifier <= LARGEST_IDENTIFIER
+            else f"identifier {identifier:X} cannot be: it has 11 bits, or 29 and EXTENDED_FLAG"
+        )
 
 
 class Filter(NamedTuple):
@@ -279,10 +308,14 @@ class Bus(ABC):
 __all__ = [
     "ERROR_FLAG",
     "EXTENDED_FLAG",
+    "LARGEST_IDENTIFIER",
+    "LARGEST_STANDARD",
     "REMOTE_FLAG",
     "Bus",
     "Filter",
     "FrameBatch",
+    "check_identifier",
+    "identifier_text",
     "kind_of_bus",
     "wire_dtype",
 ]

@@ -47,6 +47,8 @@ class BusCounters:
     """Sends that the interface refused."""
     polls_missed: int = 0
     """Polls of devices that only answer which could not be sent in time."""
+    polls_unanswered: int = 0
+    """Polls in lock step whose answer did not come in time."""
     overflows: int = 0
     """How often the controller told that it had lost frames."""
     bus_offs: int = 0

@@ -7,6 +7,7 @@ count together.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,6 +17,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
+from skinware_drivers.bus import EXTENDED_FLAG, LARGEST_IDENTIFIER, LARGEST_STANDARD, check_identifier
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can tell apart, over all its buses."""
@@ -23,12 +25,12 @@ MOST_FRAMES = 200
 
 @dataclass(frozen=True)
 class Identifier:
-    """Condition: ``identifier & mask == value``.
+    """Condition: ``identifier & mask == value``. Whether the identifier has 11 or 29 bits counts whatever the mask.
 
     Attributes:
-        value: what the masked bits are.
+        value: what the masked bits are; of a 29-bit identifier, with the flag: ``EXTENDED_FLAG | 0x18DA00F1``.
         mask: bits that count; default: all.
-        extended: the identifier has 29 bits, not 11.
+        extended: the identifier has 29 bits, not 11. To be left out: the value says it.
     """
 
     value: int
@@ -36,8 +38,16 @@ class Identifier:
     extended: bool = False
 
     def __post_init__(self) -> None:
-        if self.mask == -1:
-            object.__setattr__(self, "mask", 0x1FFF_FFFF if self.extended else 0x7FF)
+        is_extended = bool(self.value & EXTENDED_FLAG)
+        if self.extended and not is_extended:
+            text = f"Identifier(0x{self.value:X}, extended=True): write Identifier(EXTENDED_FLAG | 0x{self.value:X})"
+            warnings.warn(text, DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "value", self.value | EXTENDED_FLAG)
+            is_extended = True
+        object.__setattr__(self, "extended", is_extended)
+        every = EXTENDED_FLAG | LARGEST_IDENTIFIER if is_extended else LARGEST_STANDARD
+        mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)
+        object.__setattr__(self, "mask", mask)
 
 
 @dataclass(frozen=True)
@@ -336,8 +346,13 @@ def _check_frame(frame: Frame) -> None:
     if frame.module_byte is not None and not 1 <= frame.module_byte.width <= 8:
         raise refuse("a module's key in the payload has 1 to 8 bits")
     if frame.extended and not all(c.extended for c in frame.when if isinstance(c, Identifier)):
-        raise refuse("its identifiers have either 11 bits or 29: say extended=True in all conditions or in none")
+        raise refuse("its identifiers have either 11 bits or 29: write EXTENDED_FLAG in all conditions or in none")
     for condition in frame.when:
+        if isinstance(condition, Identifier):
+            try:
+                check_identifier(condition.value)
+            except ConfigurationError as error:
+                raise refuse(str(error)) from None
         if isinstance(condition, Identifier) and condition.value & ~condition.mask:
             raise refuse(f"identifier {condition.value:X} has bits outside its mask {condition.mask:X}: none matches")
         if isinstance(condition, Byte) and condition.offset >= min(frame.length):

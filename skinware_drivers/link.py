@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import Bus, Filter, FrameBatch
+from skinware_drivers.bus import EXTENDED_FLAG, LARGEST_IDENTIFIER, Bus, Filter, FrameBatch, identifier_text
 from skinware_drivers.decoding.filters import fewest, filters_of
 from skinware_drivers.layout import Layout
 
@@ -36,15 +36,24 @@ class Reply(NamedTuple):
 
 
 class Match(NamedTuple):
-    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``."""
+    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
+
+    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) counts whatever the mask.
+    """
 
     value: int
-    mask: int = 0x7FF
+    mask: int = LARGEST_IDENTIFIER
     prefix: bytes = b""
+
+    @property
+    def filter(self) -> Filter:
+        """Lets all frames through whose identifiers fit."""
+        return Filter(self.value, self.mask | EXTENDED_FLAG)
 
     def fits(self, frame: Reply) -> bool:
         """Whether a frame is such an answer."""
-        return frame.identifier & self.mask == self.value and frame.payload.startswith(self.prefix)
+        value, mask = self.filter
+        return frame.identifier & mask == value and frame.payload.startswith(self.prefix)
 
 
 class Heard(NamedTuple):
@@ -74,6 +83,10 @@ class Link:
         self._waiters: list[tuple[tuple[Match, ...], asyncio.Queue[Reply]]] = []
         self._late: deque[tuple[int, tuple[Match, ...]]] = deque()  # until when their answers are no strangers
         self._questions = 0
+        self._no_question = asyncio.Event()
+        self._no_question.set()
+        self._data_question = asyncio.Lock()  # held while one is open
+        self._expected: tuple[Match, asyncio.Event] | None = None
         self._heard: Counter[Heard] | None = None
 
     @property
@@ -89,14 +102,20 @@ class Link:
     @property
     def is_awaiting(self) -> bool:
         """Whether a question is open. Who follows frames, perhaps for ever, has asked none."""
-        return self._questions > 0
+        return self._questions > 0 or self._expected is not None
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:
-        """Send one frame; waits while the interface's queue is full.
+        """Send one frame; waits while a question in lock step is open (:meth:`ask`), or the interface's queue is full.
 
         Raises:
             BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
         """
+        if self._data_question.locked():
+            async with self._data_question:
+                pass
+        await self._send(identifier, payload, timeout_s)
+
+    async def _send(self, identifier: int, payload: bytes, timeout_s: float) -> None:
         loop = asyncio.get_running_loop()
         deadline_s, retry_s = loop.time() + timeout_s, _FIRST_RETRY_S
         while True:
@@ -131,7 +150,9 @@ class Link:
         if self._heard is not None:
             self._bus.narrow(())
             return
-        awaited = [Filter(m.value, m.mask) for matches, _ in self._waiters for m in matches]
+        awaited = [match.filter for matches, _ in self._waiters for match in matches]
+        if self._expected is not None:
+            awaited.append(self._expected[0].filter)
         self._bus.narrow(fewest([*self._wanted, *awaited]))
 
     @contextmanager
@@ -139,16 +160,23 @@ class Link:
         queue: asyncio.Queue[Reply] = asyncio.Queue()
         entry = (matches, queue)
         self._waiters.append(entry)
-        self._questions += is_question
+        self._count_questions(+is_question)
         self._tell_bus()
         try:
             yield queue
         finally:
             self._waiters.remove(entry)
-            self._questions -= is_question
+            self._count_questions(-is_question)
             if is_question:
                 self._late.append((now_ns() + _LATE_NS, matches))
             self._tell_bus()
+
+    def _count_questions(self, more: int) -> None:
+        self._questions += more
+        if self._questions:
+            self._no_question.clear()
+        else:
+            self._no_question.set()
 
     async def request(
         self, identifier: int, payload: bytes, reply: Match, *, timeout_s: float, tries: int = 1
@@ -168,9 +196,41 @@ class Link:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(timeout_s):
                         return await queue.get()
-        sent = f"{identifier:03X} [{payload.hex(' ').upper()}]"
+        sent = f"{identifier_text(identifier)} [{payload.hex(' ').upper()}]"
         times = "" if tries == 1 else f", {tries} times"
         raise HandshakeTimeout(f"{self.bus_name}: no answer to {sent} within {timeout_s:g} s{times}")
+
+    async def ask(self, identifier: int, payload: bytes, answer: Match, *, timeout_s: float) -> bool:
+        """Send one frame and wait for an answer that may be data; nothing else is sent on this bus meanwhile.
+
+        It waits until every ``request`` and ``collect`` has ended. For questions that are asked again and again, see
+        :class:`skinware_drivers.polling.Poll`.
+
+        Returns:
+            Whether an answer came within ``timeout_s``.
+
+        Raises:
+            BusSendError: as ``send``.
+        """
+        while True:
+            await self._no_question.wait()
+            async with self._data_question:
+                if not self._questions:
+                    return await self._ask(identifier, payload, answer, timeout_s)
+
+    async def _ask(self, identifier: int, payload: bytes, answer: Match, timeout_s: float) -> bool:
+        came = asyncio.Event()
+        self._expected = answer, came
+        self._tell_bus()
+        try:
+            await self._send(identifier, payload, timeout_s)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(timeout_s):
+                    await came.wait()
+        finally:
+            self._expected = None
+            self._tell_bus()
+        return came.is_set()
 
     async def collect(self, identifier: int, payload: bytes, reply: Match, *, duration_s: float) -> list[Reply]:
         """Send one frame and gather all answers that come within ``duration_s``.
@@ -205,6 +265,20 @@ class Link:
         """Let time pass; the bus keeps being read."""
         await asyncio.sleep(duration_s)
 
+    @property
+    def expects_data(self) -> bool:
+        """Whether a question is open whose answer may be data: ``hear`` wants to be called."""
+        return self._expected is not None
+
+    def hear(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> None:
+        """Look among frames of this bus, data or not, for the answer of ``ask`` (called by the runner)."""
+        if self._expected is None:
+            return
+        match, came = self._expected
+        likely = rows[_any_match((match,), batch.wire["identifier"][rows])].tolist()
+        if any(match.fits(_reply(batch, row)) for row in likely):
+            came.set()
+
     def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for.
 
@@ -225,10 +299,7 @@ class Link:
         waiting += [(matches, None) for _, matches in self._late]
         for matches, queue in waiting:
             for number in np.flatnonzero(_any_match(matches, identifier)).tolist():
-                row = rows[number]
-                wire = batch.wire[row]
-                payload = wire["payload"][: min(int(wire["length"]), batch.payload_size)].tobytes()
-                reply = Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload)
+                reply = _reply(batch, rows[number])
                 if any(match.fits(reply) for match in matches):
                     expected[number] = True
                     if queue is not None:
@@ -239,5 +310,12 @@ class Link:
 def _any_match(matches: Sequence[Match], identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
     found = np.zeros(len(identifier), bool)
     for match in matches:
-        found |= (identifier & match.mask) == match.value
+        value, mask = match.filter
+        found |= (identifier & mask) == value
     return found
+
+
+def _reply(batch: FrameBatch, row: int) -> Reply:
+    wire = batch.wire[row]
+    payload = wire["payload"][: min(int(wire["length"]), batch.payload_size)].tobytes()
+    return Reply(int(batch.time_ns[row]), int(wire["identifier"]), payload)

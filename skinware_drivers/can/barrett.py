@@ -29,7 +29,6 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Packed, Values
@@ -146,7 +145,7 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         await link.send(patch.key, bytes((_SET | self.options.tact, 0)) + value.to_bytes(4, "little"))
 
     async def _answers(self, link: Link, node: int) -> bool:
-        reply = Match(node << 5, mask=EXTENDED_FLAG | 0x3E0, prefix=bytes([_SET | _VERSION]))
+        reply = Match(node << 5, mask=0x3E0, prefix=bytes([_SET | _VERSION]))
         with contextlib.suppress(HandshakeTimeout):
             await link.request(node, bytes([_VERSION]), reply, timeout_s=_REPLY_S)
             return True

@@ -23,7 +23,6 @@ from canopen.objectdictionary import ObjectDictionary
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import CATALOGUE, SensorType
-from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.pdo_map import PdoMap, Tpdo, default_tpdos, tpdo_numbers
 from skinware_drivers.can.sdo import SdoAborted, SdoClient
@@ -39,7 +38,6 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 FIRST_NODE, LAST_NODE = 1, 127
 _START, _ENTER_PRE_OPERATIONAL = 0x01, 0x80
 _BOOT_UP, _OPERATIONAL = 0, 5
-_EXACT = EXTENDED_FLAG | 0x7FF
 _LAST_SYNCHRONOUS = 240
 _MOST_ERRORS_TOLD = 10
 _LOST_HEARTBEATS, _LEAST_HEARTBEAT_LOSS_S = 3, 0.2
@@ -164,7 +162,7 @@ class CanopenDriver(CanAdapter[CanopenOptions]):
         """Boot-up, heartbeat and EMCY of all nodes."""
         patches = {patch.key: patch for patch in self.patches}
         nodes = {node: _NodeState(patch, self.tell) for node, patch in patches.items()}
-        matches = [Match(base + node, mask=_EXACT) for node in nodes for base in (0x700, 0x080)]
+        matches = [Match(base + node) for node in nodes for base in (0x700, 0x080)]
         loss_s = max(_LOST_HEARTBEATS * self.options.heartbeat_ms / 1e3, _LEAST_HEARTBEAT_LOSS_S)
         with link.follow(*matches) as frames:
             while True:

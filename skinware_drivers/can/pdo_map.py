@@ -171,10 +171,7 @@ class PdoMap:
                 yield self._frame(tpdo, f"TPDO {number}", Identifier(base, 0x780), Bits(0, 7))
                 continue
             for node in of_nodes:
-                identifier = base + node
-                extended = identifier >= EXTENDED_FLAG
-                exact = Identifier(identifier & 0x1FFF_FFFF, extended=extended)
-                yield self._frame(tpdo, f"TPDO {number} of node {node}", exact, node)
+                yield self._frame(tpdo, f"TPDO {number} of node {node}", Identifier(base + node), node)
 
     def _frame(self, tpdo: Tpdo, name: str, identifier: Identifier, patch: Bits | int) -> Frame:
         return Frame(name, (identifier,), (tpdo.length,), tuple(self._runs(tpdo)), patch=patch, module=tpdo.number)

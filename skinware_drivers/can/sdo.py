@@ -14,7 +14,6 @@ from canopen.sdo import constants as sdo
 from canopen.sdo.exceptions import SdoAbortedError
 
 from skinware.errors import BusError, HandshakeTimeout
-from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.link import Link, Match
 
 REPLY_S = 0.2
@@ -112,7 +111,7 @@ class SdoClient:
         return payload
 
     async def _exchange(self, target: _Object, request: bytes, is_answer: Callable[[bytes], bool]) -> bytes:
-        with self._link.follow(Match(0x580 + self.node, mask=EXTENDED_FLAG | 0x7FF)) as frames:
+        with self._link.follow(Match(0x580 + self.node)) as frames:
             await self._link.send(0x600 + self.node, request)
             try:
                 async with asyncio.timeout(REPLY_S):

@@ -82,6 +82,10 @@ class Generation:
 
     def digest(self, batch: FrameBatch) -> None:
         """Decode a batch and publish what is due."""
+        if any(line.link.expects_data for line in self.lines):
+            new = np.arange(max(batch.start, batch.headroom), batch.stop)
+            for line, own in zip(self.lines, split_by_bus(batch, new, len(self.lines)), strict=True):
+                line.link.hear(batch, own)
         found, foreign = self.decoder.decode(batch)
         if len(foreign):
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):

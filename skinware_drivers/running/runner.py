@@ -350,6 +350,7 @@ class Runner:
             return
         rows = np.arange(batch.start, batch.stop)
         for line, own in zip(self.lines, split_by_bus(batch, rows, len(self.lines)), strict=True):
+            line.link.hear(batch, own)
             line.link.offer(batch, own)
 
     def _publish_when_due(self) -> None:

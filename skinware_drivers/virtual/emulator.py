@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
 from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
@@ -29,7 +29,7 @@ from skinware_drivers.virtual.wire import Transmission, Transmitter
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
 CanFrame = tuple[int, bytes]
-"""Identifier and payload."""
+"""Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""
 Source = Callable[[int, int], Sequence[int]]
 """(number of the device, number of its burst) -> the values that it sends, whatever is felt."""
 
@@ -204,6 +204,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
 
     def reply(self, device: Device, frame: CanFrame, now_ns: int) -> None:
         """Send one frame beside the data."""
+        self._check([frame])
         device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
     def burst(self, device: Device, time_ns: int) -> None:
@@ -274,7 +275,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         random = np.random.default_rng([self.options.seed, 2])
         others = np.setdiff1d(np.arange(0x7FF), np.array(sorted(self.identifiers)))
         identifiers = random.choice(others, min(_FOREIGN_IDENTIFIERS, len(others)), replace=False).tolist()
-        identifiers += [EXTENDED_FLAG | 0x1234_0000 | own for own in sorted(self.identifiers)[:4]]
+        identifiers += [EXTENDED_FLAG | 0x1234_0000 | own & 0x7FF for own in sorted(self.identifiers)[:4]]
         hz = self.options.foreign_hz
         return [ForeignTraffic(identifiers, hz, random, self.wire.attach(), self.log, self.counts, now_ns)]
 
@@ -299,7 +300,13 @@ class Emulator(Stage, HasOptions[OptionsT]):
             )
         return delay_ns
 
+    def _check(self, frames: Sequence[CanFrame]) -> None:
+        if self.medium == "can":
+            for identifier, _ in frames:
+                check_identifier(identifier)
+
     def _send(self, device: Device, frames: Sequence[CanFrame], time_ns: int, ready_ns: int) -> None:
+        self._check(frames)
         options, random = self.options, self._random[device.number]
         chances = (options.lose, options.truncate, options.corrupt, options.repeat)
         hit = random.random((len(frames), len(chances))) < chances

@@ -30,7 +30,7 @@ PERIOD_S = 0.02
 def half(number: int) -> Frame:
     return Frame(
         f"half {number}",
-        when=(Identifier(0x18A5_0000 | number, mask=0x1FFF_00FF, extended=True),),
+        when=(Identifier(EXTENDED_FLAG | 0x18A5_0000 | number, mask=0x1FFF_00FF),),
         length=(64,),
         values=Values(4, "<u2", 30, to=range(30 * number, 30 * number + 30)),
         patch=Bits(shift=8, width=8),

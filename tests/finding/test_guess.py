@@ -47,7 +47,7 @@ class Long(CanAdapter[NoOptions]):
 
     types = (PRESSURE,)
     layout = Layout(
-        [Frame("fd", [Identifier(0x1230000, 0x1FFF0000, extended=True), Byte(20, 0x55)], (24,), Values(0, "u1", 16))]
+        [Frame("fd", [Identifier(EXTENDED_FLAG | 0x1230000, 0x1FFF0000), Byte(20, 0x55)], (24,), Values(0, "u1", 16))]
     )
 
 

@@ -23,7 +23,7 @@ NODE = Bits(shift=8, width=8)
 PART = Bits(shift=0, width=4)
 EXTENDED = Frame(
     "extended",
-    when=(Identifier(0x14F0_0000, mask=0x1FFF_0000, extended=True),),
+    when=(Identifier(EXTENDED_FLAG | 0x14F0_0000, mask=0x1FFF_0000),),
     length=(8,),
     values=Values(0, "<u2", 2),
     patch=NODE,
@@ -199,9 +199,9 @@ def test_types_of_several_buses_are_put_together() -> None:
 def test_identifiers_that_cannot_be_matched_are_refused() -> None:
     values = Values(0, "u1", 1)
     with pytest.raises(ConfigurationError, match="either 11 bits or 29"):
-        Layout([Frame("f", (Identifier(1), Identifier(2, extended=True)), (8,), values)])
-    with pytest.raises(ConfigurationError, match="800 has bits outside its mask 7FF"):
-        Layout([Frame("f", (Identifier(0x800),), (8,), values)])
+        Layout([Frame("f", (Identifier(1), Identifier(EXTENDED_FLAG | 2)), (8,), values)])
+    with pytest.raises(ConfigurationError, match="7FF has bits outside its mask F0: none matches"):
+        Layout([Frame("f", (Identifier(0x7FF, 0xF0),), (8,), values)])
     layouts = [
         Layout([Frame(f"f{i}", (Identifier(i),), (8,), values) for i in range(bus, MOST_FRAMES // 2 + 1)])
         for bus in range(2)

@@ -42,7 +42,7 @@ def test_frames_of_the_layout_pass_and_no_others() -> None:
             frame("b", Identifier(0x470, 0x7F0), Byte(0, 0xC0)),
             frame("c", Identifier(0x480, 0x7F0)),
             frame("d", Identifier(0x123)),
-            frame("e", Identifier(0x18FF_0042, extended=True)),
+            frame("e", Identifier(EXTENDED_FLAG | 0x18FF_0042)),
             frame("f", Identifier(0x500, 0x700), Identifier(0x007, 0x00F)),
             frame("never", Identifier(0x500, 0x700), Identifier(0x600, 0x700)),
         ]
@@ -126,7 +126,7 @@ def test_no_filter_hides_an_answer_and_a_listener_hears_all() -> None:
         await link.collect(0x70F, b"\xff", Match(0x700, 0x70F, b"\xff"), duration_s=0)
         assert passing(bus.while_sending[0]) == [*range(0x470, 0x480), *range(0x700, 0x800, 0x10)]
         with pytest.raises(TimeoutError):
-            await link.request(0x207, b"", Match(EXTENDED_FLAG | 0x99, EXTENDED_FLAG | 0x1FFF_FFFF), timeout_s=0)
+            await link.request(0x207, b"", Match(EXTENDED_FLAG | 0x99), timeout_s=0)
         assert passes(bus.while_sending[1], EXTENDED_FLAG | 0x99)
         listening = asyncio.create_task(link.listen(0.001))
         await asyncio.sleep(0)

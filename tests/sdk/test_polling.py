@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import cast
 
 import numpy as np
 import pytest
 
 from skinware import BusState, DriverReader
 from skinware.errors import BusSendError, ConfigurationError
+from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
+from skinware_drivers import polling
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link
+from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Poll, Poller
+from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import WireFrame
 from tests.sdk.driving import TroubledBus, driving_lines, read_until
@@ -106,50 +112,236 @@ def test_polls_stop_with_a_lost_bus_and_go_on_when_it_is_back() -> None:
         wait_until(lambda: len(device.asked_ns) > asked + 3)
 
 
-class FullBus:
-    """Takes a frame only now and then."""
+class Line:
+    """A line that takes what it wants to, and notes what was sent and when."""
 
-    listen_only = False
-    channel = "full"
+    listen_only = narrows = False
+    name = channel = "line"
 
-    def __init__(self, taken: Sequence[bool]) -> None:
-        self.taken = iter(taken)
-        self.identifiers: list[int] = []
-
-    @property
-    def sent(self) -> int:
-        return len(self.identifiers)
+    def __init__(self, clock: Callable[[], int] = now_ns, takes: Callable[[], bool] = lambda: True) -> None:
+        self.sent: list[tuple[float, int, bytes]] = []
+        self._clock, self._takes = clock, takes
 
     def send(self, identifier: int, payload: bytes) -> None:
-        if not next(self.taken, False):
+        if not self._takes():
             raise BusSendError("queue full")
-        self.identifiers.append(identifier)
+        self.sent.append((self._clock() / 1e9, identifier, payload))
+
+    @property
+    def times_s(self) -> list[float]:
+        return [time_s for time_s, _, _ in self.sent]
+
+    @property
+    def payloads(self) -> list[bytes]:
+        return [payload for _, _, payload in self.sent]
+
+
+class Polling:
+    """A poller on a line, in time of its own; what the line says back is up to the test."""
+
+    def __init__(self, clock: HandClock, polls: Callable[[], Sequence[Poll]]) -> None:
+        self.line = Line(clock)
+        self.link = Link(self.line)  # type: ignore[arg-type]
+        self.counters = BusCounters()
+        self._polls = polls
+
+    def hear(self, identifier: int, payload: bytes) -> None:
+        batch = FrameBatch(1)
+        batch.append(0, 0, identifier, payload)
+        self.link.hear(batch, np.arange(1))
+
+    async def for_s(self, duration_s: float) -> None:
+        task = asyncio.create_task(Poller(self.link, self.counters).run(self._polls, lambda: False))
+        await asyncio.sleep(duration_s)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+def poll_for(
+    duration_s: float,
+    polls: Callable[[], Sequence[Poll]],
+    answering: Callable[[Polling], Coroutine[None, None, None]] | None = None,
+) -> Polling:
+    clock = HandClock()
+    polling = Polling(clock, polls)
+
+    async def scenario() -> None:
+        other = asyncio.create_task(answering(polling)) if answering is not None else None
+        await polling.for_s(duration_s)
+        if other is not None:
+            other.cancel()
+            await asyncio.gather(other, return_exceptions=True)
+
+    run_in_its_time(clock, scenario)
+    return polling
+
+
+async def _answer_after(polling: Polling, delay_s: float, deaf: bytes = b"") -> None:
+    """Devices that answer after a while, each with its own identifier; one does not."""
+    answered = 0
+    while True:
+        await asyncio.sleep(0.0005)
+        while len(polling.line.sent) > answered:
+            _, identifier, payload = polling.line.sent[answered]
+            answered += 1
+            if payload != deaf:
+                await asyncio.sleep(delay_s)
+                polling.hear(identifier + 1, payload)
 
 
 def test_a_bus_that_takes_nothing_is_not_flooded_and_every_miss_is_counted() -> None:
-    bus, counters = FullBus([True]), BusCounters()
-    poller = Poller(Link(bus), counters)  # type: ignore[arg-type]
-    polls = [replace(ASK, period_s=0.01)]
-    asyncio.run(
-        asyncio.wait_for(poller.run(lambda: polls if counters.polls_missed < 5 else [], lambda: False), timeout=30)
-    )
-    assert bus.sent == 1
+    bus, counters = Line(takes=iter([True] + [False] * 1000).__next__), BusCounters()
+
+    async def scenario() -> None:
+        poller = Poller(Link(bus), counters)  # type: ignore[arg-type]
+        task = asyncio.create_task(poller.run(lambda: [replace(ASK, period_s=0.01)], lambda: False))
+        async with asyncio.timeout(30):
+            while counters.polls_missed < 5:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(scenario())
+    assert len(bus.sent) == 1
 
 
 def test_other_polls_are_taken_up_while_running() -> None:
-    bus = FullBus([True] * 100)
-    poller = Poller(Link(bus), BusCounters())  # type: ignore[arg-type]
-    first, second = replace(ASK, period_s=0.005), replace(ASK, identifier=0x102, period_s=0.001)
+    """Another period counts from the last question on, not from the next."""
+    first, second = replace(ASK, period_s=0.01), replace(ASK, identifier=0x102, period_s=0.005)
+    sent: list[int] = []
 
     def polls() -> list[Poll]:
-        if bus.sent < 3:
-            return [first]
-        return [second] if bus.sent < 6 else []
+        sent.append(0)
+        return [first] if len(sent) <= 3 else [second]
 
-    asyncio.run(asyncio.wait_for(poller.run(polls, lambda: False), timeout=30))
-    assert bus.identifiers == [0x100] * 3 + [0x102] * 3
+    line = poll_for(0.0399, polls).line
+    assert [identifier for _, identifier, _ in line.sent] == [0x100] * 3 + [0x102] * 2
+    assert np.diff(line.times_s) == pytest.approx([0.01, 0.01, 0.01, 0.005])
 
 
-def test_a_period_of_zero_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="poll 100 every 0 s: give more than 0"):
-        Poll(0x100, b"", 0)
+def test_a_changing_payload_keeps_the_period() -> None:
+    """The poll is known by its place, not by what it says: each period one question, and `polls` is called once."""
+    numbers = itertools.count()
+    line = poll_for(1.005, lambda: [replace(ASK, payload=bytes([next(numbers)]), period_s=0.01)]).line
+    assert line.payloads == [bytes([number]) for number in range(101)]
+    assert np.diff(line.times_s) == pytest.approx(0.01)
+
+
+def test_no_polls_are_a_pause() -> None:
+    paused = [False]
+
+    async def pause(polling: Polling) -> None:
+        await asyncio.sleep(0.105)
+        paused[0] = True
+        await asyncio.sleep(1.0)
+        paused[0] = False
+
+    line = poll_for(2.0, lambda: () if paused[0] else (replace(ASK, period_s=0.01),), pause).line
+    pauses_s = np.diff(line.times_s)
+    assert ((pauses_s > 0.9) & (pauses_s < 1.1)).sum() == 1
+    assert len(line.sent) > 90
+
+
+def test_polls_that_raise_are_told_once_and_called_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A driver with such a mistake says where and what, keeps its other buses, and goes on when it is over."""
+    monkeypatch.setattr(polling, "_AFTER_A_FAILURE_S", 0.01)
+    calls = itertools.count()
+
+    class Raising(Answering):
+        @property
+        def polls(self) -> Sequence[Poll]:  # type: ignore[override]
+            number = next(calls)
+            if number < 3:
+                raise ZeroDivisionError("no period")
+            return (ASK,) if number < 5 or number > 7 else [cast(Poll, 7)]
+
+    device = Device()
+    with driving_lines([(Raising(NoOptions()), bus_with(device))], "raising"), DriverReader("raising") as reader:
+        read_until(reader, lambda frame: not frame.status.any())
+        wait_until(lambda: len(device.asked_ns) > 5)
+    told = [record.message for record in caplog.records if "polls" in record.message]
+    assert told == [
+        "bus virtual:Device: `polls` failed, trying again: ZeroDivisionError: no period",
+        "bus virtual:Device: `polls` failed, trying again: AttributeError: 'int' object has no attribute 'period_s'",
+    ]
+
+
+IN_STEP = [
+    replace(ASK, payload=bytes([node]), period_s=0.02, answer=Match(0x101), timeout_s=0.01) for node in (1, 2, 3)
+]
+
+
+def test_the_next_question_waits_for_the_answer() -> None:
+    line = poll_for(0.0999, lambda: IN_STEP, lambda p: _answer_after(p, 0.004)).line
+    assert line.payloads == [b"\1", b"\2", b"\3"] * 5
+    steps_s = np.diff(line.times_s).reshape(-1)
+    assert (steps_s > 0.0039).all()
+    assert np.diff(line.times_s[::3]) == pytest.approx(0.02)  # no drift
+
+
+def test_a_device_that_does_not_answer_costs_its_timeout() -> None:
+    polling = poll_for(0.0999, lambda: IN_STEP, lambda p: _answer_after(p, 0.001, deaf=b"\2"))
+    assert polling.line.payloads == [b"\1", b"\2", b"\3"] * 5
+    assert polling.counters.polls_unanswered == 5
+    times_s = polling.line.times_s
+    assert [times_s[i + 1] - times_s[i] for i in range(1, 15, 3)] == pytest.approx([0.01] * 5)
+
+
+def test_devices_too_slow_for_the_period_have_their_turns_and_it_is_counted() -> None:
+    polling = poll_for(0.3, lambda: IN_STEP, lambda p: _answer_after(p, 0.009))
+    shares = np.bincount([payload[0] for payload in polling.line.payloads])[1:]
+    assert shares.min() > 8
+    assert shares.max() - shares.min() <= 2
+    assert polling.counters.polls_missed > 5
+    assert polling.counters.polls_unanswered == 0
+
+
+def test_a_handshake_and_a_poll_in_lock_step_never_ask_at_the_same_time() -> None:
+    asked: list[Reply] = []
+
+    async def ask_too(polling: Polling) -> None:
+        answers = asyncio.create_task(_answer_after(polling, 0.003))
+        await asyncio.sleep(0.0405)  # a poll is open
+        request = asyncio.create_task(polling.link.request(0x7, b"?", Match(0x8), timeout_s=1))
+        await asyncio.sleep(0.05)
+        batch = FrameBatch(1)
+        batch.append(0, 0, 0x8, b"!")
+        polling.link.offer(batch, np.arange(1))
+        asked.append(await request)
+        await answers
+
+    line = poll_for(0.2, lambda: IN_STEP, ask_too).line
+    assert asked[0].payload == b"!"
+    at = line.payloads.index(b"?")
+    times_s = line.times_s
+    assert times_s[at] - times_s[at - 1] > 0.0029  # the open one was answered first
+    assert times_s[at + 1] - times_s[at] > 0.03  # and the next one waited for this one
+
+
+def test_an_answer_is_heard_among_the_data(caplog: pytest.LogCaptureFixture) -> None:
+    """A running driver: the answer belongs to the layout, and lets the next question out all the same."""
+    slow = replace(ASK, period_s=0.002, answer=Match(0x101), timeout_s=20.0)
+
+    class InStep(Answering):
+        polls = (slow,)
+
+    device = Device()
+    with driving_lines([(InStep(NoOptions()), bus_with(device))], "in_step") as running:
+        wait_until(lambda: len(device.asked_ns) > 20)
+        assert running.status()["buses"][0]["polls_unanswered"] == 0
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Poll(0x100, b"", 0), "poll 100 every 0 s: give more than 0"),
+        (lambda: Poll(0x100, b"", 1, timeout_s=1), "poll 100 has a timeout and no `answer`"),
+        (lambda: Poll(0x100, b"", 1, Match(1), 0), "poll 100 waits 0 s for its answer"),
+    ],
+)
+def test_polls_that_cannot_be_are_refused(make: Callable[[], Poll], words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words):
+        make()

@@ -81,7 +81,7 @@ def read_drawing(path: Path, notes: Notes) -> Drawing:
         unused.add("x, y, orientation, gain, mirror and layout of each module")
     if unused:
         text = "for the picture on the screen, no metres; not used"
-        notes.add("unused", path, text, element="; ".join(sorted(unused)))
+        notes.add("info", path, text, element="; ".join(sorted(unused)))
     return drawing
 
 

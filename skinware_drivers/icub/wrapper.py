@@ -77,7 +77,7 @@ class _WrapperReader(Reader):
         for name, why in _UNUSED.items():
             if name in group.params:
                 group.params[name].understood = True
-                self.note("unused", group.params[name], why)
+                self.note("info", group.params[name], why)
         for action in group.actions:
             action.understood = True
         for element in self._rest(group):

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from skinware_drivers.icub.notes import Note
 
 _HEADINGS = {
-    "todo": "To be filled in or decided",
-    "odd": "Understood, but look at it",
-    "unknown": "Not understood, left out",
-    "missing": "Not there",
+    "todo": "To fill in or decide",
+    "odd": "Worth checking",
+    "unknown": "Not understood and left out",
+    "missing": "Missing",
     "info": "Nothing to do",
 }
 

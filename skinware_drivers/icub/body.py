@@ -149,7 +149,7 @@ def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Plac
             body.shapes[place] = shape
             if shape[0] == "palm":
                 text = f"channel 11 of {places_text([place])} is taken to be thermal, as in most palm triangles"
-                notes.add("odd", drawing.path, text)
+                notes.add("info", drawing.path, text)
 
 
 def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:

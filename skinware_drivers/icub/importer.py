@@ -63,7 +63,7 @@ class ImportedPart:
 
     def geometry(self) -> str:
         """The text of its geometry file."""
-        lines = f"Places of the sensors of {self.name}, made by skin-import: read it with skinware.geometry."
+        lines = f"Places of the sensors of {self.name}, made by skin-import. Read it with skinware.geometry."
         return geometry_to_toml(self.groups, lines)
 
     def figures(self) -> dict[str, object]:
@@ -184,9 +184,9 @@ def _take(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes, *, 
     elif is_drawing(text):
         sources.drawings.append(path)
     elif is_asked_for:
-        raise ConfigurationError(f"{path}: neither positions nor a drawing of skinGui")
+        raise ConfigurationError(f"{path}: neither a position file nor a drawing of skinGui")
     else:
-        notes.add("info", path, "neither positions nor a drawing of skinGui")
+        notes.add("info", path, "neither a position file nor a drawing of skinGui")
 
 
 def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
@@ -221,7 +221,7 @@ class _Wrappers:
         where = part.element.file.resolve().parts
         of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
         if not of_part:
-            text = "no skinWrapper with its ports: the body parts, and so the places of the taxels, are not known"
+            text = "no skinWrapper with its ports, so its body parts and the places of its taxels are unknown"
             notes.add("missing", part.element.file, text, line=part.element.line, element=part.element.label)
             return ()
         element, wrapper, own = max(of_part, key=lambda entry: _shared(where, entry[0].file.resolve().parts))
@@ -293,7 +293,11 @@ class _BodyFiles:
         candidates = exact if len(exact) == 1 else [*exact, *similar]
         if len(candidates) > 1:
             names = ", ".join(path.name for path in candidates)
-            self._note(port, "todo", f"whose positions? {names}; none is used: say --positions {port.name}=FILE")
+            self._note(
+                port,
+                "todo",
+                f"several position files ({names}), none used: choose one with --positions {port.name}=FILE",
+            )
             return None
         return candidates[0] if candidates else None
 

@@ -21,10 +21,12 @@ DEVICE_TYPES = (ETHERNET, CAN)
 """Devices with skin: boards behind an Ethernet board, and boards on a CAN bus of the robot's computer."""
 
 _PATCH_PARAMETER = "skinCanAddrsPatch"
-_HOST_DEFAULTS = "the host's own default"
+_HOST_DEFAULTS = "the default of the robot's software"
 _LARGEST = {"period": 255, "skinType": 15, "noLoad": 255, "shift": 255, "cdcOffset": 0xFFFF}
 _GROUPS_OF_THE_ROBOT = {"GENERAL", "PC104", "ETH", "ETH_BOARD", "SERVICE", "TRANSCEIVER", "PROTOCOL"}
 """What the devices of all robots include, and what says nothing about skin."""
+_MOST_TRIANGLE_SETS = 20
+"""What the robot's software reads; files of legs and arms have up to twice as many."""
 _SKIN_TYPES = (0, 1, 2, 3, 7, 8)
 
 
@@ -138,7 +140,7 @@ class _PartReader(Reader):
             if ["socketcan"] in kinds and self._can_device is not None:
                 self._part.bus_name = f"can{self._can_device}"
             if "period" in params:
-                self._unused(params["period"], "how often the host reads its buffer")
+                self._unused(params["period"], "how often the robot's software reads its buffer")
             return
         patches = self._group.groups.get("patches")
         for name, element in patches.params.items() if patches else ():
@@ -174,7 +176,7 @@ class _PartReader(Reader):
         part.skin_type = self._default(board, "skinType", part.skin_type)
         part.no_load = self._default(board, "noLoad", part.no_load)
         if part.skin_type not in _SKIN_TYPES:
-            self.note("odd", board["skinType"], f"no firmware is known to have the skin type {part.skin_type}")
+            self.note("odd", board["skinType"], f"no known firmware has the skin type {part.skin_type}")
         if "diagnostic" in board:
             self._unused(board["diagnostic"], "whether the robot's software logs faults; Skinware always shows them")
         triangle = self._params_of("defaultCfgTriangle")
@@ -210,8 +212,11 @@ class _PartReader(Reader):
             return []
         count = self.number(group.params.get("numOfSets"), 0, 1000)
         if count is None:
-            self.note("missing", group.element, "no usable numOfSets: the host refuses such a file; no set was used")
+            self.note("missing", group.element, "no usable numOfSets: the robot refuses such a file; no set is used")
             count = 0
+        if prefix == "triangleSetCfg" and count > _MOST_TRIANGLE_SETS:
+            text = f"the robot's software reads the first {_MOST_TRIANGLE_SETS} of these {count} sets; here, all count"
+            self.note("info", group.element, text)
         width = len(columns.split())
         sets = []
         for number in range(1, count + 1):
@@ -228,7 +233,7 @@ class _PartReader(Reader):
                 sets.append((element, row))
         for name, element in group.params.items():
             if name.startswith(prefix) and not element.understood:
-                self._unused(element, f"beyond numOfSets = {count}: the host does not read it")
+                self._unused(element, f"beyond numOfSets = {count}: the robot does not read it")
         return sets
 
     def _read_board_sets(self) -> None:
@@ -259,7 +264,7 @@ class _PartReader(Reader):
                 self.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
             elif of_patch:
                 if enabled not in (0, 1):
-                    text = f"enabled = {enabled}: of this number, boards heed the lowest bit: {enabled & 1}"
+                    text = f"enabled = {enabled}: boards use the lowest bit only, which is {enabled & 1}"
                     self.note("odd", element, text)
                 triangles = tuple(range(first, last + 1))
                 self._part.triangle_sets.append(
@@ -293,13 +298,13 @@ class _PartReader(Reader):
             if element is None or row is None:
                 continue
             if len(row) != len(boards):
-                text = f"{len(row)} values for {len(boards)} boards; the host takes {default:#x} for the others"
+                text = f"{len(row)} values for {len(boards)} boards; the robot takes {default:#x} for the others"
                 self.note("odd", element, text)
             for board, value in zip(boards, row, strict=False):
                 if 0 <= value <= 255:
                     self._part.old[board].values[name] = value
                 else:
-                    self.refuse(element, f"{value} is no byte")
+                    self.refuse(element, f"{value} is not a byte")
 
     # What is left
 

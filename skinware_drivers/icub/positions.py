@@ -77,7 +77,7 @@ def read_positions(path: Path, notes: Notes) -> Positions:
     head, mark, body = text.partition(_CALIBRATION)
     found = _REPRESENTATIVES.search(head)
     if not mark or found is None:
-        raise ConfigurationError(f"{path}: no file of positions: it has no taxel2Repr (...) before [calibration]")
+        raise ConfigurationError(f"{path}: not a position file: it has no taxel2Repr (...) before [calibration]")
     representatives = _representatives(found[1], path)
     fields = {}
     for line_number, line in enumerate(_REPRESENTATIVES.sub("", head).splitlines(), 1):
@@ -87,10 +87,10 @@ def read_positions(path: Path, notes: Notes) -> Positions:
         elif key:
             notes.add("unknown", path, "not understood", line=line_number, element=line.strip()[:60])
     if fields.get("spatial_sampling", "taxel") != "taxel":
-        text = "the file wants one place per triangle; its lines, one per channel, are taken as they are"
+        text = "the file asks for one place per triangle; its places, one per channel, are kept"
         notes.add("info", path, text, element=f"spatial_sampling {fields['spatial_sampling']}")
     if not fields.get("name"):
-        notes.add("missing", path, "no frame: the numbers are in a frame that has no name", element="name")
+        notes.add("missing", path, "no frame is named, so nobody can tell whose axes these are", element="name")
     poses = _poses(body, head.count("\n"), path, notes)
     return _fit(path, fields.get("name", ""), representatives, poses, notes)
 

@@ -210,8 +210,8 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
             sets = [s for s in part.board_sets if s.patch == patch and board in s.boards]
             element = sets[-1].element
             text = (
-                f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, off again"
-                " by this set, and on again by nothing: they stay off, as on the robot"
+                f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, then off"
+                " by this set, and no set switches them on again: they stay off, as on the robot"
             )
             notes.add("odd", element.file, text, line=element.line, element=element.label)
     on = {(patch, board, t) for board in options.boards for t in BoardSetUp(options, board).enabled}
@@ -221,13 +221,13 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
     unknown = {place for place in on if place not in body.shapes and place not in body.bare}
     if unknown and part.old:
         text = (
-            'the files do not tell what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
+            'the files do not say what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
             f" without it, skin type {options.skin_type} decides"
         )
         _note(notes, "todo", part, text)
     elif {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}:
         special = {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}
-        text = f"fingertips or palms? taken to be fingertips, as no position file tells: {places_text(special)}"
+        text = f"fingertips or palms? No position file says, so they are taken to be fingertips: {places_text(special)}"
         _note(notes, "todo", part, text)
 
 

@@ -20,11 +20,11 @@ def number(text: str) -> int:
         ValueError: it is none.
     """
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
-        raise ValueError(f"{text[:20]!r} is no whole number")
+        raise ValueError(f"{text[:20]!r} is not a whole number")
     try:
         value = int(text, 16) if text.lower().startswith("0x") else int(text, 10)
     except ValueError:
-        raise ValueError(f"{text!r} is no whole number") from None
+        raise ValueError(f"{text!r} is not a whole number") from None
     return value
 
 

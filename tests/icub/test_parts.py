@@ -56,7 +56,7 @@ def test_triangles_that_the_files_switch_on_in_vain_are_named(made: Made) -> Non
     assert only_part(made).triangles == 16 + 4
     (line,) = made.said("odd").splitlines()
     assert line.startswith('skin.xml:9: param "boardSetCfg1": board 8: triangles 4-15 are switched on by')
-    assert line.endswith("on again by nothing: they stay off, as on the robot")
+    assert line.endswith("no set switches them on again: they stay off, as on the robot")
 
 
 def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
@@ -78,11 +78,11 @@ def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
         (triangle_sets("0 8 5 4 1 2 0x2200"), "unknown", "triangles 5 to 4: the firmware ignores a range outside 0-15"),
         (triangle_sets("0 8 0 16 1 2 0x2200"), "unknown", "triangles 0 to 16"),
         (triangle_sets("0 8 0 1 1 2"), "unknown", "6 numbers, not 7 (patch board firstTriangle"),
-        (triangle_sets("0 8 0 one 1 2 3"), "unknown", "'one' is no whole number; left out"),
+        (triangle_sets("0 8 0 one 1 2 3"), "unknown", "'one' is not a whole number; left out"),
         (triangle_sets("0 8 0 1 1 2 0x12200"), "unknown", "cdcOffset 0x12200 is impossible"),
-        (triangle_sets("0 8 0 1 2 2 0x2200"), "odd", "enabled = 2: of this number, boards heed the lowest bit: 0"),
+        (triangle_sets("0 8 0 1 2 2 0x2200"), "odd", "enabled = 2: boards use the lowest bit only, which is 0"),
         (triangle_sets("0 8 0 1 1 2 0x2200", count=2), "missing", "numOfSets is 2, but there is no triangleSetCfg2"),
-        (triangle_sets("0 8 0 1 0 2 0x2200", count=0), "info", "beyond numOfSets = 0: the host does not read it"),
+        (triangle_sets("0 8 0 1 0 2 0x2200", count=0), "info", "beyond numOfSets = 0: the robot does not read it"),
         (
             triangle_sets("2 8 0 1 1 2 0x2200"),
             "odd",
@@ -94,7 +94,7 @@ def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
         ('<param name="gain"> 4 </param>', "unknown", "param \"gain\": not understood: '4'"),
         ('<group name="more"><param name="x"> 1 </param></group>', "unknown", 'param "x": not understood'),
         ("<surprise> 7 </surprise>", "unknown", "surprise: not understood: '7'"),
-        ('<param name="period"> 10 </param>', "info", "how often the host reads its buffer"),
+        ('<param name="period"> 10 </param>', "info", "how often the robot's software reads its buffer"),
         ('<param name="4C_Timer"> 1 1 </param>', "info", "of the old set-up"),
         ('<param name="skinCanIds"> 9 </param>', "odd", "given again as '9'; the first counts ('7 8')"),
     ],
@@ -111,8 +111,8 @@ def test_every_value_that_has_no_place_is_named(made: Made, body: str, level: st
         ('"period"> 50 ', '"period"> 0 ', "unknown", 'param "period": 0 is outside 1-255; left out'),
         ('"period"> 50 ', '"period"> 50 51 ', "unknown", "'50 51' is not one number"),
         ('"period"> 50 ', '"periode"> 50 ', "unknown", "param \"periode\": not understood: '50'"),
-        ('"noLoad"> 0xf0 ', '"noLoad"> 240.0 ', "unknown", "'240.0' is no whole number"),
-        ('"skinType"> 0 ', '"skinType"> 5 ', "odd", "no firmware is known to have the skin type 5"),
+        ('"noLoad"> 0xf0 ', '"noLoad"> 240.0 ', "unknown", "'240.0' is not a whole number"),
+        ('"skinType"> 0 ', '"skinType"> 5 ', "odd", "no known firmware has the skin type 5"),
     ],
 )
 def test_defaults_that_are_no_use_are_named(made: Made, old: str, new: str, level: str, words: str) -> None:
@@ -120,7 +120,7 @@ def test_defaults_that_are_no_use_are_named(made: Made, old: str, new: str, leve
     only_part(made)
     assert words in made.said(level)
     if "skinType" not in old:
-        assert "the host's own default" in made.said("odd")
+        assert "the default of the robot's software" in made.said("odd")
 
 
 @pytest.mark.parametrize(
@@ -159,6 +159,13 @@ def test_the_sets_of_a_can_bus_name_it_by_its_number(made: Made) -> None:
         Kind(7, (5,), enabled=False, shift=2, cdc_offset=0x2200),
     )
     assert "patch" not in made.said("odd")
+
+
+def test_all_sets_count_however_many_the_robot_reads(made: Made) -> None:
+    sets = triangle_sets(*(f"0 {7 + n // 16} {n % 16} {n % 16} 1 2 0x2200" for n in range(32)))
+    made.write("skin.xml", device(DEFAULTS.replace("true", "false") + sets))
+    assert only_part(made).triangles == 32
+    assert "the robot's software reads the first 20 of these 32 sets; here, all count" in made.said("info")
 
 
 def test_what_every_robot_has_beside_skin_needs_nobody(made: Made) -> None:
@@ -238,7 +245,7 @@ def test_the_old_set_up(made: Made) -> None:
         modules=(Kind(8, (4, 5, 6, 7), enabled=False),),
     )
     assert "board 7: a period of 43.4176 ms becomes 43 ms" in made.said("info")
-    assert "1 values for 2 boards; the host takes 0xff for the others" in made.said("odd")
+    assert "1 values for 2 boards; the robot takes 0xff for the others" in made.said("odd")
     assert "board 8: 4E_Param 0x29: only bits 0, 1 and 3 are understood" in made.said("unknown")
     assert "board 8: 4E_Shift3_1 0x33: areas are not used" in made.said("info")
     assert 'add kind = "fingertip", "palm" or "triangle" to the options' in made.said("todo")
@@ -267,10 +274,10 @@ def test_other_devices_and_wrappers_without_a_device_are_named(made: Made) -> No
 @pytest.mark.parametrize(
     ("wrapper", "level", "words"),
     [
-        (WRAPPER.replace("0 383 0 383", "0 383 0 200"), "unknown", "the two ranges are not of one length"),
+        (WRAPPER.replace("0 383 0 383", "0 383 0 200"), "unknown", "the two ranges differ in length"),
         (WRAPPER.replace("0 383 0 383", "0 383"), "unknown", "2 numbers, not 4"),
         (WRAPPER.replace("0 383 0 383", "0 575 0 575"), "odd", "goes to 575, but the 2 boards have 384 values"),
-        (WRAPPER.replace("0 383 0 383", "a b c d"), "unknown", "'a' is no whole number"),
+        (WRAPPER.replace("0 383 0 383", "a b c d"), "unknown", "'a' is not a whole number"),
         (WRAPPER.replace("<action", '<param name="x"> 1 </param><action'), "unknown", 'param "x": not understood'),
         (WRAPPER.replace("> torso_skin <", "> torso_skin other <"), "odd", "several devices (torso_skin, other)"),
     ],

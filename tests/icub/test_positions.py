@@ -162,7 +162,7 @@ def test_lines_of_the_head_that_are_not_understood_are_named(torso: Made) -> Non
     torso.write("torso.txt", positions([TRIANGLE] * 32, head=head))
     part_of(torso)
     assert "torso.txt:3: colour blue: not understood" in torso.said("unknown")
-    assert "spatial_sampling triangle: the file wants one place per triangle" in torso.said("info")
+    assert "spatial_sampling triangle: the file asks for one place per triangle" in torso.said("info")
     torso.write("torso.txt", positions([TRIANGLE] * 32, head="spatial_sampling taxel"))
     part_of(torso)
     assert "torso.txt: name: no frame" in torso.said("missing")
@@ -172,7 +172,7 @@ def test_lines_of_the_head_that_are_not_understood_are_named(torso: Made) -> Non
     ("text", "words"),
     [
         ("taxel2Repr [calibration]", "it has no taxel2Repr"),
-        ("taxel2Repr ( 1 2 x ) [calibration]", "taxel2Repr: 'x' is no whole number"),
+        ("taxel2Repr ( 1 2 x ) [calibration]", "taxel2Repr: 'x' is not a whole number"),
         ("taxel2Repr ( 1 2 3 )\n[calibration]\n", "no whole triangle"),
     ],
 )
@@ -187,7 +187,10 @@ def test_which_file_is_meant_is_asked_where_it_is_open(torso: Made) -> None:
     torso.write("torso_V2.txt", positions([FINGERTIP] * 32))
     torso.write("torsolike.txt", positions([FINGERTIP] * 32))
     assert part_of(torso).groups == []
-    assert "whose positions? torso_V1.txt, torso_V2.txt; none is used: say --positions torso=FILE" in torso.said("todo")
+    assert (
+        "several position files (torso_V1.txt, torso_V2.txt), none used: choose one with --positions torso=FILE"
+        in torso.said("todo")
+    )
     assert len(part_of(torso, positions={"torso": first}).groups) == 64
     assert "torsolike.txt: no body part of this name is imported" in torso.said("info")
     torso.write("torso.txt", positions([FINGERTIP] * 32))
@@ -219,7 +222,7 @@ def test_a_drawing_tells_what_modules_are_where_no_positions_do(torso: Made) -> 
     assert bus.options.modules == (Kind(7, (1,), kind="fingertip"), Kind(8, (0, 1, 2, 3), kind="palm"))
     unknown = torso.said("unknown").splitlines()
     assert [line.split(": ")[0] for line in unknown] == [f"torso.ini:{n}" for n in (4, 11, 12, 13)]
-    assert "a module of the kind 'quad16', which nobody here knows" in unknown[1]
+    assert "a module of the kind 'quad16', which is not known here" in unknown[1]
     assert "draws triangles 40, which the port torso does not have" in torso.said("odd")
     assert "on, but not drawn: patch 1 board 7: 2-15; patch 1 board 8: 5-15" in torso.said("odd")
     assert "x, y, orientation, gain, mirror and layout of each module: for the picture" in torso.said("info")
@@ -250,5 +253,5 @@ def test_several_drawings_of_one_part_are_no_use(torso: Made) -> None:
 def test_a_hand_of_which_no_file_tells_is_to_be_decided(torso: Made) -> None:
     torso.write("skin.xml", device(DEFAULTS + board_sets("0 8 8 50 1 0xf0") + triangle_sets("0 8 0 11 1 2 0x2200")))
     part_of(torso)
-    assert "fingertips or palms? taken to be fingertips" in torso.said("todo")
+    assert "fingertips or palms? No position file says, so they are taken to be fingertips" in torso.said("todo")
     assert "patch 1 board 8: 0-11" in torso.said("todo")

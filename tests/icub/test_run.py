@@ -99,7 +99,7 @@ def test_one_part_goes_to_stdout_and_the_remarks_to_stderr(made: Made, capsys: p
     out, err = capsys.readouterr()
     assert out.startswith("# torso_skin (canBusSkin), made by skin-import from skin.xml.\n")
     assert 'name = "can0"' in out
-    assert "Not understood, left out:\n" in err
+    assert "Not understood and left out:\n" in err
     assert "skin.xml:9: param \"gain\": not understood: '4'" in err
     assert "Nothing to do: 1 (-v names them)" in err
     assert call(made.folder, "-v") == 0
@@ -184,7 +184,7 @@ def test_a_file_that_is_named_must_be_of_use(made: Made, capsys: pytest.CaptureF
     assert "does not exist" in capsys.readouterr().err
     path = made.write("notes.txt", "nothing")
     assert call(path) == 2
-    assert "neither positions nor a drawing of skinGui" in capsys.readouterr().err
+    assert "neither a position file nor a drawing of skinGui" in capsys.readouterr().err
     assert call(made.write("a.xml", "<a")) == 2
     assert "a.xml:1: not XML" in capsys.readouterr().err
 

@@ -111,7 +111,7 @@ def _pairs(texts: Sequence[str], form: str) -> list[tuple[str, str]]:
 
 def _patch(text: str) -> int:
     if text not in ("1", "2"):
-        raise ConfigurationError(f"--bus {text}=...: a patch is 1 or 2")
+        raise ConfigurationError(f"--bus {text}=...: a patch is 1 or 2; the bus of a canBusSkin is 1")
     return int(text)
 
 

@@ -147,10 +147,12 @@ def _flat(path: Path, element: ET.Element) -> tuple[dict[str, str], dict[str, di
             group = groups.setdefault(child.get("name", ""), {})
             for param in child.findall("param"):
                 group.setdefault(param.get("name", ""), param.text or "")
+        elif child.tag == "include" or child.get("file"):
+            name = child.get("href") or child.get("file") or ""
+            files = [folder / name for folder in path.parents if (folder / name).is_file()]
+            inner = _flat(files[0], _xml(files[0])) if files else inner  # relative to the file or to the robot
         elif child.tag == "params":
             inner = _flat(path, child)
-        elif child.tag == "include" and (file := path.parent / child.get("href", "")).is_file():
-            inner = _flat(file, _xml(file))
         params = {**inner[0], **params}
         groups = {**inner[1], **groups}
     return params, groups

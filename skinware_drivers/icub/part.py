@@ -264,11 +264,10 @@ class _PartReader(Reader):
                 self.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
             elif of_patch:
                 if enabled not in (0, 1):
-                    text = f"enabled = {enabled}: boards use the lowest bit only, which is {enabled & 1}"
-                    self.note("odd", element, text)
+                    self.note("info", element, f"enabled = {enabled}: counts as 1, as on the robot")
                 triangles = tuple(range(first, last + 1))
                 self._part.triangle_sets.append(
-                    TriangleSet(element, patch, board, triangles, bool(enabled & 1), shift, cdc_offset)
+                    TriangleSet(element, patch, board, triangles, bool(enabled), shift, cdc_offset)
                 )
 
     def _patch_of(self, element: Element, number: int) -> int:
@@ -313,7 +312,7 @@ class _PartReader(Reader):
         self.note("info", element, why)
 
     def _name_the_rest(self, group: Group) -> None:
-        for name in _GROUPS_OF_THE_ROBOT & set(group.groups):
+        for name in sorted(_GROUPS_OF_THE_ROBOT & set(group.groups)):
             for element in _elements_of(group.groups[name]):
                 element.understood = True
             self._unused(group.groups[name].element, "of the robot's computer and its Ethernet boards")

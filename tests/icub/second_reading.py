@@ -126,7 +126,7 @@ def _messages(groups: dict[str, dict[str, str]], patch: int, address: int) -> It
     for row in _sets(groups, "specialCfgTriangles", "triangleSetCfg"):
         number, board_address, first, last, enabled, shift, offset = row
         if (number, board_address) == (patch, address):
-            yield bytes((0x50, first, last, shift, enabled, offset & 255, offset >> 8))
+            yield bytes((0x50, first, last, shift, enabled != 0, offset & 255, offset >> 8))
 
 
 def _sets(groups: dict[str, dict[str, str]], name: str, prefix: str) -> list[list[int]]:

@@ -80,7 +80,7 @@ def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
         (triangle_sets("0 8 0 1 1 2"), "unknown", "6 numbers, not 7 (patch board firstTriangle"),
         (triangle_sets("0 8 0 one 1 2 3"), "unknown", "'one' is not a whole number; left out"),
         (triangle_sets("0 8 0 1 1 2 0x12200"), "unknown", "cdcOffset 0x12200 is impossible"),
-        (triangle_sets("0 8 0 1 2 2 0x2200"), "odd", "enabled = 2: boards use the lowest bit only, which is 0"),
+        (triangle_sets("0 8 0 1 2 2 0x2200"), "info", "enabled = 2: counts as 1, as on the robot"),
         (triangle_sets("0 8 0 1 1 2 0x2200", count=2), "missing", "numOfSets is 2, but there is no triangleSetCfg2"),
         (triangle_sets("0 8 0 1 0 2 0x2200", count=0), "info", "beyond numOfSets = 0: the robot does not read it"),
         (
@@ -149,7 +149,7 @@ def test_enabled_is_what_yarp_makes_of_it(made: Made, text: str, value: bool, no
 
 
 def test_the_sets_of_a_can_bus_name_it_by_its_number(made: Made) -> None:
-    sets = board_sets("7 8 8 20 1 0xE0") + triangle_sets("7 8 0 3 1 0 0x2000", "7 7 5 5 0 2 0x2200")
+    sets = board_sets("7 8 8 20 1 0xE0") + triangle_sets("7 8 0 3 2 0 0x2000", "7 7 5 5 0 2 0x2200")
     skin = device(DEFAULTS + sets).replace('"canDeviceNum"> 0 ', '"canDeviceNum"> 7 ')
     made.write("skin.xml", skin)
     options = options_of(made)

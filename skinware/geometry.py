@@ -12,7 +12,7 @@ The file is TOML. Sensors stand in groups that share a type and a frame::
     radius_m = 0.002                        # of each sensor; left out where nobody knows
     uid = [0x70500, 0x70501]
     position_m = [[0.01, 0.02, 0.03], [0.01, 0.03, 0.03]]
-    normal = [[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]     # outwards, of length 1; may be left out
+    normal = [[0.0, 0.0, 1.0], [nan, nan, nan]]     # outwards, of length 1; nan where nobody knows; may be left out
 
 ``uid`` are those of the driver's structure. A sensor that the file does not have has no known place.
 """
@@ -48,7 +48,7 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         frame: whose axes the numbers are in.
         uid: of each sensor.
         position_m: of each sensor, m.
-        normal: of each sensor, of length 1, outwards; None where it is not known.
+        normal: of each sensor, of length 1, outwards; NaN where it is not known, None where none is.
         radius_m: of each of them, m; None where it is not known.
         name: for people.
     """
@@ -67,7 +67,11 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 continue
             if len(rows) != len(self.uid):
                 raise ValueError(f"{len(self.uid)} uid, but {len(rows)} {what}")
-            if not np.isfinite(np.array(rows)).all():
+            numbers = np.array(rows).reshape(-1, 3)
+            good = np.isfinite(numbers).all(axis=1)
+            if what == "normal":
+                good |= np.isnan(numbers).all(axis=1)
+            if not good.all():
                 raise ValueError(f"{what}: a number is not finite")
         if self.normal:
             length = np.linalg.norm(np.array(self.normal), axis=1)

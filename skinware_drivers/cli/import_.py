@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from skinware_drivers.icub.notes import Note
 
 _HEADINGS = {
-    "todo": "To be filled in or decided",
-    "odd": "Understood, but look at it",
-    "unknown": "Not understood, left out",
-    "missing": "Not there",
-    "unused": "Understood, of no meaning for the driver",
+    "todo": "To fill in or decide",
+    "odd": "Worth checking",
+    "unknown": "Not understood and left out",
+    "missing": "Missing",
+    "info": "Nothing to do",
 }
 
 
@@ -45,7 +45,7 @@ def command() -> None:
 @click.option("--bus", "buses", multiple=True, metavar="PATCH=NAME", help="Bus that a patch is wired to, as 1=can0.")
 @click.option("--positions", multiple=True, metavar="PART=FILE", help="Position file of a body part, where unclear.")
 @json_option
-@click.option("-v", "--verbose", is_flag=True, help="Also name what was understood, but has no meaning here.")
+@click.option("-v", "--verbose", is_flag=True, help="Also list the remarks that ask for nothing.")
 def icub(
     paths: tuple[Path, ...],
     output: Path | None,
@@ -111,7 +111,7 @@ def _pairs(texts: Sequence[str], form: str) -> list[tuple[str, str]]:
 
 def _patch(text: str) -> int:
     if text not in ("1", "2"):
-        raise ConfigurationError(f"--bus {text}=...: a patch is 1 or 2")
+        raise ConfigurationError(f"--bus {text}=...: a patch is 1 or 2; the bus of a canBusSkin is 1")
     return int(text)
 
 
@@ -150,7 +150,7 @@ def _report(notes: Sequence[Note], verbose: bool) -> None:
         of_level = [note for note in notes if note.level == level]
         if not of_level:
             continue
-        if level == "unused" and not verbose:
+        if level == "info" and not verbose:
             click.echo(f"{heading}: {len(of_level)} (-v names them)", err=True)
             continue
         click.echo(f"{heading}:", err=True)

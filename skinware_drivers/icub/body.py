@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+import msgspec.structs
 
 from skinware.geometry import GeometryGroup
 from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
 from skinware_drivers.icub.drawing import Drawing, Shape
 from skinware_drivers.icub.notes import Notes
 from skinware_drivers.icub.part import Part
-from skinware_drivers.icub.positions import Positions
+from skinware_drivers.icub.positions import Pose, Positions
 from skinware_drivers.icub.wrapper import Port
 
 _OF_A_BOARD = TRIANGLES * CHANNELS
+_NO_NORMAL = (math.nan,) * 3
 
 Place = tuple[int, int, int]
 """Patch, board, triangle."""
@@ -26,14 +30,24 @@ class Body:
     Attributes:
         shapes: what triangles are; those of which it is not known are left out.
         bare: triangles that are known to have no taxel.
-        drawn: triangles that a drawing of their body part shows, by name of the body part.
-        groups: places of sensors.
+        drawn: triangles that a drawing shows, by name of the body part; only of parts without positions.
+        groups: places of sensors, by triangle; their uid lack the bus.
     """
 
     shapes: dict[Place, Shape] = field(default_factory=dict)
     bare: set[Place] = field(default_factory=set)
     drawn: dict[str, set[Place]] = field(default_factory=dict)
-    groups: list[GeometryGroup] = field(default_factory=list)
+    groups: dict[Place, list[GeometryGroup]] = field(default_factory=dict)
+
+    def groups_of(self, patches: Sequence[int]) -> list[GeometryGroup]:
+        """The places on some patches, keyed as a driver does whose buses these are, in this order."""
+        return [
+            msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
+            for bus, patch in enumerate(patches)
+            for place, groups in self.groups.items()
+            if place[0] == patch
+            for group in groups
+        ]
 
 
 def read_body(
@@ -48,8 +62,8 @@ def read_body(
     for port in ports:
         channels = _channels(part, port, notes)
         if port.name in positions:
-            _place(body, part, port, positions[port.name], channels, notes)
-        if port.name in drawings:
+            _place(body, port, positions[port.name], channels, notes)
+        elif port.name in drawings:
             _draw(body, port, drawings[port.name], channels, notes)
     return body
 
@@ -70,57 +84,43 @@ def _channels(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
     return triangles
 
 
-def _place(
-    body: Body, part: Part, port: Port, positions: Positions, triangles: Mapping[int, Place], notes: Notes
-) -> None:
-    bus_of = {patch: bus for bus, patch in enumerate(sorted(part.boards))}
-    count = len(positions.tactile) // CHANNELS
-    beyond = [number for number in triangles if number >= count]
-    if beyond or count > len(triangles):
-        text = f"it has {count} triangles, the port {port.name} {len(triangles)}; what has no counterpart is left out"
-        notes.add("odd", positions.path, text)
-    for number, place in triangles.items():
-        if number >= count:
-            continue
+def _place(body: Body, port: Port, positions: Positions, triangles: Mapping[int, Place], notes: Notes) -> None:
+    all_poses = [positions.poses[first : first + CHANNELS] for first in range(0, len(positions.poses), CHANNELS)]
+    lost, without_a_place = 0, []
+    for number, poses in enumerate(all_poses):
+        place = triangles.get(number)
         shape = _shape(positions.non_tactile(number * CHANNELS))
-        if shape is None:
-            body.bare.add(place)
+        if place is None or shape is None:
+            lost += sum(pose is not None for pose in poses)
+            if place is not None:
+                body.bare.add(place)
             continue
         body.shapes[place] = shape
-        poses = positions.poses[number * CHANNELS : (number + 1) * CHANNELS]
         thermal = set(shape[1])
+        groups = body.groups.setdefault(place, [])
         for type_name, of_type in (("pressure", set(range(CHANNELS)) - thermal), ("temperature", thermal)):
-            known = [k for k in sorted(of_type) if poses[k] is not None]
+            known = {k: pose for k in sorted(of_type) if (pose := poses[k]) is not None}
             if known:
-                body.groups.append(_group(port, place, bus_of[place[0]], type_name, positions.frame, known, poses))
-    bare = [place for place in triangles.values() if place in body.shapes and not _has_group(body, place, bus_of)]
-    if bare:
-        text = f"taxels without a place: {places_text(bare)}"
-        notes.add("missing", positions.path, text)
+                groups.append(_group(port, place, type_name, positions.frame, known))
+        if not groups:
+            without_a_place.append(place)
+    if lost:
+        text = f"{lost} places of triangles without a taxel, or that the port {port.name} does not have; left out"
+        notes.add("odd", positions.path, text)
+    if without_a_place:
+        notes.add("info", positions.path, f"taxels without a place: {places_text(without_a_place)}")
 
 
-def _has_group(body: Body, place: Place, bus_of: Mapping[int, int]) -> bool:
-    first = _uid(bus_of[place[0]], place, 0)
-    return any(group.uid[0] >> 8 == first >> 8 for group in body.groups)
-
-
-def _group(
-    port: Port, place: Place, bus: int, type_name: str, frame: str, channels: Sequence[int], poses: Sequence[object]
-) -> GeometryGroup:
-    found = [pose for k in channels if isinstance(pose := poses[k], tuple)]
+def _group(port: Port, place: Place, type_name: str, frame: str, known: Mapping[int, Pose]) -> GeometryGroup:
+    normals = [normal for _, normal in known.values()]
     return GeometryGroup(
         type=type_name,
         frame=frame,
-        uid=tuple(_uid(bus, place, k) for k in channels),
-        position_m=tuple(pose[:3] for pose in found),
-        normal=tuple(pose[3:] for pose in found),
+        uid=tuple(place[1] << 16 | place[2] << 8 | channel for channel in known),
+        position_m=tuple(position for position, _ in known.values()),
+        normal=tuple(normal or _NO_NORMAL for normal in normals) if any(normals) else None,
         name=f"{port.name}, board {place[1]}, triangle {place[2]}",
     )
-
-
-def _uid(bus: int, place: Place, channel: int) -> int:
-    """The driver's uid of a channel."""
-    return bus << 32 | place[1] << 16 | place[2] << 8 | channel
 
 
 def _shape(non_tactile: tuple[int, ...]) -> Shape | None:
@@ -149,7 +149,7 @@ def _draw(body: Body, port: Port, drawing: Drawing, triangles: Mapping[int, Plac
             body.shapes[place] = shape
             if shape[0] == "palm":
                 text = f"channel 11 of {places_text([place])} is taken to be thermal, as in most palm triangles"
-                notes.add("odd", drawing.path, text)
+                notes.add("info", drawing.path, text)
 
 
 def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set[Place], notes: Notes) -> None:

@@ -19,6 +19,8 @@ _MOST_INCLUDES = 200
 _LONGEST_CHAIN = 8
 _HIGHEST_FOLDER = 6
 _CONTAINERS = ("devices", "params", "robot")
+_FILES_OF_THE_ROBOT = ("general.xml", "pc104.xml", "-eln.xml")
+"""What the devices of all robots include, and what says nothing about skin."""
 
 
 @dataclass
@@ -79,7 +81,7 @@ class DeviceReader:
             return
         target = _target(element)
         if target is not None:
-            found = self._include(element, target, trail)
+            found = self._include(element, target, trail, is_needed="skin" in target.lower())
             if found is not None:
                 yield from self._devices(found, [*trail, found.file.resolve()])
             return
@@ -94,7 +96,8 @@ class DeviceReader:
                 count[0] += 1
                 if count[0] > _MOST_INCLUDES:
                     raise ConfigurationError(f"{child.file}:{child.line}: more than {_MOST_INCLUDES} files included")
-                found = self._include(child, target, trail)
+                is_needed = not target.strip().endswith(_FILES_OF_THE_ROBOT)
+                found = self._include(child, target, trail, is_needed=is_needed)
                 if found is not None and found.tag != "device":
                     found.understood = True
                     whole = found if found.tag in _CONTAINERS else Element("params", {}, found.file, 0, [found])
@@ -123,14 +126,16 @@ class DeviceReader:
         first = params.setdefault(param.name, param)
         if first is not param:
             param.understood = True
-            text = f"given again as {param.text!r}; the first counts ({first.text!r})"
+        if first.text.split() != param.text.split():
+            again, counts = (" ".join(element.text.split()) for element in (param, first))
+            text = f"given again as {again!r}; the first counts ({counts!r})"
             self._notes.add("odd", param.file, text, line=param.line, element=param.label)
 
-    def _include(self, element: Element, target: str, trail: list[Path]) -> Element | None:
+    def _include(self, element: Element, target: str, trail: list[Path], *, is_needed: bool) -> Element | None:
         """The root of an included file; None where there is none (which is noted)."""
         path = _find(target, element.file)
         if path is None:
-            self._note(element, "missing", f"{target!r} is not there")
+            self._note(element, "missing" if is_needed else "info", f"{target!r} is not there")
             return None
         if path.resolve() in trail:
             self._note(element, "odd", f"{target!r} includes itself; left out")
@@ -164,7 +169,7 @@ def _target(element: Element) -> str | None:
     """What an element includes; None if it does not include."""
     if element.tag.rpartition(":")[2] == "include":
         return element.attributes.get("href", "")
-    if element.tag == "params":
+    if element.tag in ("params", "devices"):
         return element.attributes.get("file")
     return None
 

@@ -58,7 +58,7 @@ def read_drawing(path: Path, notes: Notes) -> Drawing:
     """
     text = read_text(path)
     if not is_drawing(text):
-        raise ConfigurationError(f"{path}: no drawing of skinGui: it has no robotPart and [SENSORS]")
+        raise ConfigurationError(f"{path}: not a drawing of skinGui: it has no robotPart and [SENSORS]")
     drawing = Drawing(path, "")
     in_sensors, unused = False, set[str]()
     for line_number, line in enumerate(text.splitlines(), 1):
@@ -80,8 +80,8 @@ def read_drawing(path: Path, notes: Notes) -> Drawing:
     if drawing.shapes:
         unused.add("x, y, orientation, gain, mirror and layout of each module")
     if unused:
-        text = "for the picture on the screen, no metres; not used"
-        notes.add("unused", path, text, element="; ".join(sorted(unused)))
+        text = "for the picture on the screen only; not used"
+        notes.add("info", path, text, element="; ".join(sorted(unused)))
     return drawing
 
 
@@ -98,7 +98,7 @@ def _take_sensor(drawing: Drawing, words: list[str]) -> str:
             drawing.shapes[each] = "palm", NON_TACTILE["palm"]
         return ""
     drawing.shapes[triangle] = _KINDS.get(words[0])
-    return "" if words[0] in _KINDS else f"a module of the kind {words[0]!r}, which nobody here knows"
+    return "" if words[0] in _KINDS else f"a module of the kind {words[0]!r}, which is not known here"
 
 
 __all__ = ["Drawing", "Shape", "is_drawing", "read_drawing"]

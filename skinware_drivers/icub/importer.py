@@ -35,8 +35,9 @@ class ImportedPart:
         part: what the files say.
         ports: body parts in its index.
         buses: in the order of the configuration.
-        groups: places of its sensors.
+        groups: places of its sensors, also of those that are switched off.
         triangles: number of triangles that are switched on.
+        placed: number of sensors that are switched on and have a place.
     """
 
     name: str
@@ -45,6 +46,7 @@ class ImportedPart:
     buses: list[TranslatedBus]
     groups: list[GeometryGroup]
     triangles: int
+    placed: int
 
     def configuration(self) -> str:
         """The text of its configuration file."""
@@ -61,7 +63,7 @@ class ImportedPart:
 
     def geometry(self) -> str:
         """The text of its geometry file."""
-        lines = f"Places of the sensors of {self.name}, made by skin-import: read it with skinware.geometry."
+        lines = f"Places of the sensors of {self.name}, made by skin-import. Read it with skinware.geometry."
         return geometry_to_toml(self.groups, lines)
 
     def figures(self) -> dict[str, object]:
@@ -75,7 +77,7 @@ class ImportedPart:
             "body_parts": [port.name for port in self.ports],
             "triangles": self.triangles,
             "sensors": self.triangles * CHANNELS,
-            "sensors_with_a_place": sum(len(group.uid) for group in self.groups),
+            "sensors_with_a_place": self.placed,
         }
 
 
@@ -140,7 +142,9 @@ def import_files(
         enabled = enabled_places(buses)
         check_drawings(body, places_of(part, ports), enabled, notes)
         name = service_name(part.name, {each.name for each in parts})
-        parts.append(ImportedPart(name, part, ports, buses, body.groups, len(enabled)))
+        placed = sum(len(group.uid) for place in enabled for group in body.groups.get(place, ()))
+        groups = body.groups_of([bus.patch for bus in buses])
+        parts.append(ImportedPart(name, part, ports, buses, groups, len(enabled), placed))
     if not only:
         wrappers.name_unused(notes)
     files.name_unused({port.name for part in parts for port in part.ports})
@@ -180,9 +184,9 @@ def _take(path: Path, reader: DeviceReader, sources: _Sources, notes: Notes, *, 
     elif is_drawing(text):
         sources.drawings.append(path)
     elif is_asked_for:
-        raise ConfigurationError(f"{path}: neither positions nor a drawing of skinGui")
+        raise ConfigurationError(f"{path}: neither a position file nor a drawing of skinGui")
     else:
-        notes.add("unused", path, "neither positions nor a drawing of skinGui")
+        notes.add("info", path, "neither a position file nor a drawing of skinGui")
 
 
 def _pick(devices: Sequence[Element], names: Sequence[str]) -> list[Element]:
@@ -217,7 +221,7 @@ class _Wrappers:
         where = part.element.file.resolve().parts
         of_part = [entry for entry in self._wrappers if entry[1].device == part.name]
         if not of_part:
-            text = "no skinWrapper with its ports: the body parts, and so the places of the taxels, are not known"
+            text = "no skinWrapper with its ports, so its body parts and the places of its taxels are unknown"
             notes.add("missing", part.element.file, text, line=part.element.line, element=part.element.label)
             return ()
         element, wrapper, own = max(of_part, key=lambda entry: _shared(where, entry[0].file.resolve().parts))
@@ -233,9 +237,10 @@ class _Wrappers:
                 notes.add("missing", element.file, text, line=element.line, element=element.label)
         for element in self._others:
             text = f"a device of type {element.attributes['type']!r} is not imported"
-            if "inertial" in text.lower():
-                text += "; see the option inertial of the driver"
-            notes.add("unknown", element.file, text, line=element.line, element=element.label)
+            is_skin = "skin" in element.attributes["type"].lower()
+            if not is_skin:
+                text += "; for inertial sensors, see the option inertial of the driver"
+            notes.add("unknown" if is_skin else "info", element.file, text, line=element.line, element=element.label)
 
 
 def _shared(one: Sequence[str], other: Sequence[str]) -> int:
@@ -279,7 +284,7 @@ class _BodyFiles:
                 raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")
         for path in [*self._positions, *(drawing.path for drawing, _ in self._drawings)]:
             if path not in self._used:
-                self._notes.add("unused", path, "no body part of this name is imported")
+                self._notes.add("info", path, "no body part of this name is imported")
 
     def _positions_of(self, port: Port) -> Path | None:
         """By the name of the file: ``torso.txt``, ``left_hand_V2_1.txt``."""
@@ -288,7 +293,11 @@ class _BodyFiles:
         candidates = exact if len(exact) == 1 else [*exact, *similar]
         if len(candidates) > 1:
             names = ", ".join(path.name for path in candidates)
-            self._note(port, "todo", f"whose positions? {names}; none is used: say --positions {port.name}=FILE")
+            self._note(
+                port,
+                "todo",
+                f"several position files ({names}), none used: choose one with --positions {port.name}=FILE",
+            )
             return None
         return candidates[0] if candidates else None
 

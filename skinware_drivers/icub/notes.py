@@ -7,9 +7,9 @@ from typing import Literal
 
 import msgspec
 
-Level = Literal["todo", "odd", "unknown", "missing", "unused"]
+Level = Literal["todo", "odd", "unknown", "missing", "info"]
 """``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not
-understood; ``missing``: named, but not there; ``unused``: understood, and of no meaning for a driver."""
+understood; ``missing``: named, but not there; ``info``: nothing to do."""
 
 
 class Note(msgspec.Struct, frozen=True, order=True):

@@ -15,12 +15,18 @@ from skinware_drivers.icub.values import Reader, words
 from skinware_drivers.icub.xml_tree import Element
 
 ETHERNET, CAN = "embObjSkin", "canBusSkin"
+_ONLY_PATCH = 1
+"""What the one bus of a canBusSkin is called here; its sets name it by canDeviceNum."""
 DEVICE_TYPES = (ETHERNET, CAN)
 """Devices with skin: boards behind an Ethernet board, and boards on a CAN bus of the robot's computer."""
 
 _PATCH_PARAMETER = "skinCanAddrsPatch"
-_HOST_DEFAULTS = "the host's own default"
+_HOST_DEFAULTS = "the default of the robot's software"
 _LARGEST = {"period": 255, "skinType": 15, "noLoad": 255, "shift": 255, "cdcOffset": 0xFFFF}
+_GROUPS_OF_THE_ROBOT = {"GENERAL", "PC104", "ETH", "ETH_BOARD", "SERVICE", "TRANSCEIVER", "PROTOCOL"}
+"""What the devices of all robots include, and what says nothing about skin."""
+_MOST_TRIANGLE_SETS = 20
+"""What the robot's software reads; files of legs and arms have up to twice as many."""
 _SKIN_TYPES = (0, 1, 2, 3, 7, 8)
 
 
@@ -103,6 +109,8 @@ class _PartReader(Reader):
         super().__init__(notes)
         self._group = group
         self._part = Part(name, group.element, device_type)
+        self._can_device: int | None = None
+        self._other_patches: set[int] = set()
 
     def read(self) -> Part:
         self._read_boards()
@@ -123,18 +131,16 @@ class _PartReader(Reader):
     def _read_boards(self) -> None:
         if self._part.device_type == CAN:
             params = self._group.params
-            self._take_boards(1, params.get("skinCanIds"), "skinCanIds")
-            number = self.number(params.get("canDeviceNum"), 0, 99)
-            device = params.get("canbusDevice")
+            self._take_boards(_ONLY_PATCH, params.get("skinCanIds"), "skinCanIds")
+            self._can_device = self.number(params.get("canDeviceNum"), 0, 99)
+            kinds = [words(params[name].text) for name in ("canbusDevice", "physDevice") if name in params]
             for name in ("canbusDevice", "physDevice"):
                 if name in params:
                     params[name].understood = True
-            if device is not None and words(device.text) == ["socketcan"] and number is not None:
-                self._part.bus_name = f"can{number}"
-            elif device is not None:
-                self.note("odd", device, f"{device.text!r} is no SocketCAN: which bus is it here?")
+            if ["socketcan"] in kinds and self._can_device is not None:
+                self._part.bus_name = f"can{self._can_device}"
             if "period" in params:
-                self._unused(params["period"], "how often the host reads its buffer")
+                self._unused(params["period"], "how often the robot's software reads its buffer")
             return
         patches = self._group.groups.get("patches")
         for name, element in patches.params.items() if patches else ():
@@ -170,9 +176,9 @@ class _PartReader(Reader):
         part.skin_type = self._default(board, "skinType", part.skin_type)
         part.no_load = self._default(board, "noLoad", part.no_load)
         if part.skin_type not in _SKIN_TYPES:
-            self.note("odd", board["skinType"], f"no firmware is known to have the skin type {part.skin_type}")
+            self.note("odd", board["skinType"], f"no known firmware has the skin type {part.skin_type}")
         if "diagnostic" in board:
-            self._unused(board["diagnostic"], "whether the host logs faults; Skinware always shows them")
+            self._unused(board["diagnostic"], "whether the robot's software logs faults; Skinware always shows them")
         triangle = self._params_of("defaultCfgTriangle")
         enabled = self.truth(triangle.get("enabled"))
         if enabled is None:
@@ -206,8 +212,11 @@ class _PartReader(Reader):
             return []
         count = self.number(group.params.get("numOfSets"), 0, 1000)
         if count is None:
-            self.note("missing", group.element, "no usable numOfSets: the host refuses such a file; no set was used")
+            self.note("missing", group.element, "no usable numOfSets: the robot refuses such a file; no set is used")
             count = 0
+        if prefix == "triangleSetCfg" and count > _MOST_TRIANGLE_SETS:
+            text = f"the robot's software reads the first {_MOST_TRIANGLE_SETS} of these {count} sets; here, all count"
+            self.note("info", group.element, text)
         width = len(columns.split())
         sets = []
         for number in range(1, count + 1):
@@ -224,17 +233,18 @@ class _PartReader(Reader):
                 sets.append((element, row))
         for name, element in group.params.items():
             if name.startswith(prefix) and not element.understood:
-                self._unused(element, f"beyond numOfSets = {count}: the host does not read it")
+                self._unused(element, f"beyond numOfSets = {count}: the robot does not read it")
         return sets
 
     def _read_board_sets(self) -> None:
         columns = "patch firstBoard lastBoard period skinType noLoad"
         for element, row in self._sets("specialCfgBoards", "boardSetCfg", columns):
             patch, first, last, period_ms, skin_type, no_load = row
+            patch = self._patch_of(element, patch)
             of_patch = self._boards_of(element, patch)
             boards = tuple(board for board in of_patch if first <= board <= last)
             if of_patch and not boards:
-                self.refuse(element, f"no board of patch {patch} is {first} to {last}")
+                self.refuse(element, f"no board on its bus is {first} to {last}")
             elif not 1 <= period_ms <= 255 or not 0 <= skin_type <= 15 or not 0 <= no_load <= 255:
                 self.refuse(element, f"period {period_ms}, skinType {skin_type} or noLoad {no_load} is impossible")
             elif boards:
@@ -244,36 +254,42 @@ class _PartReader(Reader):
         columns = "patch board firstTriangle lastTriangle enabled shift cdcOffset"
         for element, row in self._sets("specialCfgTriangles", "triangleSetCfg", columns):
             patch, board, first, last, enabled, shift, cdc_offset = row
+            patch = self._patch_of(element, patch)
             of_patch = self._boards_of(element, patch)
             if of_patch and board not in of_patch:
-                self.refuse(element, f"patch {patch} has no board {board}")
+                self.refuse(element, f"there is no board {board} on its bus")
             elif not 0 <= first <= last < TRIANGLES:
                 self.refuse(element, f"triangles {first} to {last}: the firmware ignores a range outside 0-15")
             elif not 0 <= shift <= 255 or not 0 <= cdc_offset <= 0xFFFF:
                 self.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
             elif of_patch:
                 if enabled not in (0, 1):
-                    text = f"enabled = {enabled}: of this number, boards heed the lowest bit: {enabled & 1}"
-                    self.note("odd", element, text)
+                    self.note("info", element, f"enabled = {enabled}: counts as 1, as on the robot")
                 triangles = tuple(range(first, last + 1))
                 self._part.triangle_sets.append(
-                    TriangleSet(element, patch, board, triangles, bool(enabled & 1), shift, cdc_offset)
+                    TriangleSet(element, patch, board, triangles, bool(enabled), shift, cdc_offset)
                 )
+
+    def _patch_of(self, element: Element, number: int) -> int:
+        """The patch that a set is for."""
+        if self._part.device_type == ETHERNET:
+            return number
+        if self._can_device not in (None, number) and number not in self._other_patches:
+            self._other_patches.add(number)
+            text = f"for patch {number}, but canDeviceNum is {self._can_device}: the robot refuses such a file"
+            self.note("odd", element, f"{text}; it is taken to be for the only bus")
+        return _ONLY_PATCH
 
     def _boards_of(self, element: Element, patch: int) -> tuple[int, ...]:
         boards = self._part.boards
-        if self._part.device_type == CAN and boards:
-            if patch != 1:
-                self.note("odd", element, f"patch {patch}: a canBusSkin has one bus, whose boards are taken")
-            return boards.get(1, ())
-        if patch not in boards:
+        if patch not in boards and boards:
             self.refuse(element, f"there is no patch {patch}")
         return boards.get(patch, ())
 
     # The old set-up
 
     def _read_old(self) -> None:
-        boards = self._part.boards.get(1, ())
+        boards = self._part.boards.get(_ONLY_PATCH, ())
         self._part.old = {board: OldBoard(dict(OLD_DEFAULTS)) for board in boards}
         for name, default in OLD_DEFAULTS.items():
             element = self._group.params.get(name)
@@ -281,26 +297,25 @@ class _PartReader(Reader):
             if element is None or row is None:
                 continue
             if len(row) != len(boards):
-                text = f"{len(row)} values for {len(boards)} boards; the host takes {default:#x} for the others"
+                text = f"{len(row)} values for {len(boards)} boards; the robot takes {default:#x} for the others"
                 self.note("odd", element, text)
             for board, value in zip(boards, row, strict=False):
                 if 0 <= value <= 255:
                     self._part.old[board].values[name] = value
                 else:
-                    self.refuse(element, f"{value} is no byte")
+                    self.refuse(element, f"{value} is not a byte")
 
     # What is left
 
     def _unused(self, element: Element, why: str) -> None:
         element.understood = True
-        self.note("unused", element, why)
+        self.note("info", element, why)
 
     def _name_the_rest(self, group: Group) -> None:
-        for name, why in (("SERVICE", "how the host tells the Ethernet board"), ("ETH_BOARD", "the Ethernet board's")):
-            if name in group.groups:
-                for element in _elements_of(group.groups[name]):
-                    element.understood = True
-                self.note("unused", group.groups[name].element, why)
+        for name in sorted(_GROUPS_OF_THE_ROBOT & set(group.groups)):
+            for element in _elements_of(group.groups[name]):
+                element.understood = True
+            self._unused(group.groups[name].element, "of the robot's computer and its Ethernet boards")
         for element in _elements_of(group):
             if not element.understood:
                 element.understood = True

@@ -3,6 +3,9 @@
 Source: robotology/icub-main app/skinGui/conf/positions. Lines ``name FRAME``, ``spatial_sampling taxel|triangle``,
 ``taxel2Repr (...)``, then ``[calibration]`` and per channel ``x y z nx ny nz``, in metres in the frame of the link. In
 ``taxel2Repr``, -1 stands for a channel that is no taxel, -2 for a thermal pad (some files write -1 for both).
+
+In some files ``taxel2Repr`` is shorter than the list of places: beyond its end, a channel with a place is a taxel. Some
+have no normals (0 0 0), or normals of another length than 1: their places are as good as any.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
+from skinware.geometry import Triple
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.notes import Notes
 from skinware_drivers.icub.values import number
@@ -22,10 +26,10 @@ _CALIBRATION = "[calibration]"
 _REPRESENTATIVES = re.compile(r"taxel2Repr\s*\(([^()]*)\)")
 _MOST_TAXELS = 1 << 16
 _FARTHEST_M = 10.0
-_LENGTH_TOLERANCE = 0.02
+_DIGITS = 6
 
-Pose = tuple[float, float, float, float, float, float]
-_NOWHERE: Pose = (0.0,) * 6
+Pose = tuple[Triple, Triple | None]
+"""Place, and normal of length 1 if it is known."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Positions:
         path: of it.
         frame: the link in whose frame the numbers are.
         tactile: by channel, whether it is a taxel.
-        poses: by channel, x y z in metres and the normal; None where the file has none.
+        poses: by channel, in metres; None where the file has no place.
     """
 
     path: Path
@@ -73,7 +77,7 @@ def read_positions(path: Path, notes: Notes) -> Positions:
     head, mark, body = text.partition(_CALIBRATION)
     found = _REPRESENTATIVES.search(head)
     if not mark or found is None:
-        raise ConfigurationError(f"{path}: no file of positions: it has no taxel2Repr (...) before [calibration]")
+        raise ConfigurationError(f"{path}: not a position file: it has no taxel2Repr (...) before [calibration]")
     representatives = _representatives(found[1], path)
     fields = {}
     for line_number, line in enumerate(_REPRESENTATIVES.sub("", head).splitlines(), 1):
@@ -83,10 +87,10 @@ def read_positions(path: Path, notes: Notes) -> Positions:
         elif key:
             notes.add("unknown", path, "not understood", line=line_number, element=line.strip()[:60])
     if fields.get("spatial_sampling", "taxel") != "taxel":
-        text = "the file wants one place per triangle; its lines, one per channel, are taken as they are"
-        notes.add("odd", path, text, element=f"spatial_sampling {fields['spatial_sampling']}")
+        text = "the file asks for one place per triangle; its places, one per channel, are kept"
+        notes.add("info", path, text, element=f"spatial_sampling {fields['spatial_sampling']}")
     if not fields.get("name"):
-        notes.add("missing", path, "no frame: the numbers are in a frame that has no name", element="name")
+        notes.add("missing", path, "no frame is named, so nobody can tell whose axes these are", element="name")
     poses = _poses(body, head.count("\n"), path, notes)
     return _fit(path, fields.get("name", ""), representatives, poses, notes)
 
@@ -111,7 +115,7 @@ def _poses(body: str, line_before: int, path: Path, notes: Notes) -> list[Pose |
         pose, why = _pose(line)
         if why:
             notes.add("unknown", path, why, line=line_number, element=line.strip()[:60])
-        poses.append(None if pose == _NOWHERE else pose)
+        poses.append(pose)
     return poses
 
 
@@ -127,26 +131,30 @@ def _pose(line: str) -> tuple[Pose | None, str]:
     x, y, z, *normal = numbers
     if max(map(abs, (x, y, z))) > _FARTHEST_M:
         return None, f"farther than {_FARTHEST_M:g} m from the link: not in metres? no place"
-    pose: Pose = (x, y, z, *normal)  # type: ignore[assignment]
-    if pose != _NOWHERE and abs(math.hypot(*normal) - 1) > _LENGTH_TOLERANCE:
-        return None, "the normal does not have the length 1; no place"
-    return pose, ""
+    if not any(numbers):
+        return None, ""
+    length = math.hypot(*normal)
+    if not 0 < length < math.inf:
+        return ((x, y, z), None), ""
+    nx, ny, nz = (round(component / length, _DIGITS) for component in normal)
+    return ((x, y, z), (nx, ny, nz)), ""
 
 
 def _fit(path: Path, frame: str, representatives: list[int], poses: list[Pose | None], notes: Notes) -> Positions:
     """Both lists at one length, which is a whole number of triangles."""
-    count = min(len(representatives), len(poses)) // CHANNELS * CHANNELS
-    for what, rest, says_something in (
-        ("taxel2Repr", representatives[count:], any(r >= 0 for r in representatives[count:])),
-        ("[calibration]", poses[count:], any(pose is not None for pose in poses[count:])),
-    ):
-        if rest:
-            text = f"{len(rest)} entries more than the {count} that both have; they are left out"
-            level = "odd" if says_something else "unused"
-            notes.add("odd" if level == "odd" else "unused", path, text, element=what)
+    count = max(len(representatives), len(poses)) // CHANNELS * CHANNELS
     if not count:
-        raise ConfigurationError(f"{path}: no whole triangle: taxel2Repr and [calibration] do not fit each other")
-    return Positions(path, frame, tuple(r >= 0 for r in representatives[:count]), tuple(poses[:count]))
+        raise ConfigurationError(f"{path}: no whole triangle in taxel2Repr and [calibration]")
+    for what, rest in (("taxel2Repr", representatives[count:]), ("[calibration]", poses[count:])):
+        if rest:
+            notes.add("odd", path, f"{len(rest)} entries after the last whole triangle; left out", element=what)
+    poses = [*poses[:count], *[None] * (count - len(poses))]
+    tactile = [representative >= 0 for representative in representatives[:count]]
+    tactile += [pose is not None for pose in poses[len(tactile) :]]
+    normals = [pose[1] for pose in poses if pose is not None]
+    if None in normals:
+        notes.add("info", path, f"{normals.count(None)} of {len(normals)} places have no normal")
+    return Positions(path, frame, tuple(tactile), tuple(poses))
 
 
 __all__ = ["Positions", "is_positions", "read_positions", "read_text"]

@@ -75,13 +75,17 @@ def translate(part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes
         comment = "" if name else _BUS_COMMENT.get(part.device_type, _BUS_COMMENT[""]).format(patch=patch)
         buses.append(TranslatedBus(patch, name, comment, options))
         _check_set_up(part, patch, options, body, notes)
+    bare = enabled_places(buses) & body.bare
+    if bare:
+        text = "on, but without a taxel by the position files; if they show faults, add enabled = false to the modules"
+        _note(notes, "odd", part, f"{text}: {places_text(bare)}")
     for patch in bus_names:
         if patch not in part.boards:
             raise ConfigurationError(f"--bus {patch}={bus_names[patch]}: {part.name} has no patch {patch}")
     to_fill_in = [str(bus.patch) for bus in buses if not bus.name]
     if to_fill_in and part.device_type == ETHERNET:
         text = (
-            "the boards hang behind an Ethernet board: wire a CAN interface to the bus itself and fill in its name;"
+            "the boards are behind an Ethernet board: connect a CAN interface to the bus itself and fill in its name;"
             f" patch {', '.join(to_fill_in)}"
         )
         _note(notes, "todo", part, text)
@@ -162,7 +166,8 @@ class _OldSettings:
             period_ms = (values["4C_TimeL"] | values["4C_TimeH"] << 8) * _TICK_MS
         self.period_ms = min(max(round(period_ms), 1), 209)
         if self.period_ms != period_ms:
-            _note(notes, "odd", part, f"board {board}: a period of {period_ms:g} ms becomes {self.period_ms} ms")
+            level = "info" if abs(self.period_ms - period_ms) < 1 else "odd"
+            _note(notes, level, part, f"board {board}: a period of {period_ms:g} ms becomes {self.period_ms} ms")
         parameter = values["4E_Param"]
         self.skin_type = parameter & 3 if parameter & _COMPENSATED else _NOT_COMPENSATED_TYPE
         if parameter & ~(_COMPENSATED | 3):
@@ -171,7 +176,7 @@ class _OldSettings:
             )
         if values["4E_Shift3_1"] != _AREA_SHIFTS:
             text = f"board {board}: 4E_Shift3_1 {values['4E_Shift3_1']:#x}: areas are not used, so 0x22 is sent"
-            _note(notes, "unused", part, text)
+            _note(notes, "info", part, text)
         if values["4E_Shift"] & 0xF0:
             _note(notes, "odd", part, f"board {board}: 4E_Shift {values['4E_Shift']:#x}: its low four bits count")
         self.shift, self.no_load = values["4E_Shift"] & 0x0F, values["4E_NoLoad"]
@@ -205,25 +210,24 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
             sets = [s for s in part.board_sets if s.patch == patch and board in s.boards]
             element = sets[-1].element
             text = (
-                f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, off again"
-                " by this set, and on again by nothing: they stay off, as on the robot"
+                f"board {board}: triangles {runs_text(set_up.wiped)} are switched on by defaultCfgTriangle, then off"
+                " by this set, and no set switches them on again: they stay off, as on the robot"
             )
             notes.add("odd", element.file, text, line=element.line, element=element.label)
-        elif not set_up.enabled:
-            _note(notes, "odd", part, f"patch {patch} board {board}: no triangle is switched on")
     on = {(patch, board, t) for board in options.boards for t in BoardSetUp(options, board).enabled}
-    if on & body.bare:
-        _note(notes, "odd", part, f"on, though their position file has no taxel there: {places_text(on & body.bare)}")
+    off = set(options.boards) - {board for _, board, _ in on}
+    if off:
+        _note(notes, "odd", part, f"patch {patch}: no triangle is switched on: board {runs_text(off)}")
     unknown = {place for place in on if place not in body.shapes and place not in body.bare}
     if unknown and part.old:
         text = (
-            'the files do not tell what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
+            'the files do not say what the modules are: add kind = "fingertip", "palm" or "triangle" to the options;'
             f" without it, skin type {options.skin_type} decides"
         )
         _note(notes, "todo", part, text)
     elif {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}:
         special = {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}
-        text = f"fingertips or palms? taken to be fingertips, as no position file tells: {places_text(special)}"
+        text = f"fingertips or palms? No position file says, so they are taken to be fingertips: {places_text(special)}"
         _note(notes, "todo", part, text)
 
 

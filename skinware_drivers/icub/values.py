@@ -6,7 +6,6 @@ from skinware_drivers.icub.notes import Level, Notes
 from skinware_drivers.icub.xml_tree import Element
 
 _LONGEST_NUMBER = 12
-_YES, _NO = ("true", "1", "yes", "on"), ("false", "0", "no", "off")
 
 
 def words(text: str) -> list[str]:
@@ -21,11 +20,11 @@ def number(text: str) -> int:
         ValueError: it is none.
     """
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
-        raise ValueError(f"{text[:20]!r} is no whole number")
+        raise ValueError(f"{text[:20]!r} is not a whole number")
     try:
         value = int(text, 16) if text.lower().startswith("0x") else int(text, 10)
     except ValueError:
-        raise ValueError(f"{text!r} is no whole number") from None
+        raise ValueError(f"{text!r} is not a whole number") from None
     return value
 
 
@@ -64,15 +63,20 @@ class Reader:
         return None
 
     def truth(self, element: Element | None) -> bool | None:
-        """Yes or no."""
+        """Yes or no as YARP reads it: the first word is ``true`` or a number that is not 0; anything else means no."""
         if element is None:
             return None
         element.understood = True
-        word = " ".join(words(element.text)).lower()
-        if word not in (*_YES, *_NO):
-            self.refuse(element, f"{element.text!r} is neither true nor false")
-            return None
-        return word in _YES
+        found = words(element.text)
+        try:
+            value = found[:1] == ["true"] or bool(number("".join(found[:1])))
+            clear = len(found) == 1
+        except ValueError:
+            value, clear = False, found == ["false"]
+        if not clear:
+            text = f"{element.text!r} is neither true nor false; taken to be {str(value).lower()}, as on the robot"
+            self.note("odd", element, text)
+        return value
 
     def refuse(self, element: Element, why: str) -> None:
         """Note that a value was not understood."""

@@ -77,7 +77,7 @@ class _WrapperReader(Reader):
         for name, why in _UNUSED.items():
             if name in group.params:
                 group.params[name].understood = True
-                self.note("unused", group.params[name], why)
+                self.note("info", group.params[name], why)
         for action in group.actions:
             action.understood = True
         for element in self._rest(group):
@@ -94,7 +94,7 @@ class _WrapperReader(Reader):
             return None
         first, last, local_first, local_last = row
         if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
-            self.refuse(element, f"{element.text!r}: the two ranges are not of one length")
+            self.refuse(element, f"{element.text!r}: the two ranges differ in length")
             return None
         return Port(element.name, element, first, last, local_first)
 

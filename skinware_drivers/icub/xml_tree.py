@@ -79,7 +79,7 @@ def read_bytes(path: Path, limit: int = LARGEST_FILE) -> bytes:
     except ValueError as error:  # a NUL in the path
         raise ConfigurationError(f"{str(path)!r}: {error}") from None
     if len(data) > limit:
-        raise ConfigurationError(f"{path}: larger than {limit >> 20} MiB, so it is no robot's configuration")
+        raise ConfigurationError(f"{path}: larger than {limit >> 20} MiB, too large for a robot's configuration")
     return data
 
 
@@ -102,7 +102,12 @@ def _without_odd_comments(data: bytes, path: Path, notes: Notes) -> bytes:
         body = data[start + 4 : end]
         if b"--" in body or body.endswith(b"-"):
             line = data.count(b"\n", 0, start) + 1
-            notes.add("odd", path, "'--' within a comment is no XML; taken to end at the first '-->'", line=line)
+            notes.add(
+                "info",
+                path,
+                "'--' in a comment is not XML; the comment ends at the first '-->', as on the robot",
+                line=line,
+            )
             parts += [data[position:start], b"\n" * body.count(b"\n")]
         else:
             parts.append(data[position : end + 3])
@@ -169,7 +174,7 @@ class _Reader:
         raise self._refusal(f"defines the entity {name!r}: write out what it stands for", self._line)
 
     def _skipped(self, name: str, _is_parameter: bool) -> None:
-        self._notes.add("unknown", self._path, "an entity that nobody defines", line=self._line, element=f"&{name};")
+        self._notes.add("unknown", self._path, "an undefined entity", line=self._line, element=f"&{name};")
 
 
 __all__ = ["LARGEST_FILE", "Element", "read_bytes", "read_xml"]

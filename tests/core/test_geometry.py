@@ -76,6 +76,17 @@ def test_places_come_in_the_order_of_a_skin(tmp_path: Path) -> None:
         geometry.of(structure, "shear_x")
 
 
+def test_a_normal_that_nobody_knows_leaves_the_place(tmp_path: Path) -> None:
+    group = GeometryGroup("pressure", "f", (1, 2), ((1, 0, 0), (2, 0, 0)), ((float("nan"),) * 3, (0, 0, 1)))
+    geometry = read_geometry(written(tmp_path / "g.toml", geometry_to_toml([group])))
+    assert geometry.known.all()
+    assert np.isnan(geometry.normal[0]).all()
+    assert geometry.normal[1].tolist() == [0, 0, 1]
+    for normal in ("[nan, 0, 1]", "[inf, 0, 0]"):
+        with pytest.raises(ConfigurationError, match="normal: a number is not finite"):
+            read_geometry(written(tmp_path / "g.toml", f"{HEAD}{GROUP}normal = [{normal}, [0, 0, 1]]\n"))
+
+
 def test_normals_of_few_digits_get_the_length_1(tmp_path: Path) -> None:
     text = HEAD + GROUP + "normal = [[0.71, 0.71, 0], [0, 0, 0.99]]\n"
     geometry = read_geometry(written(tmp_path / "g.toml", text))

@@ -36,7 +36,7 @@ def test_a_patch_is_a_bus_and_those_of_patch_2_come_first_for_the_host(made: Mad
     part = only_part(made)
     assert [(bus.patch, bus.name, bus.options.boards) for bus in part.buses] == [(1, "", (1, 2)), (2, "", (13, 12))]
     assert part.part.host_order == [(2, 13), (2, 12), (1, 1), (1, 2)]
-    assert "wire a CAN interface to the bus itself and fill in its name; patch 1, 2" in made.said("todo")
+    assert "connect a CAN interface to the bus itself and fill in its name; patch 1, 2" in made.said("todo")
     assert 'name = ""  # fill in the interface that taps CAN1 of the Ethernet board, as can0' in part.configuration()
 
 
@@ -51,12 +51,12 @@ def test_a_set_holds_for_its_patch_only(made: Made) -> None:
 
 
 def test_triangles_that_the_files_switch_on_in_vain_are_named(made: Made) -> None:
-    sets = board_sets("1 8 8 50 1 0xf0") + triangle_sets("1 8 0 3 1 2 0x2200")
+    sets = board_sets("0 8 8 50 1 0xf0") + triangle_sets("0 8 0 3 1 2 0x2200")
     made.write("skin.xml", device(DEFAULTS + sets))
     assert only_part(made).triangles == 16 + 4
     (line,) = made.said("odd").splitlines()
     assert line.startswith('skin.xml:9: param "boardSetCfg1": board 8: triangles 4-15 are switched on by')
-    assert line.endswith("on again by nothing: they stay off, as on the robot")
+    assert line.endswith("no set switches them on again: they stay off, as on the robot")
 
 
 def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
@@ -64,30 +64,38 @@ def test_a_bus_on_which_nothing_is_on_is_left_out_and_named(made: Made) -> None:
     made.write("skin.xml", device(off, ETHERNET, "embObjSkin"))
     assert [bus.patch for bus in only_part(made).buses] == [1]
     assert "patch 2 is left out: boards 13, 12: the configuration leaves all triangles switched off" in made.said("odd")
-    assert "patch 1 board 2: no triangle is switched on" in made.said("odd")
+    assert "patch 1: no triangle is switched on: board 2" in made.said("odd")
 
 
 @pytest.mark.parametrize(
     ("body", "level", "words"),
     [
-        (triangle_sets("1 9 0 1 1 2 0x2200"), "unknown", 'param "triangleSetCfg1": patch 1 has no board 9; left out'),
-        (triangle_sets("1 8 5 4 1 2 0x2200"), "unknown", "triangles 5 to 4: the firmware ignores a range outside 0-15"),
-        (triangle_sets("1 8 0 16 1 2 0x2200"), "unknown", "triangles 0 to 16"),
-        (triangle_sets("1 8 0 1 1 2"), "unknown", "6 numbers, not 7 (patch board firstTriangle"),
-        (triangle_sets("1 8 0 one 1 2 3"), "unknown", "'one' is no whole number; left out"),
-        (triangle_sets("1 8 0 1 1 2 0x12200"), "unknown", "cdcOffset 0x12200 is impossible"),
-        (triangle_sets("1 8 0 1 2 2 0x2200"), "odd", "enabled = 2: of this number, boards heed the lowest bit: 0"),
-        (triangle_sets("1 8 0 1 1 2 0x2200", count=2), "missing", "numOfSets is 2, but there is no triangleSetCfg2"),
-        (triangle_sets("1 8 0 1 0 2 0x2200", count=0), "unused", "beyond numOfSets = 0: the host does not read it"),
-        (triangle_sets("2 8 0 1 1 2 0x2200"), "odd", "patch 2: a canBusSkin has one bus, whose boards are taken"),
-        (board_sets("1 9 10 50 1 0xf0"), "unknown", "no board of patch 1 is 9 to 10"),
-        (board_sets("1 8 8 500 1 0xf0"), "unknown", "period 500, skinType 1 or noLoad 240 is impossible"),
+        (
+            triangle_sets("0 9 0 1 1 2 0x2200"),
+            "unknown",
+            'param "triangleSetCfg1": there is no board 9 on its bus; left out',
+        ),
+        (triangle_sets("0 8 5 4 1 2 0x2200"), "unknown", "triangles 5 to 4: the firmware ignores a range outside 0-15"),
+        (triangle_sets("0 8 0 16 1 2 0x2200"), "unknown", "triangles 0 to 16"),
+        (triangle_sets("0 8 0 1 1 2"), "unknown", "6 numbers, not 7 (patch board firstTriangle"),
+        (triangle_sets("0 8 0 one 1 2 3"), "unknown", "'one' is not a whole number; left out"),
+        (triangle_sets("0 8 0 1 1 2 0x12200"), "unknown", "cdcOffset 0x12200 is impossible"),
+        (triangle_sets("0 8 0 1 2 2 0x2200"), "info", "enabled = 2: counts as 1, as on the robot"),
+        (triangle_sets("0 8 0 1 1 2 0x2200", count=2), "missing", "numOfSets is 2, but there is no triangleSetCfg2"),
+        (triangle_sets("0 8 0 1 0 2 0x2200", count=0), "info", "beyond numOfSets = 0: the robot does not read it"),
+        (
+            triangle_sets("2 8 0 1 1 2 0x2200"),
+            "odd",
+            "for patch 2, but canDeviceNum is 0: the robot refuses such a file",
+        ),
+        (board_sets("0 9 10 50 1 0xf0"), "unknown", "no board on its bus is 9 to 10"),
+        (board_sets("0 8 8 500 1 0xf0"), "unknown", "period 500, skinType 1 or noLoad 240 is impossible"),
         ('<group name="specialCfgBoards"></group>', "missing", 'group "specialCfgBoards": no usable numOfSets'),
         ('<param name="gain"> 4 </param>', "unknown", "param \"gain\": not understood: '4'"),
         ('<group name="more"><param name="x"> 1 </param></group>', "unknown", 'param "x": not understood'),
         ("<surprise> 7 </surprise>", "unknown", "surprise: not understood: '7'"),
-        ('<param name="period"> 10 </param>', "unused", "how often the host reads its buffer"),
-        ('<param name="4C_Timer"> 1 1 </param>', "unused", "of the old set-up"),
+        ('<param name="period"> 10 </param>', "info", "how often the robot's software reads its buffer"),
+        ('<param name="4C_Timer"> 1 1 </param>', "info", "of the old set-up"),
         ('<param name="skinCanIds"> 9 </param>', "odd", "given again as '9'; the first counts ('7 8')"),
     ],
 )
@@ -103,9 +111,8 @@ def test_every_value_that_has_no_place_is_named(made: Made, body: str, level: st
         ('"period"> 50 ', '"period"> 0 ', "unknown", 'param "period": 0 is outside 1-255; left out'),
         ('"period"> 50 ', '"period"> 50 51 ', "unknown", "'50 51' is not one number"),
         ('"period"> 50 ', '"periode"> 50 ', "unknown", "param \"periode\": not understood: '50'"),
-        ('"noLoad"> 0xf0 ', '"noLoad"> 240.0 ', "unknown", "'240.0' is no whole number"),
-        ('"enabled"> true ', '"enabled"> maybe ', "unknown", "'maybe' is neither true nor false"),
-        ('"skinType"> 0 ', '"skinType"> 5 ', "odd", "no firmware is known to have the skin type 5"),
+        ('"noLoad"> 0xf0 ', '"noLoad"> 240.0 ', "unknown", "'240.0' is not a whole number"),
+        ('"skinType"> 0 ', '"skinType"> 5 ', "odd", "no known firmware has the skin type 5"),
     ],
 )
 def test_defaults_that_are_no_use_are_named(made: Made, old: str, new: str, level: str, words: str) -> None:
@@ -113,7 +120,68 @@ def test_defaults_that_are_no_use_are_named(made: Made, old: str, new: str, leve
     only_part(made)
     assert words in made.said(level)
     if "skinType" not in old:
-        assert "the host's own default" in made.said("odd")
+        assert "the default of the robot's software" in made.said("odd")
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "noted"),
+    [
+        ("true", True, False),
+        ("1", True, False),
+        ('"true"', True, False),
+        ("false", False, False),
+        ("0", False, False),
+        ("fasle", False, True),
+        ("fal se", False, True),
+        ("True", False, True),
+        ("yes", False, True),
+        ("true false", True, True),
+        ("", False, True),
+    ],
+)
+def test_enabled_is_what_yarp_makes_of_it(made: Made, text: str, value: bool, noted: bool) -> None:
+    sets = triangle_sets("0 7 0 0 1 2 0x2200")
+    made.write("skin.xml", device(DEFAULTS.replace('"enabled"> true ', f'"enabled"> {text} ') + sets))
+    assert options_of(made).enabled is value
+    said = f"neither true nor false; taken to be {str(value).lower()}, as on the robot"
+    assert (said in made.said("odd")) is noted
+    assert made.said("unknown") == ""
+
+
+def test_the_sets_of_a_can_bus_name_it_by_its_number(made: Made) -> None:
+    sets = board_sets("7 8 8 20 1 0xE0") + triangle_sets("7 8 0 3 2 0 0x2000", "7 7 5 5 0 2 0x2200")
+    skin = device(DEFAULTS + sets).replace('"canDeviceNum"> 0 ', '"canDeviceNum"> 7 ')
+    made.write("skin.xml", skin)
+    options = options_of(made)
+    assert options.special_boards == (SpecialBoards((8,), 20, 1, 0xE0),)
+    assert options.modules == (
+        Kind(8, (0, 1, 2, 3), enabled=True, shift=0, cdc_offset=0x2000),
+        Kind(7, (5,), enabled=False, shift=2, cdc_offset=0x2200),
+    )
+    assert "patch" not in made.said("odd")
+
+
+def test_all_sets_count_however_many_the_robot_reads(made: Made) -> None:
+    sets = triangle_sets(*(f"0 {7 + n // 16} {n % 16} {n % 16} 1 2 0x2200" for n in range(32)))
+    made.write("skin.xml", device(DEFAULTS.replace("true", "false") + sets))
+    assert only_part(made).triangles == 32
+    assert "the robot's software reads the first 20 of these 32 sets; here, all count" in made.said("info")
+
+
+def test_what_every_robot_has_beside_skin_needs_nobody(made: Made) -> None:
+    general = '<params><group name="GENERAL"><param name="skipCalibration"> false </param></group></params>'
+    made.write("general.xml", general)
+    made.write("skin-eln.xml", '<params><group name="PC104"><param name="PC104IpPort"> 1 </param></group></params>')
+    service = '<group name="SERVICE"><param name="type"> skin </param></group>' * 2
+    includes = "".join(f'<xi:include href="{name}"/>' for name in ("general.xml", "skin-eln.xml", "arm-eln.xml"))
+    made.write("skin.xml", device(includes + DEFAULTS + service))
+    made.write("wrapper.xml", WRAPPER)
+    made.write("robot.xml", '<robot><devices file="motor.xml"/><devices file="skin.xml"/></robot>')
+    only_part(made)
+    assert {note.level for note in made.notes} == {"info"}
+    made.write("robot.xml", '<robot><devices file="hardware/skin/leg.xml"/></robot>')
+    made.imported()
+    assert "'hardware/skin/leg.xml' is not there" in made.said("missing")
 
 
 @pytest.mark.parametrize(
@@ -129,8 +197,19 @@ def test_impossible_boards_are_named_and_left_out(made: Made, boards: str, words
 def test_another_can_bus_is_to_be_filled_in(made: Made) -> None:
     made.write("skin.xml", device().replace("socketcan", "cfw2can"))
     assert only_part(made).buses[0].name == ""
-    assert "'cfw2can' is no SocketCAN: which bus is it here?" in made.said("odd")
-    assert "fill in the bus" in made.said("todo")
+    (line,) = made.said("todo").splitlines()
+    assert line.endswith("the files do not name a CAN interface of this machine: fill in the bus")
+    assert made.said("odd") == ""
+
+
+def test_a_shared_can_bus_is_the_one_that_is_shared(made: Made) -> None:
+    skin = (
+        device()
+        .replace(" socketcan ", ' "sharedcan" ')
+        .replace("skinCanIds", 'physDevice"> "socketcan" </param><param name="skinCanIds')
+    )
+    made.write("skin.xml", skin)
+    assert only_part(made).buses[0].name == "can0"
 
 
 def test_the_user_names_the_buses(made: Made) -> None:
@@ -165,10 +244,10 @@ def test_the_old_set_up(made: Made) -> None:
         special_boards=(SpecialBoards((8,), period_ms=50, skin_type=1, no_load=0xEB),),
         modules=(Kind(8, (4, 5, 6, 7), enabled=False),),
     )
-    assert "board 7: a period of 43.4176 ms becomes 43 ms" in made.said("odd")
-    assert "1 values for 2 boards; the host takes 0xff for the others" in made.said("odd")
+    assert "board 7: a period of 43.4176 ms becomes 43 ms" in made.said("info")
+    assert "1 values for 2 boards; the robot takes 0xff for the others" in made.said("odd")
     assert "board 8: 4E_Param 0x29: only bits 0, 1 and 3 are understood" in made.said("unknown")
-    assert "board 8: 4E_Shift3_1 0x33: areas are not used" in made.said("unused")
+    assert "board 8: 4E_Shift3_1 0x33: areas are not used" in made.said("info")
     assert 'add kind = "fingertip", "palm" or "triangle" to the options' in made.said("todo")
 
 
@@ -185,17 +264,20 @@ def test_other_devices_and_wrappers_without_a_device_are_named(made: Made) -> No
     made.write("motor.xml", '<device name="m" type="embObjMotionControl"/>')
     only_part(made)
     assert "there is no skin device 'chest'; its ports are not used" in made.said("missing")
+    made.write("other.xml", '<device name="o" type="embObjSkin7"/>')
+    made.imported()
+    assert "'embObjInertials' is not imported; for inertial sensors, see the option inertial" in made.said("info")
     (line,) = made.said("unknown").splitlines()
-    assert line.endswith("'embObjInertials' is not imported; see the option inertial of the driver")
+    assert line.endswith("a device of type 'embObjSkin7' is not imported")
 
 
 @pytest.mark.parametrize(
     ("wrapper", "level", "words"),
     [
-        (WRAPPER.replace("0 383 0 383", "0 383 0 200"), "unknown", "the two ranges are not of one length"),
+        (WRAPPER.replace("0 383 0 383", "0 383 0 200"), "unknown", "the two ranges differ in length"),
         (WRAPPER.replace("0 383 0 383", "0 383"), "unknown", "2 numbers, not 4"),
         (WRAPPER.replace("0 383 0 383", "0 575 0 575"), "odd", "goes to 575, but the 2 boards have 384 values"),
-        (WRAPPER.replace("0 383 0 383", "a b c d"), "unknown", "'a' is no whole number"),
+        (WRAPPER.replace("0 383 0 383", "a b c d"), "unknown", "'a' is not a whole number"),
         (WRAPPER.replace("<action", '<param name="x"> 1 </param><action'), "unknown", 'param "x": not understood'),
         (WRAPPER.replace("> torso_skin <", "> torso_skin other <"), "odd", "several devices (torso_skin, other)"),
     ],

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
+from skinware.geometry import read_geometry
 from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.icub.importer import ImportedPart
 from tests.icub.conftest import DEFAULTS, WRAPPER, Made, board_sets, device, triangle_sets
@@ -49,7 +51,9 @@ def test_modules_are_what_the_positions_say(torso: Made) -> None:
         Kind(8, (2,), kind="palm", thermal=(7,)),
         Kind(8, (3,), kind="triangle", thermal=(0, 1)),
     )
-    assert "on, though their position file has no taxel there: patch 1 board 8: 4" in torso.said("odd")
+    (line,) = torso.said("odd").splitlines()
+    assert "on, but without a taxel by the position files" in line
+    assert line.endswith("add enabled = false to the modules: patch 1 board 8: 4")
 
 
 def test_places_are_keyed_as_the_driver_names_its_sensors(torso: Made) -> None:
@@ -72,8 +76,14 @@ def test_with_two_patches_the_places_of_patch_2_come_first_in_the_file(made: Mad
     first, second = part.buses
     assert (first.options.boards, first.options.modules) == ((1,), ())
     assert (second.options.boards, second.options.modules) == ((13,), (Kind(13, tuple(range(16)), kind="fingertip"),))
-    assert part.groups[0].uid[0] == 1 << 32 | 13 << 16  # bus 1, as the driver counts
-    assert part.groups[16].uid[0] == 1 << 16
+    assert part.groups[0].uid[0] == 1 << 16
+    assert part.groups[32].uid[0] == 1 << 32 | 13 << 16  # bus 1, as the driver counts
+    off = DEFAULTS.replace("true", "false") + triangle_sets("2 13 0 3 1 2 0x2200")
+    made.write("skin.xml", device(off, ETHERNET, "embObjSkin"))
+    part = part_of(made)
+    assert [bus.patch for bus in part.buses] == [2]
+    assert {uid >> 16 for group in part.groups for uid in group.uid} == {13}  # of bus 0: there is no other
+    assert part.figures()["sensors_with_a_place"] == part.figures()["sensors"] == 4 * 12
 
 
 def test_a_port_can_be_a_piece_of_the_index(torso: Made) -> None:
@@ -88,11 +98,46 @@ def test_taxels_without_a_place_and_lists_that_do_not_fit_are_named(torso: Made)
     poses = nowhere + ["0.1 0.2 0.3 0 0 1"] * 12 * 31
     torso.write("torso.txt", positions([TRIANGLE] * 32 + [BARE], poses=poses))
     part_of(torso)
-    assert "torso.txt: taxels without a place: patch 1 board 7: 0" in torso.said("missing")
-    assert "torso.txt: taxel2Repr: 12 entries more than the 384 that both have" in torso.said("unused")
-    torso.write("torso.txt", positions([TRIANGLE] * 33))
+    assert "torso.txt: taxels without a place: patch 1 board 7: 0" in torso.said("info")
+    assert torso.said("odd") == torso.said("missing") == ""
+    torso.write("torso.txt", positions([TRIANGLE] * 33, poses=["0.1 0.2 0.3 0 0 1"] * 12 * 33 + ["1 0 0 0 0 1"]))
     part_of(torso)
-    assert "torso.txt: it has 33 triangles, the port torso 32" in torso.said("odd")
+    assert "12 places of triangles without a taxel, or that the port torso does not have" in torso.said("odd")
+    assert "torso.txt: [calibration]: 1 entries after the last whole triangle; left out" in torso.said("odd")
+
+
+def test_where_the_list_of_taxels_ends_a_channel_with_a_place_is_a_taxel(torso: Made) -> None:
+    """Some legs have 80 triangles in taxel2Repr, and 112 with a place."""
+    beyond = ["0.5 0 0 0 0 1" if k not in (6, 10) else "0 0 0 0 0 0" for k in range(12)]
+    poses = ["0.1 0.2 0.3 0 0 1"] * 12 * 30 + beyond + ["0 0 0 0 0 0"] * 12
+    torso.write("torso.txt", positions([TRIANGLE] * 30, poses=poses))
+    part = part_of(torso)
+    (bus,) = part.buses
+    assert bus.options.modules == ()
+    of_board_8 = [group for group in part.groups if group.uid[0] >> 8 == 8 << 8 | 14]
+    assert [(group.type, [uid & 255 for uid in group.uid]) for group in of_board_8] == [
+        ("pressure", [0, 1, 2, 3, 4, 5, 7, 8, 9, 11])
+    ]
+    assert part.groups[-1].uid[0] >> 8 == 8 << 8 | 14
+    assert torso.said("odd").endswith("patch 1 board 8: 15")
+
+
+def test_a_place_is_kept_whatever_its_normal(torso: Made) -> None:
+    first = ["0.1 0.2 0.3 0 0 0", "0.1 0.2 0.4 0.3 0 -0.4", "0 0 0 0 0 1", "0.1 0 0 1.7e308 1.7e308 1.7e308"]
+    none = ["0.1 0.2 0.3 0 0 0"] * 12
+    rest = ["0.1 0.2 0.3 0 0 1"] * 12 * 30
+    torso.write("torso.txt", positions([FINGERTIP] * 32, poses=[*first, *["0.1 0.2 0.3 0 0 1"] * 8, *none, *rest]))
+    part = part_of(torso)
+    path = torso.write("out.toml", part.geometry())
+    geometry = read_geometry(path)
+    assert len(geometry) == 384
+    assert geometry.known.all()
+    assert geometry.position_m[:4].tolist() == [[0.1, 0.2, 0.3], [0.1, 0.2, 0.4], [0, 0, 0], [0.1, 0, 0]]
+    assert np.isnan(geometry.normal[[0, 3, *range(12, 24)]]).all()
+    assert np.allclose(geometry.normal[[1, 2]], np.array([[0.6, 0, -0.8], [0, 0, 1]]))
+    assert part.groups[1].normal is None
+    assert torso.said("odd") == torso.said("unknown") == ""
+    assert "torso.txt: 14 of 384 places have no normal" in torso.said("info")
 
 
 @pytest.mark.parametrize(
@@ -102,7 +147,6 @@ def test_taxels_without_a_place_and_lists_that_do_not_fit_are_named(torso: Made)
         ("0.1 0.2 0.3 0 0 z", "not six numbers"),
         ("nan 0.2 0.3 0 0 1", "not six numbers"),
         ("100 0.2 0.3 0 0 1", "farther than 10 m from the link: not in metres?"),
-        ("0.1 0.2 0.3 0 0 0", "the normal does not have the length 1"),
     ],
 )
 def test_lines_that_are_no_place_are_named(torso: Made, line: str, words: str) -> None:
@@ -118,7 +162,7 @@ def test_lines_of_the_head_that_are_not_understood_are_named(torso: Made) -> Non
     torso.write("torso.txt", positions([TRIANGLE] * 32, head=head))
     part_of(torso)
     assert "torso.txt:3: colour blue: not understood" in torso.said("unknown")
-    assert "spatial_sampling triangle: the file wants one place per triangle" in torso.said("odd")
+    assert "spatial_sampling triangle: the file asks for one place per triangle" in torso.said("info")
     torso.write("torso.txt", positions([TRIANGLE] * 32, head="spatial_sampling taxel"))
     part_of(torso)
     assert "torso.txt: name: no frame" in torso.said("missing")
@@ -128,7 +172,7 @@ def test_lines_of_the_head_that_are_not_understood_are_named(torso: Made) -> Non
     ("text", "words"),
     [
         ("taxel2Repr [calibration]", "it has no taxel2Repr"),
-        ("taxel2Repr ( 1 2 x ) [calibration]", "taxel2Repr: 'x' is no whole number"),
+        ("taxel2Repr ( 1 2 x ) [calibration]", "taxel2Repr: 'x' is not a whole number"),
         ("taxel2Repr ( 1 2 3 )\n[calibration]\n", "no whole triangle"),
     ],
 )
@@ -143,9 +187,12 @@ def test_which_file_is_meant_is_asked_where_it_is_open(torso: Made) -> None:
     torso.write("torso_V2.txt", positions([FINGERTIP] * 32))
     torso.write("torsolike.txt", positions([FINGERTIP] * 32))
     assert part_of(torso).groups == []
-    assert "whose positions? torso_V1.txt, torso_V2.txt; none is used: say --positions torso=FILE" in torso.said("todo")
+    assert (
+        "several position files (torso_V1.txt, torso_V2.txt), none used: choose one with --positions torso=FILE"
+        in torso.said("todo")
+    )
     assert len(part_of(torso, positions={"torso": first}).groups) == 64
-    assert "torsolike.txt: no body part of this name is imported" in torso.said("unused")
+    assert "torsolike.txt: no body part of this name is imported" in torso.said("info")
     torso.write("torso.txt", positions([FINGERTIP] * 32))
     assert len(part_of(torso).groups) == 32  # its very name
     with pytest.raises(ConfigurationError, match=r"--positions leg=.*no part that is imported has a port"):
@@ -175,10 +222,10 @@ def test_a_drawing_tells_what_modules_are_where_no_positions_do(torso: Made) -> 
     assert bus.options.modules == (Kind(7, (1,), kind="fingertip"), Kind(8, (0, 1, 2, 3), kind="palm"))
     unknown = torso.said("unknown").splitlines()
     assert [line.split(": ")[0] for line in unknown] == [f"torso.ini:{n}" for n in (4, 11, 12, 13)]
-    assert "a module of the kind 'quad16', which nobody here knows" in unknown[1]
+    assert "a module of the kind 'quad16', which is not known here" in unknown[1]
     assert "draws triangles 40, which the port torso does not have" in torso.said("odd")
     assert "on, but not drawn: patch 1 board 7: 2-15; patch 1 board 8: 5-15" in torso.said("odd")
-    assert "x, y, orientation, gain, mirror and layout of each module: for the picture" in torso.said("unused")
+    assert "x, y, orientation, gain, mirror and layout of each module: for the picture" in torso.said("info")
 
 
 def test_positions_beat_a_drawing(torso: Made) -> None:
@@ -189,7 +236,7 @@ def test_positions_beat_a_drawing(torso: Made) -> None:
 
 
 def test_what_is_drawn_but_off_is_named(torso: Made) -> None:
-    torso.write("skin.xml", device(DEFAULTS + triangle_sets("1 7 0 1 0 2 0x2200")))
+    torso.write("skin.xml", device(DEFAULTS + triangle_sets("0 7 0 1 0 2 0x2200")))
     torso.write("torso.ini", DRAWING)
     part_of(torso)
     assert "drawn, but off: patch 1 board 7: 0-1" in torso.said("odd")
@@ -204,7 +251,7 @@ def test_several_drawings_of_one_part_are_no_use(torso: Made) -> None:
 
 
 def test_a_hand_of_which_no_file_tells_is_to_be_decided(torso: Made) -> None:
-    torso.write("skin.xml", device(DEFAULTS + board_sets("1 8 8 50 1 0xf0") + triangle_sets("1 8 0 11 1 2 0x2200")))
+    torso.write("skin.xml", device(DEFAULTS + board_sets("0 8 8 50 1 0xf0") + triangle_sets("0 8 0 11 1 2 0x2200")))
     part_of(torso)
-    assert "fingertips or palms? taken to be fingertips" in torso.said("todo")
+    assert "fingertips or palms? No position file says, so they are taken to be fingertips" in torso.said("todo")
     assert "patch 1 board 8: 0-11" in torso.said("todo")

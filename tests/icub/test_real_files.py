@@ -1,7 +1,8 @@
-"""The real files of robots, read in place."""
+"""The real files of robots, read in place: what is made of them, and what a person is told of it."""
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,26 +15,52 @@ from skinware_drivers.icub.notes import Notes
 from tests.icub.conftest import configuration
 
 
-@pytest.fixture
-def all_files(robots: Path, geometry: Path) -> tuple[Import, Notes]:
+def imported(*paths: Path) -> tuple[Import, Notes]:
     notes = Notes()
-    return import_files([robots, geometry], notes), notes
+    return import_files(paths, notes), notes
 
 
-def test_every_value_of_all_files_is_understood(all_files: tuple[Import, Notes], robots: Path, geometry: Path) -> None:
-    done, notes = all_files
+@pytest.fixture
+def robot(robots: Path, geometry: Path) -> Import:
+    """The first whole robot, with all positions."""
+    return imported(robots / "iCubGenova02", geometry)[0]
+
+
+def test_every_value_of_all_files_is_understood(robots: Path, geometry: Path) -> None:
+    done, notes = imported(robots, geometry)
     assert [str(note) for note in notes.all() if note.level == "unknown"] == []
     there_are = [path for folder in (robots, geometry) for path in folder.rglob("*")]
     assert set(done.files) == {path for path in there_are if path.suffix in (".xml", ".txt", ".ini")}
-    missing = {note.element for note in notes.all() if note.level == "missing"}
-    assert missing == {"xi:include", ""}  # of the robot's other files, and fingertips without a place
+    missing = {note.text for note in notes.all() if note.level == "missing"}
+    assert missing == {"there is no skin device 'torso_skin'; its ports are not used"}
 
 
-def test_every_part_is_there_with_the_triangles_that_its_files_enable(all_files: tuple[Import, Notes]) -> None:
-    parts = {part.name: (part.triangles, len(part.buses)) for part in all_files[0].parts}
-    assert parts == {
-        "fingertip": (16, 1),
-        "torso_skin": (64, 1),
+FILL_IN_A_BUS, FINGERTIPS_OR_PALMS = "fill in", "fingertips or palms?"
+GIVEN_AGAIN, NO_BOOLEAN, STAY_OFF = "given again as", "neither true nor false", "they stay off"
+ALL_OFF, NO_DEVICE, NO_KIND = "no triangle is switched on", "there is no skin device", "what the modules are"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("iCubGenova02", {FILL_IN_A_BUS: 5, FINGERTIPS_OR_PALMS: 2}),
+        ("iCubShanghai01", {FILL_IN_A_BUS: 5, FINGERTIPS_OR_PALMS: 2, NO_BOOLEAN: 1}),
+        ("iCubStanford01", {FILL_IN_A_BUS: 5, FINGERTIPS_OR_PALMS: 2, NO_BOOLEAN: 1, GIVEN_AGAIN: 8, ALL_OFF: 2}),
+        ("SkinFingertipDemo", {NO_KIND: 1}),
+        ("experimentalSetups/torsoSkinLaptop", {}),
+        ("robots-icebox/iCubAnkara01", {FILL_IN_A_BUS: 2, FINGERTIPS_OR_PALMS: 2, ALL_OFF: 2, NO_DEVICE: 1}),
+        ("robots-icebox/iCubLondon01", {FILL_IN_A_BUS: 3, FINGERTIPS_OR_PALMS: 2, STAY_OFF: 2}),
+        ("robots-icebox/iCubRome02", {FILL_IN_A_BUS: 2, NO_DEVICE: 1}),
+    ],
+)
+def test_a_person_is_told_what_a_person_must_know(robots: Path, name: str, expected: dict[str, int]) -> None:
+    told = [note.text for note in imported(robots / name)[1].all() if note.level != "info"]
+    assert Counter(what for what in expected for text in told if what in text) == expected
+    assert len(told) == sum(expected.values())
+
+
+def test_every_part_is_there_with_the_triangles_that_its_files_enable(robot: Import) -> None:
+    assert {part.name: (part.triangles, len(part.buses)) for part in robot.parts} == {
         "left_arm-eb2-j4_15-skin": (74, 1),
         "right_arm-eb4-j4_15-skin": (74, 1),
         "left_leg-eb10-skin": (208, 2),
@@ -42,8 +69,8 @@ def test_every_part_is_there_with_the_triangles_that_its_files_enable(all_files:
     }
 
 
-def test_what_is_written_is_what_the_driver_reads(all_files: tuple[Import, Notes], tmp_path: Path) -> None:
-    for part in all_files[0].parts:
+def test_what_is_written_is_what_the_driver_reads(robots: Path, geometry: Path, tmp_path: Path) -> None:
+    for part in imported(robots, geometry)[0].parts:
         text = part.configuration()
         for number in range(len(part.buses)):
             text = text.replace('name = ""', f'name = "can{number}"', 1)
@@ -57,8 +84,8 @@ def test_what_is_written_is_what_the_driver_reads(all_files: tuple[Import, Notes
         assert places.known.all()
 
 
-def test_the_right_arm(all_files: tuple[Import, Notes]) -> None:
-    arm = next(part for part in all_files[0].parts if part.name.startswith("right_arm"))
+def test_the_right_arm(robot: Import) -> None:
+    arm = next(part for part in robot.parts if part.name.startswith("right_arm"))
     (bus,) = arm.buses
     assert bus.options.boards == (14, 13, 12, 11, 10, 9, 8)
     enabled = {board: sorted(BoardSetUp(bus.options, board).enabled) for board in bus.options.boards}
@@ -71,17 +98,17 @@ def test_the_right_arm(all_files: tuple[Import, Notes]) -> None:
     assert {group.frame for group in palm} == {"r_hand"}
 
 
-def test_the_left_leg_is_on_two_buses_of_which_the_second_has_the_foot(all_files: tuple[Import, Notes]) -> None:
-    leg = next(part for part in all_files[0].parts if part.name.startswith("left_leg"))
+def test_the_left_leg_is_on_two_buses_of_which_the_second_has_the_foot(robot: Import) -> None:
+    leg = next(part for part in robot.parts if part.name.startswith("left_leg"))
     assert [bus.options.boards for bus in leg.buses] == [(1, 2, 3, 4, 5, 6, 7), (13, 12, 8, 9, 10, 11)]
-    uids = {uid for group in leg.groups for uid in group.uid}
-    assert {uid >> 32 for uid in uids} == {1}
-    assert {uid >> 16 & 0xFFFF for uid in uids} == {12, 13}
-    assert {group.frame for group in leg.groups} == {"l_foot"}
+    boards = {(group.frame, uid >> 32, uid >> 16 & 0xFFFF) for group in leg.groups for uid in group.uid}
+    foot = {("l_foot", 1, 12), ("l_foot", 1, 13)}
+    assert boards == foot | {("l_upper_leg", 0, board) for board in range(1, 8)}
+    assert sum(len(group.uid) for group in leg.groups) == leg.placed == 250 + 680  # 210 of them beyond taxel2Repr
 
 
-def test_a_torso_has_all_its_528_places(all_files: tuple[Import, Notes]) -> None:
-    torso = next(part for part in all_files[0].parts if part.name == "torso_skin")
+def test_a_torso_has_all_its_528_places(robots: Path, geometry: Path) -> None:
+    (torso,) = imported(robots / "experimentalSetups" / "torsoSkinLaptop", geometry)[0].parts
     assert torso.buses[0].name == "can0"
     by_type = {kind: sum(len(g.uid) for g in torso.groups if g.type == kind) for kind in ("pressure", "temperature")}
     assert by_type == {"pressure": 440, "temperature": 88}

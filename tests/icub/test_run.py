@@ -57,12 +57,13 @@ def test_a_real_leg_on_two_buses_lives(robots: Path, geometry: Path, tmp_path: P
             places = read_geometry(tmp_path / f"{name}.geometry.toml")
             known = places.of(frame.structure, "pressure").known
             boards = frame.structure.sensor_uid[frame.structure.index("pressure")][known] >> 16
-            assert set(boards.tolist()) == {1 << 16 | 12, 1 << 16 | 13}  # the foot, on the second bus
-            assert known.sum() == len(places) == 250
+            foot = {1 << 16 | 12, 1 << 16 | 13}  # on the second bus
+            assert set(boards.tolist()) == {*range(1, 8), *foot}
+            assert known.sum() == len(places) == 680 + 250
 
 
 def test_a_made_up_part_lives_with_what_its_files_enable(made: Made, tmp_path_factory: pytest.TempPathFactory) -> None:
-    sets = board_sets("1 8 8 100 1 0xf0") + triangle_sets("1 8 0 3 1 2 0x2200", "1 7 15 15 0 2 0x2200")
+    sets = board_sets("0 8 8 100 1 0xf0") + triangle_sets("0 8 0 3 1 2 0x2200", "0 7 15 15 0 2 0x2200")
     made.write("skin.xml", device(DEFAULTS + sets))
     made.write("wrapper.xml", WRAPPER)
     palm = [1] * 11 + [-1]
@@ -98,11 +99,11 @@ def test_one_part_goes_to_stdout_and_the_remarks_to_stderr(made: Made, capsys: p
     out, err = capsys.readouterr()
     assert out.startswith("# torso_skin (canBusSkin), made by skin-import from skin.xml.\n")
     assert 'name = "can0"' in out
-    assert "Not understood, left out:\n" in err
+    assert "Not understood and left out:\n" in err
     assert "skin.xml:9: param \"gain\": not understood: '4'" in err
-    assert "Understood, of no meaning for the driver: 1 (-v names them)" in err
+    assert "Nothing to do: 1 (-v names them)" in err
     assert call(made.folder, "-v") == 0
-    assert "whether the host logs faults" in capsys.readouterr().err
+    assert "whether the robot's software logs faults" in capsys.readouterr().err
 
 
 def test_json_holds_everything(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,7 +184,7 @@ def test_a_file_that_is_named_must_be_of_use(made: Made, capsys: pytest.CaptureF
     assert "does not exist" in capsys.readouterr().err
     path = made.write("notes.txt", "nothing")
     assert call(path) == 2
-    assert "neither positions nor a drawing of skinGui" in capsys.readouterr().err
+    assert "neither a position file nor a drawing of skinGui" in capsys.readouterr().err
     assert call(made.write("a.xml", "<a")) == 2
     assert "a.xml:1: not XML" in capsys.readouterr().err
 

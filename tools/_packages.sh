@@ -3,6 +3,7 @@
 
 may_install=yes
 lock_wait_s=600
+lists_are_new=no
 
 # install_packages "for what" PACKAGE...: as root; otherwise says what to type, and fails.
 install_packages() {
@@ -10,7 +11,9 @@ install_packages() {
     shift
     if [ "$may_install" = yes ] && [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
         echo "installing $* ($purpose)" >&2
-        apt_get update && apt_get install --yes --no-install-recommends "$@"
+        [ "$lists_are_new" = yes ] || apt_get update || return 1
+        lists_are_new=yes
+        apt_get install --yes --no-install-recommends "$@"
         return
     fi
     echo "missing $purpose; on Debian and Ubuntu:" >&2

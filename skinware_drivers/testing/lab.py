@@ -190,6 +190,7 @@ def main(folder: Path) -> int:
     if arguments.action == "packages":
         sys.stdout.write(f"{packages(arguments.kernel)}\n")
         return 0
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # the guest ends with us
     return run(arguments.kernel, arguments.command, arguments.timeout, folder)
 
 

@@ -1,0 +1,78 @@
+"""What the tools do to the machine that they run on: packages are installed as root, behind any other apt, or named."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+PACKAGES = Path(__file__).parent.parent / "tools/_packages.sh"
+
+
+@pytest.fixture
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in front of PATH: an ``apt-get`` that notes what it is asked for, run by root, and no pauses."""
+    put(tmp_path / "apt-get", 'echo "$@" >>"$(dirname "$0")/asked"')
+    put(tmp_path / "id", "echo 0")
+    put(tmp_path / "sleep", "")
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    return tmp_path
+
+
+def put(path: Path, script: str) -> None:
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+
+
+def shell(script: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["bash", "-uc", f"source {PACKAGES}; {script}"], capture_output=True, text=True)
+
+
+def asked(fake: Path) -> list[str]:
+    return (fake / "asked").read_text().splitlines() if (fake / "asked").exists() else []
+
+
+def test_root_installs_and_says_what_for_in_one_line(fake: Path) -> None:
+    done = shell('install_packages "to see" one two && install_packages "to hear" three')
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr.splitlines() == ["installing one two (to see)", "installing three (to hear)"]
+    install = "-qq install --yes --no-install-recommends"
+    assert asked(fake) == ["-qq update", f"{install} one two", f"{install} three"]
+
+
+@pytest.mark.parametrize("message", ["Could not get lock /var/lib/apt/lists/lock", "Unable to lock directory"])
+def test_another_apt_is_waited_for(fake: Path, message: str) -> None:
+    count = f'n=$(cat {fake}/count 2>/dev/null); echo "$n+" >{fake}/count; [ "$n" = "+++" ]'
+    put(fake / "apt-get", f'{count} || {{ echo "E: {message}" >&2; exit 100; }}')
+    done = shell("apt_get update")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == "another apt is running: waiting for it, at most 10 minutes\n"
+    assert (fake / "count").read_text() == "++++\n"
+
+
+def test_another_apt_is_not_waited_for_indefinitely(fake: Path) -> None:
+    put(fake / "apt-get", 'echo "E: Could not get lock" >&2; exit 100')
+    done = shell("lock_wait_s=1; apt_get update")
+    assert done.returncode == 1
+    assert done.stderr.endswith("E: Could not get lock\n")
+
+
+def test_what_apt_says_is_shown_if_it_fails(fake: Path) -> None:
+    put(fake / "apt-get", 'echo "E: Unable to locate package two" >&2; exit 100')
+    done = shell('install_packages "to see" one two')
+    assert done.returncode == 1
+    assert done.stderr == "installing one two (to see)\nE: Unable to locate package two\n"
+
+
+@pytest.mark.parametrize(("user", "may_install"), [("1000", "yes"), ("0", "no")])
+def test_who_may_not_install_is_told_the_line_to_type(fake: Path, user: str, may_install: str) -> None:
+    put(fake / "id", f"echo {user}")
+    done = shell(f'may_install={may_install}; install_packages "to see" one two')
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == [
+        "missing to see; on Debian and Ubuntu:",
+        "    sudo apt-get update && sudo apt-get install --no-install-recommends one two",
+    ]
+    assert asked(fake) == []

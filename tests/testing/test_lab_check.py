@@ -1,0 +1,88 @@
+"""The CAN lab says that it can run only where all is there that a boot needs, and its guest never outlives it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from skinware_drivers.testing import lab
+from skinware_drivers.testing.waiting import wait_until
+
+STATIC = "ELF 64-bit LSB executable, x86-64, statically linked, stripped"
+DYNAMIC = "ELF 64-bit LSB pie executable, x86-64, dynamically linked, interpreter /lib64/ld-linux-x86-64.so.2"
+NEEDED = ("qemu-system-x86_64", "ip", "modprobe", "file", "busybox", "vng")
+
+
+def put(path: Path, script: str) -> None:
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with all the commands of a machine that can run the lab."""
+    for name in NEEDED:
+        put(tmp_path / name, f'echo "$2: {STATIC}"')
+    monkeypatch.setattr(lab, "_path", lambda: f"{tmp_path}")
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(lab, "find_kernel", lambda flavour: Path(f"/boot/vmlinuz-{flavour}"))
+    monkeypatch.setattr(lab, "find_vng", lambda: str(tmp_path / "vng") if (tmp_path / "vng").exists() else None)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("machine")
+def test_a_machine_that_has_all_can_run_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert lab.report("plain", lab.missing("plain")) == 0
+    assert capsys.readouterr().out == "the CAN lab can run: /boot/vmlinuz-plain\n"
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_whatever_is_missing_is_named(machine: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (machine / name).unlink()
+    assert lab.report("rt", lab.missing("rt")) == 1
+    said = capsys.readouterr().err
+    assert {"vng": "virtme-ng"}.get(name, name) in said.splitlines()[0]
+    assert said.splitlines()[1] == f"install: apt-get install --no-install-recommends {lab.packages('rt')}"
+
+
+def test_a_dynamically_linked_busybox_is_none(machine: Path) -> None:
+    put(machine / "file", f'echo "$2: {DYNAMIC}"')
+    assert lab.missing("plain") == ["a statically linked busybox"]
+    put(machine / "busybox-static", "")
+    put(machine / "file", f'case $2 in *-static) echo "{STATIC}" ;; *) echo "{DYNAMIC}" ;; esac')
+    assert lab.missing("plain") == []
+
+
+@pytest.mark.parametrize("suffix", ["", ".xz", ".zst"])
+def test_a_kernel_is_one_that_has_all_modules(tmp_path: Path, suffix: str) -> None:
+    names = lab.MODULES.split()
+    lines = [f"kernel/net/can/{name}.ko{suffix}: kernel/net/can/can.ko{suffix}\n" for name in names]
+    assert not lab._has_modules(tmp_path)
+    (tmp_path / "modules.dep").write_text("".join(lines))
+    assert lab._has_modules(tmp_path)
+    (tmp_path / "modules.dep").write_text("".join(lines[1:]))
+    assert not lab._has_modules(tmp_path)
+
+
+def test_the_guest_ends_with_the_lab(machine: Path) -> None:
+    put(machine / "vng", 'echo "guest $$"; exec sleep 600')
+    program = f"""
+import sys
+from pathlib import Path
+from skinware_drivers.testing import lab
+lab.missing, lab.find_kernel, lab.find_vng = lambda flavour: [], lambda flavour: Path("/"), lambda: "{machine}/vng"
+sys.argv = ["lab", "run", "true"]
+sys.exit(lab.main(Path("/")))
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    with process.stdout:
+        guest = int(process.stdout.readline().split()[1])
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 128 + signal.SIGTERM
+    wait_until(lambda: not Path(f"/proc/{guest}").exists())

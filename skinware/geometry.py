@@ -23,19 +23,28 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.structure import Structure
 
 FORMAT, VERSION = "skinware-geometry", 1
 
 _LENGTH_TOLERANCE = 0.02
 """Of a normal: files give them with few digits."""
+
+
+class Sensors(Protocol):
+    """What has sensors in an order: a :class:`skinware.Structure`."""
+
+    @property
+    def sensor_uid(self) -> npt.NDArray[np.uint64]: ...
+
+    def index(self, type_name: str, /) -> slice | npt.NDArray[np.int64]: ...
+
 
 Triple = tuple[float, float, float]
 
@@ -116,7 +125,7 @@ class Geometry:
         known: npt.NDArray[np.bool_] = np.isfinite(self.position_m[:, 0])
         return known
 
-    def of(self, structure: Structure, type_name: str) -> Geometry:
+    def of(self, structure: Sensors, type_name: str) -> Geometry:
         """The places of a skin's sensors of one type, in the order of ``structure.index(type_name)``.
 
         Raises:

@@ -133,7 +133,7 @@ class Structure:
     @cached_property
     def patch_names(self) -> tuple[str, ...]:
         """Name of every patch, as people know it: ``board 8``; of those that share one ``board 8 on can0``."""
-        return _names.patch_names(_texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()])
+        return _names.distinct(texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()], "on")
 
     @cached_property
     def module_names(self) -> tuple[str, ...]:
@@ -143,7 +143,7 @@ class Structure:
         is called as the patch.
         """
         return _names.module_names(
-            _texts(self.module_name), _texts(self.module_kind), self.module_patch.tolist(), self.patch_names
+            texts(self.module_name), texts(self.module_kind), self.module_patch.tolist(), self.patch_names
         )
 
     def sensor_name(self, position: int) -> str:
@@ -156,10 +156,13 @@ class Structure:
         Args:
             position: in a frame.
         """
-        module, type_id = int(self.sensor_module[position]), int(self.sensor_type[position])
-        of_module = self.module_index(module)
-        return _names.sensor_name(
-            self.module_names[module],
+        return _names.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
+
+    def name_in_module(self, position: int) -> str:
+        """What ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
+        of_module = self.module_index(int(self.sensor_module[position]))
+        type_id = int(self.sensor_type[position])
+        return _names.name_in_module(
             next(t.name for t in self.types if t.id == type_id),
             int(self.sensor_uid[position] - self.sensor_uid[of_module].min()),
             is_only=int((self.sensor_type[of_module] == type_id).sum()) == 1,
@@ -206,7 +209,19 @@ class Structure:
         except KeyError:
             raise StructureError(f"no {type_name} sensor with uid {uid:#x} in this skin") from None
 
-    def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.float32]:
+    def module_of(self, type_name: str) -> npt.NDArray[np.uint32]:
+        """(n,) uint32, index of the module of each sensor of a type, in the order of ``index(type_name)``.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        return self.sensor_module[self.index(type_name)]
+
+    def patch_of(self, type_name: str) -> npt.NDArray[np.uint32]:
+        """(n,) uint32, index of the patch of each sensor of a type, likewise."""
+        return self.sensor_patch[self.index(type_name)]
+
+    def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Physical values of all sensors of a type.
 
         Args:
@@ -214,11 +229,16 @@ class Structure:
             type_name: which sensors to take.
 
         Returns:
-            (n,) float32 in the type's unit, in the order of ``index(type_name)``.
+            (n,) float32 in the type's unit, in the order of ``index(type_name)``; float64 if the raw values are
+            int32, which have more digits than float32 holds.
         """
         sensor_type = self.type(type_name)
-        raw = values[self.index(type_name)].astype(np.float32)
-        return raw * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
+        raw = values[self.index(type_name)]
+        if self.dtype == np.int32:
+            exact: npt.NDArray[np.float64] = raw.astype(np.float64)
+            return exact * sensor_type.scale + sensor_type.offset
+        single: npt.NDArray[np.float32] = raw.astype(np.float32)
+        return single * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """The tables as named columns, for a service's file."""
@@ -343,7 +363,8 @@ def _column(name: str, data: npt.ArrayLike) -> npt.NDArray[Any]:
     return _frozen(given.astype(wanted))
 
 
-def _texts(column: npt.NDArray[np.bytes_]) -> list[str]:
+def texts(column: npt.NDArray[np.bytes_]) -> list[str]:
+    """The texts of a column of names."""
     return [text.decode(errors="replace") for text in column.tolist()]
 
 

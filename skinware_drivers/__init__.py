@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         Layout,
         Packed,
         Sentinel,
-        Stamp,
+        SequenceNumber,
         StatusBytes,
         Values,
     )
@@ -50,7 +50,7 @@ __all__ = [
     "Poll",
     "Sensor",
     "Sentinel",
-    "Stamp",
+    "SequenceNumber",
     "StatusBytes",
     "Values",
     "Watch",
@@ -70,6 +70,8 @@ def get_include() -> str:
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for, and no more: commands and the pytest plug-in, which are here too, start fast."""
+    if name == "Stamp":  # the old name of SequenceNumber, which says so
+        return importlib.import_module(f"{__name__}.layout").Stamp
     if name in __all__:
         for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
             if name in vars(module):

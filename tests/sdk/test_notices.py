@@ -15,7 +15,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import NoOptions, Notice
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Stamp, Values
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -302,7 +302,7 @@ def test_sequence_numbers_of_a_patch_that_was_set_up_anew_begin_anew(devices: De
                     (3,),
                     Values(1, "u1", 2),
                     patch=Bits(0, 4),
-                    stamp=Stamp(0, "u1"),
+                    sequence=SequenceNumber(0, "u1"),
                 )
             ]
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skinware_drivers.adapter import NoOptions, Notice, Watch
+    from skinware_drivers.bus import EXTENDED_FLAG
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.layout import (
         Bits,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from skinware_drivers.polling import Poll
 
 __all__ = [
+    "EXTENDED_FLAG",
     "Bits",
     "Byte",
     "Cycle",
@@ -60,7 +62,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("layout", "description", "link", "adapter", "operations", "options", "polling")
+_MODULES = ("layout", "bus", "description", "link", "adapter", "operations", "options", "polling")
 
 
 def get_include() -> str:

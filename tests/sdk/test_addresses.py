@@ -219,3 +219,20 @@ def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
     decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
     run(decoder, [(0, 0x101, numbers(1)), (0, 0x101, numbers(2))])
     assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
+
+
+def test_a_wide_key_of_a_module_is_not_taken_for_one_of_the_next_patch() -> None:
+    patch, module = Bits(shift=20, width=8), Bits(shift=0, width=20)
+    frame = Frame("f", (Identifier(0, mask=0, extended=True),), (8,), Values(0, "<u2", 2), patch=patch, module=module)
+    decoder = Decoder([Layout([frame])], tables_of(patches(0, 1, modules=(1,))))
+    foreign = run(
+        decoder, [(0, EXTENDED_FLAG | 0x1_0001, numbers(9, 9)), (0, EXTENDED_FLAG | 1 << 20 | 1, numbers(1, 2))]
+    )
+    assert foreign == [0]
+    assert decoder.state.values.tolist() == [0, 0, 1, 2]
+
+
+@pytest.mark.parametrize("bits", [Bits(0, 0), Bits(-1, 4), Bits(16, 16), Bits(0, 30)])
+def test_a_key_that_no_identifier_has_room_for_is_refused(bits: Bits) -> None:
+    with pytest.raises(ConfigurationError, match="an identifier has at most 29 bits"):
+        Layout([Frame("f", (), (8,), Values(0, "u1", 1), module=bits)])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         Layout,
         Packed,
         Sentinel,
-        Stamp,
+        SequenceNumber,
         StatusBytes,
         Values,
     )
@@ -53,7 +53,7 @@ __all__ = [
     "Poll",
     "Sensor",
     "Sentinel",
-    "Stamp",
+    "SequenceNumber",
     "StatusBytes",
     "Values",
     "Watch",
@@ -63,7 +63,7 @@ __all__ = [
     "taxels",
 ]
 
-_MODULES = ("bus", "layout", "description", "link", "notice", "watch", "operations", "options", "polling")
+_MODULES = ("layout", "bus", "description", "link", "notice", "watch", "operations", "options", "polling")
 
 
 def get_include() -> str:
@@ -73,6 +73,8 @@ def get_include() -> str:
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for, and no more: commands and the pytest plug-in, which are here too, start fast."""
+    if name == "Stamp":  # the old name of SequenceNumber, which says so
+        return importlib.import_module(f"{__name__}.layout").Stamp
     if name in __all__:
         for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
             if name in vars(module):

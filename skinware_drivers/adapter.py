@@ -15,6 +15,7 @@ from skinware.sensor_types import SensorType
 from skinware_drivers.bus import Bus, kind_of_bus
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.layout import Layout
+from skinware_drivers.layout_check import check_layout
 from skinware_drivers.link import DEFAULT_PACE_PER_MS, Link
 from skinware_drivers.notice import Notice
 from skinware_drivers.options import HasOptions, NoOptions, OptionsT
@@ -87,9 +88,13 @@ class Adapter(HasOptions[OptionsT], ABC):
             if not getattr(self, needed, None):
                 raise ConfigurationError(f"{name} has no `{needed}`")
         try:
-            assemble([("bus", self.patches)], self.types, self.dtype)
+            tables = assemble([("bus", self.patches)], self.types, self.dtype)
         except (StructureError, TypeError, AttributeError) as error:  # the last two: one where a list belongs, or so
             raise ConfigurationError(f"{name}: `patches`, `types` and `dtype` make no skin: {error}") from None
+        try:
+            check_layout(self.layout, self.patches, tables, self.period_s)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{name}: {error}") from None
 
     def fit(self, bus: Bus) -> None:
         """Prepare a bus that is not open yet for what this driver expects of it.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -18,9 +18,12 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.bus import EXTENDED_FLAG, LARGEST_IDENTIFIER, LARGEST_STANDARD, check_identifier
+from skinware_drivers.numbering import DeviceTime, SequenceNumber
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can tell apart, over all its buses."""
+_KEY_BITS = 29
+_FEWEST_COUNTS = 4
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class Bits:
 
     Attributes:
         shift: position of the lowest bit.
-        width: number of bits, 1 to 16.
+        width: number of bits, 1 to 29.
         byte: None: of the identifier; a number: of that payload byte (only as a module's key, at most 8 bits).
     """
 
@@ -166,50 +169,6 @@ class StatusBytes:
 
 
 @dataclass(frozen=True)
-class Stamp:
-    """A sequence number in the payload that counts a module's frames; what it skips or repeats is counted.
-
-    Attributes:
-        offset: first byte.
-        dtype: unsigned numpy dtype with byte order.
-        modulo: it wraps to 0 here; default: the dtype's own range.
-    """
-
-    offset: int
-    dtype: str
-    modulo: int | None = None
-
-
-@dataclass(frozen=True)
-class DeviceTime:
-    """The time in a payload at which the device took the values, by its own clock.
-
-    The frame's time then is that time on our clock, and not that of the receipt. All frames of a patch have one clock.
-
-    Attributes:
-        offset: first byte.
-        dtype: unsigned numpy dtype with byte order, at most 4 bytes.
-        unit_s: seconds per count.
-        modulo: it wraps to 0 here; default: the dtype's own range.
-    """
-
-    offset: int
-    dtype: str
-    unit_s: float
-    modulo: int | None = None
-
-    @property
-    def end(self) -> int:
-        """One past its last byte."""
-        return self.offset + np.dtype(self.dtype).itemsize
-
-    @property
-    def turn(self) -> int:
-        """Counts until it is 0 again."""
-        return self.modulo or 1 << 8 * np.dtype(self.dtype).itemsize
-
-
-@dataclass(frozen=True)
 class Expand:
     """The escape for what values cannot say (run lengths, nibble maps, text): a vectorised function.
 
@@ -239,8 +198,9 @@ class Frame:
         module: bit field that names the module within the patch; or the key of the only module that it is of; None:
             the patch has one module.
         flags: what sets status bits.
-        stamp: sequence number, if there is one.
+        sequence: sequence number, if there is one that the frames of a cycle do not share (see :class:`Cycle`).
         time: the device's own time, if it tells it.
+        stamp: the old name of ``sequence``; to be removed in release 0.2.
     """
 
     name: str
@@ -250,8 +210,14 @@ class Frame:
     patch: Bits | int | None = None
     module: Bits | int | None = None
     flags: Sequence[Flag | Sentinel | StatusBytes] = ()
-    stamp: Stamp | None = None
+    sequence: SequenceNumber | None = None
     time: DeviceTime | None = None
+    stamp: InitVar[SequenceNumber | None] = None
+
+    def __post_init__(self, stamp: SequenceNumber | None) -> None:
+        if stamp is not None:
+            warnings.warn("Frame(stamp=...) is now Frame(sequence=...)", DeprecationWarning, stacklevel=3)
+            object.__setattr__(self, "sequence", stamp)
 
     @property
     def runs(self) -> Sequence[Values]:
@@ -275,19 +241,47 @@ class Frame:
 class Cycle:
     """Frames that make one coherent update of a module together; without all of them none is shown.
 
+    With a ``counter``, frames of different cycles are never joined. Without one, only order and time tell cycles
+    apart: see :doc:`/explanation/layout` for what they can tell, and what they cannot.
+
     Attributes:
         members: names of the frames, in order.
         within: the members must follow each other without any other frame of the same ``patch`` (or ``module``)
             in between.
         order: ``given``: in the order of ``members``; ``any``: each once; ``ends_with``: any order, but the last
             member last.
-        maximum_age_s: longest time from the first to the last of them.
+        maximum_age_s: longest time from the first to the last of them. Two cycles must not fit into it: it is shorter
+            than a period (``any``: half a period), or so many periods as the counter has values.
+        counter: the number that all frames of a cycle share, and that is another in the next: of the module's cycles,
+            or of the patch's. One field that all members have, or one for each.
     """
 
     members: Sequence[str]
     maximum_age_s: float
     within: Literal["patch", "module"] = "module"
     order: Literal["given", "any", "ends_with"] = "given"
+    counter: SequenceNumber | Sequence[SequenceNumber] | None = None
+
+    @property
+    def counters(self) -> Sequence[SequenceNumber]:
+        """The counter's field in each member; empty without one."""
+        if self.counter is None:
+            return ()
+        return [self.counter] * len(self.members) if isinstance(self.counter, SequenceNumber) else self.counter
+
+    @property
+    def turn(self) -> int:
+        """Cycles after which one looks like this again: 1 without a counter."""
+        return self.counters[0].turn if self.counters else 1
+
+    @property
+    def reach_s(self) -> float:
+        """What must be shorter than ``turn`` periods, or two cycles fit into ``maximum_age_s``.
+
+        In a given order, the frame that came last must be from the end of a cycle and the first from the beginning
+        of one, which are a period apart or more. In any order, it can be the end of one and the beginning of the next.
+        """
+        return 2 * self.maximum_age_s if self.order == "any" else self.maximum_age_s
 
 
 @dataclass(frozen=True)
@@ -313,6 +307,7 @@ class Layout:
             members = list(self.cycle.members)
             if len(set(members)) < len(members) or not set(members) <= set(names) or len(members) < 2:
                 raise ConfigurationError(f"cycle of {members}: name at least two different frames of {names}")
+            _check_counters(self.cycle, [self.frames[names.index(name)] for name in members])
 
     @property
     def cycle_length(self) -> int:
@@ -341,6 +336,9 @@ def _check_frame(frame: Frame) -> None:
             raise refuse(f"values end at byte {values.end}, the shortest right payload has {min(frame.length)}")
         if isinstance(values.dtype, Packed) and not 0 <= values.dtype.skip < 8:
             raise refuse(f"{values.dtype.skip} bits before the first value: give 0 to 7, and the first byte as offset")
+    for name, key in (("patch", frame.patch), ("module", frame.module)):
+        if isinstance(key, Bits) and not (key.width >= 1 and 0 <= key.shift <= _KEY_BITS - key.width):
+            raise refuse(f"{name}: an identifier has at most {_KEY_BITS} bits, not {key.width} from bit {key.shift} on")
     if isinstance(frame.patch, Bits) and frame.patch.byte is not None:
         raise refuse("a patch is named by bits of the identifier, not of the payload")
     if frame.module_byte is not None and not 1 <= frame.module_byte.width <= 8:
@@ -357,7 +355,56 @@ def _check_frame(frame: Frame) -> None:
             raise refuse(f"identifier {condition.value:X} has bits outside its mask {condition.mask:X}: none matches")
         if isinstance(condition, Byte) and condition.offset >= min(frame.length):
             raise refuse(f"byte {condition.offset} is not in every right payload")
-    if frame.stamp is not None and frame.stamp.offset + np.dtype(frame.stamp.dtype).itemsize > min(frame.length):
-        raise refuse("the sequence number is not in every right payload")
+    if frame.sequence is not None and frame.sequence.wrong(min(frame.length)):
+        raise refuse(frame.sequence.wrong(min(frame.length)))
     if frame.time is not None and frame.time.end > min(frame.length):
         raise refuse("the device's time is not in every right payload")
+
+
+def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:
+    counters = cycle.counters
+    if not counters:
+        return
+    if len(counters) != len(members):
+        raise ConfigurationError("the counter of a cycle: give one field, or one for each member")
+    for counter, frame in zip(counters, members, strict=True):
+        wrong = counter.wrong(min(frame.length))
+        if wrong:
+            raise ConfigurationError(f"frame {frame.name!r}, counter of its cycle: {wrong}")
+        if frame.sequence is not None:
+            raise ConfigurationError(
+                f"frame {frame.name!r} has a sequence number beside the counter of its cycle: leave it out"
+            )
+    if len({counter.turn for counter in counters}) > 1:
+        raise ConfigurationError("the counter of a cycle: its fields must be of the same modulo")
+    if cycle.turn < _FEWEST_COUNTS:
+        raise ConfigurationError(
+            f"the counter of a cycle has {cycle.turn} values: two lost cycles look like none; it needs {_FEWEST_COUNTS}"
+        )
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Stamp":
+        warnings.warn("Stamp is now SequenceNumber", DeprecationWarning, stacklevel=2)
+        return SequenceNumber
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+__all__ = [
+    "MOST_FRAMES",
+    "Bits",
+    "Byte",
+    "Condition",
+    "Cycle",
+    "DeviceTime",
+    "Expand",
+    "Flag",
+    "Frame",
+    "Identifier",
+    "Layout",
+    "Packed",
+    "Sentinel",
+    "SequenceNumber",
+    "StatusBytes",
+    "Values",
+]

@@ -135,6 +135,10 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
         for patch in self.patches:
             await self.revive(link, patch)
 
+    async def start(self, link: Link) -> None:
+        """Wait for a period: the data with which they answered must not be taken for those of the first question."""
+        await link.sleep(self.period_s)
+
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask a node that sends no data for its version."""
         return await self._answers(link, patch.key)

@@ -23,7 +23,7 @@ from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PR
 from skinware.status import Status
 from skinware_drivers.can.roboskin_options import CHANNELS, Inertial, InertialSensor, RoboskinOptions
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Sentinel, Stamp, Values
+from skinware_drivers.layout import Bits, Byte, Cycle, Flag, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
 
 OLD_SKIN, SKIN, INERTIAL = 3, 4, 5
 """Message classes: robotology/icub-firmware-shared iCubCanProto_classes.h."""
@@ -119,7 +119,7 @@ def _inertial_frames(options: RoboskinOptions) -> list[Frame]:
                 patch=_PATCH,
                 module=_IMU_SENSOR,
                 values=Values(offset=2, dtype="<i2", count=3),
-                stamp=Stamp(offset=0, dtype="u1"),
+                sequence=SequenceNumber(offset=0, dtype="u1"),
             )
         )
     return frames

@@ -17,7 +17,7 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Bits, Frame, Identifier
 
 STANDARD_IDENTIFIERS = 1 << 11
-_FIELD_BITS = 16  # of a patch's or module's key
+_FIELD_BITS = 29  # of a patch's or module's key
 
 Indices = npt.NDArray[np.int64]
 
@@ -77,6 +77,24 @@ class Addresses:
             for form in self._forms:
                 form.look_up(bus[rows], identifier[rows].astype(np.int64), slots, rows)
         return slots
+
+    def modules_of(self, kind: int, frame: Frame) -> list[int]:
+        """The modules that frames of a kind can be of.
+
+        Args:
+            kind: its number.
+            frame: its declaration.
+        """
+        found = set(self.entry[self.sets[self.candidates, kind]].tolist())
+        byte = frame.module_byte
+        if byte is None:
+            return sorted(entry for entry in found if entry < self._n_modules)
+        keys = range(1 << byte.width)
+        return sorted(
+            module
+            for (patch, key), module in self._tables.module_key.items()
+            if key in keys and self._n_modules + patch in found
+        )
 
     def _find(self, bus: int, frame: Frame, identifier: int) -> int | None:
         patch = self._tables.patch_key.get((bus, bits_of(identifier, frame.patch)))

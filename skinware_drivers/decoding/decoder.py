@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,18 @@ from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.decoding.device_stamps import DeviceStamps
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
 from skinware_drivers.decoding.pairing import Pairing
+from skinware_drivers.decoding.punctuality import Punctuality
+from skinware_drivers.decoding.sequences import Sequences, read_numbers
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
+from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.numbering import SequenceNumber
 
 _NO_KIND = 255
 _EARLIEST_NS = 1
 """CLOCK_MONOTONIC begins with the machine, and 0 means never."""
+_COUNTER_BITS = 32
+_COUNTER_MASK = (1 << _COUNTER_BITS) - 1
 
 Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
@@ -41,12 +47,18 @@ class _CompiledCycle:
 
     Attributes:
         members: numbers of its kinds of frame, in order.
+        counters: where the number is that they share, in each; empty without one.
+        sequence: of which member the sequence numbers are compared, and where they are; None: none has one.
+        punctuality: tells cycles apart that have no counter; None: nothing does.
         pairing: finds it.
         assembly: reads it.
         group_of_entry: what its frames must follow each other in.
     """
 
     members: list[int]
+    counters: Sequence[SequenceNumber]
+    sequence: tuple[int, SequenceNumber] | None
+    punctuality: Punctuality | None
     pairing: Pairing
     assembly: Assembly
     group_of_entry: npt.NDArray[np.uint16]
@@ -58,12 +70,16 @@ class Decoder:
     Args:
         layouts: what frames mean, for each bus; None for a bus of which that is not known yet.
         tables: what hangs on the buses.
+        periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
+            joined whenever they come (as those of fixed bytes in a test).
 
     Raises:
         ConfigurationError: the buses have more kinds of frame than can be told apart.
     """
 
-    def __init__(self, layouts: Sequence[Layout | None], tables: SkinTables) -> None:
+    def __init__(
+        self, layouts: Sequence[Layout | None], tables: SkinTables, periods_s: Sequence[float] | None = None
+    ) -> None:
         self.layouts: list[Layout | None] = list(layouts)
         self.tables = tables
         self.state: SkinState = SkinState(tables)
@@ -71,16 +87,17 @@ class Decoder:
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
         self._frames: list[Frame] = []
-        first_of: list[tuple[Layout, int]] = []  # different layouts, and the number of the first kind of each
+        # different layouts (and periods), and the number of the first kind of each
+        first_of: list[tuple[Layout, float | None, int]] = []
         kinds_of_bus = []
-        for layout in layouts:
+        for layout, period_s in zip(layouts, periods_s or repeat(None), strict=False):
             if layout is None:
                 kinds_of_bus.append(range(0))
                 continue
-            first = next((first for known, first in first_of if known == layout), None)
+            first = next((first for *known, first in first_of if known == [layout, period_s]), None)
             if first is None:
                 first = len(self._frames)
-                first_of.append((layout, first))
+                first_of.append((layout, period_s, first))
                 self._frames += layout.frames
             kinds_of_bus.append(range(first, first + len(layout.frames)))
         if len(self._frames) > MOST_FRAMES:
@@ -99,7 +116,7 @@ class Decoder:
             self._length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
-        self._last_sequence = np.full(self._n_modules, -1, np.int64)
+        self._sequences = Sequences(structure)
         self.device_stamps: DeviceStamps = DeviceStamps(self._frames, structure)
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
             (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
@@ -121,8 +138,13 @@ class Decoder:
             batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, bus
             self._carried = None
 
-    def decode(self, batch: FrameBatch) -> tuple[Updates, Indices]:
+    def decode(self, batch: FrameBatch, interrupted: Sequence[int] = ()) -> tuple[Updates, Indices]:
         """Find the updates of a batch; count what is wrong with the frames of our modules.
+
+        Args:
+            batch: the frames.
+            interrupted: buses of which it is known that they have lost frames since the last batch: what waits for
+                partners on them is not joined with what came since.
 
         Returns:
             The updates in order of their time, to be shown by ``state.show``; and the rows that belong to no module:
@@ -151,9 +173,12 @@ class Decoder:
             rows = np.flatnonzero((kind == number) & is_module)
             if len(rows):
                 parts.append(self._read(assembly, batch, rows[:, None], entry[rows]))
-                self._check_sequence(number, payload[rows], entry[rows])
+                self._compare(self._frames[number].sequence, payload[rows], entry[rows])
+        severed = np.zeros(len(bus), bool)
+        if interrupted:
+            severed[: new.start] = np.isin(bus[: new.start], interrupted)
         for cycle in self._cycles:
-            parts += self._pair(batch, cycle, entry, is_module, kind)
+            parts += self._pair(batch, cycle, entry, is_module, kind, severed)
         if not parts:
             return self._no_updates, foreign + first
         updates = Updates.join([part for part, _ in parts])
@@ -165,9 +190,12 @@ class Decoder:
         return updates, foreign + first
 
     def forget(self, patch: int) -> None:
-        """A patch has restarted: its sequence numbers and its clock begin anew."""
-        self._last_sequence[self._module_patch == patch] = -1
+        """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""
+        self._sequences.forget(patch)
         self.device_stamps.forget(patch)
+        for cycle in self._cycles:
+            if cycle.punctuality is not None:
+                cycle.punctuality.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""
@@ -185,9 +213,9 @@ class Decoder:
 
     # -- compiling ----------------------------------------------------------------------------------------------
 
-    def _compile_assemblies(self, layouts: Sequence[tuple[Layout, int]]) -> None:
+    def _compile_assemblies(self, layouts: Sequence[tuple[Layout, float | None, int]]) -> None:
         members_of: list[list[int]] = []
-        for layout, first in layouts:
+        for layout, _, first in layouts:
             names = [frame.name for frame in layout.frames]
             members_of.append([first + names.index(name) for name in layout.cycle.members] if layout.cycle else [])
         in_cycles = {number for members in members_of for number in members}
@@ -198,18 +226,18 @@ class Decoder:
         self._alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
         self._cycles = [
-            self._compile_cycle(layout, members, next(of_cycles))
-            for (layout, _), members in zip(layouts, members_of, strict=True)
-            if members
+            self._compile_cycle(layout.cycle, period_s, members, next(of_cycles))
+            for (layout, period_s, _), members in zip(layouts, members_of, strict=True)
+            if layout.cycle is not None
         ]
         self._width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
         self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
 
-    def _compile_cycle(self, layout: Layout, members: list[int], assembly: Assembly) -> _CompiledCycle:
-        structure, cycle = self.tables.structure, layout.cycle
-        if cycle is None:
-            raise ValueError("no cycle")
+    def _compile_cycle(
+        self, cycle: Cycle, period_s: float | None, members: list[int], assembly: Assembly
+    ) -> _CompiledCycle:
+        structure = self.tables.structure
         places = np.full(256, len(members), np.uint8)
         places[members] = np.arange(len(members))
         n_entries = self._n_modules + self._n_patches + 1
@@ -217,7 +245,16 @@ class Decoder:
             groups = np.concatenate([structure.module_patch, np.arange(self._n_patches), [self._n_patches]])
         else:
             groups = np.minimum(np.arange(n_entries), 0xFFFF)
-        return _CompiledCycle(members, Pairing(cycle, places), assembly, groups.astype(np.uint16))
+        own = [self._frames[number].sequence for number in members]
+        sequences: Sequence[SequenceNumber | None] = cycle.counters or own
+        sequence = next(((member, each) for member, each in enumerate(sequences) if each is not None), None)
+        punctuality = None
+        if period_s is not None and not cycle.counters:
+            punctuality = Punctuality(cycle, period_s, self._n_modules)
+        pairing = Pairing(cycle, places, punctuality)
+        return _CompiledCycle(
+            members, cycle.counters, sequence, punctuality, pairing, assembly, groups.astype(np.uint16)
+        )
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
@@ -291,11 +328,17 @@ class Decoder:
         return kind
 
     def _pair(
-        self, batch: FrameBatch, cycle: _CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes
+        self, batch: FrameBatch, cycle: _CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
     ) -> list[tuple[Updates, Indices]]:
         """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        pairs = cycle.pairing.find(entry, cycle.group_of_entry[entry], kind, time_ns, is_module)
+        shared = entry
+        if cycle.counters:
+            shared = entry << _COUNTER_BITS
+            for number, counter in zip(cycle.members, cycle.counters, strict=True):
+                rows = np.flatnonzero((kind == number) & is_module)
+                shared[rows] |= read_numbers(wire["payload"][rows], counter) & _COUNTER_MASK
+        pairs = cycle.pairing.find(shared, cycle.group_of_entry[entry], kind, time_ns, is_module, severed)
         if len(pairs.waiting):
             self._carry(batch, pairs.waiting + batch.start)
         if not len(pairs.rows):
@@ -303,10 +346,9 @@ class Decoder:
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
         self._count_patches(1, module[~whole])
         self._count_patches(2, entry[pairs.late])
-        for member, number in enumerate(cycle.members):
-            if self._frames[number].stamp is not None:
-                rows = pairs.rows[whole, member]
-                self._check_sequence(number, wire["payload"][rows], module[whole])
+        if cycle.sequence is not None:
+            member, sequence = cycle.sequence
+            self._compare(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
 
     def _carry(self, batch: FrameBatch, rows: Indices) -> None:
@@ -354,24 +396,7 @@ class Decoder:
         patch = self._module_patch[module]
         self.state.patch_counters[:, counter] += np.bincount(patch, minlength=self._n_patches)
 
-    def _check_sequence(self, kind: int, payload: Bytes, module: Indices) -> None:
-        stamp = self._frames[kind].stamp
-        if stamp is None or not len(module):
-            return
-        dtype = np.dtype(stamp.dtype)
-        modulo = stamp.modulo or 1 << 8 * dtype.itemsize
-        number = np.ascontiguousarray(payload[:, stamp.offset : stamp.offset + dtype.itemsize]).view(dtype)[:, 0]
-        order = np.argsort(module, kind="stable")
-        module, number = module[order], number[order].astype(np.int64)
-        before = np.empty_like(number)
-        before[1:] = number[:-1]
-        first = np.flatnonzero(np.append(True, module[1:] != module[:-1]))
-        before[first] = self._last_sequence[module[first]]
-        step = (number - before) % modulo
-        step[before < 0] = 1
-        self._last_sequence[module] = number
-        is_back = step > modulo // 2
-        patch = self._module_patch[module]
-        for counter, count in ((3, np.where(is_back, 0, np.maximum(step - 1, 0))), (4, step == 0), (5, is_back)):
-            found = np.bincount(patch, weights=count, minlength=self._n_patches)
-            self.state.patch_counters[:, counter] += found.astype(np.int64)
+    def _compare(self, sequence: SequenceNumber | None, payload: Bytes, module: Indices) -> None:
+        if sequence is not None and len(module):
+            for counter, found in enumerate(self._sequences.compare(sequence, payload, module), start=3):
+                self.state.patch_counters[:, counter] += found

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware_drivers.decoding.punctuality import Punctuality
 from skinware_drivers.layout import Cycle
 
 Indices = npt.NDArray[np.int64]
@@ -27,12 +28,14 @@ class Pairs:
         whole: (n,) bool, which of them are whole.
         late: first rows of cycles that took too long (their rows are orphans too).
         waiting: rows that may become a cycle with what comes next, ascending.
+        soon: rows that came too soon after those before them to be told from them (orphans too).
     """
 
     rows: Indices
     whole: Flags
     late: Indices
     waiting: Indices
+    soon: Indices
 
 
 class Pairing:
@@ -41,39 +44,52 @@ class Pairing:
     Args:
         cycle: what makes one.
         places: (256,) place in the cycle of each kind of frame; ``n`` = not a member.
+        punctuality: for cycles without a counter, what tells them apart; None: nothing does but order and age.
     """
 
-    def __init__(self, cycle: Cycle, places: Places) -> None:
+    def __init__(self, cycle: Cycle, places: Places, punctuality: Punctuality | None = None) -> None:
         self._n = len(cycle.members)
         self._order: Literal["given", "any", "ends_with"] = cycle.order
         self._maximum_age_ns = round(cycle.maximum_age_s * NS_PER_S)
         self._places = places
+        self._punctuality = punctuality
 
-    def find(self, module: Indices, group: Groups, kind: Places, time_ns: Indices, is_module: Flags) -> Pairs:
+    def find(
+        self, shared: Indices, group: Groups, kind: Places, time_ns: Indices, is_module: Flags, severed: Flags
+    ) -> Pairs:
         """Find the members of cycles that follow each other without another frame of their group in between.
 
         Args:
-            module: (m,) module of each frame, where ``is_module``.
+            shared: (m,) what the members of a cycle have in common, where ``is_module``: the module; with a counter,
+                the module and its number together.
             group: (m,) what frames must follow each other in: the patch, or the module.
             kind: (m,) kind of each frame.
             time_ns: (m,) stamps.
             is_module: (m,) bool: the frame is one of a known module.
+            severed: (m,) bool: the frame has waited for partners, and it is known that frames were lost since.
         """
         n = self._n
-        place = self._places[kind]
-        place[~is_module] = n
         order = np.argsort(group, kind="stable")
-        module, place, group, time_ns = module[order], place[order], group[order], time_ns[order]
-        starts = self._find_cycles(module, place)
+        shared, group, time_ns = shared[order], group[order], time_ns[order]
+        place = self._places[kind[order]]
+        place[~is_module[order]] = n
+        is_member = place < n
+        place[severed[order]] = n
+        soon, late = self._judge(shared, place, time_ns)
+        starts = self._find_cycles(shared, place, soon, late)
         in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._maximum_age_ns
-        late, starts = starts[~in_time], starts[in_time]
-        windows = starts[:, None] + np.arange(n)
         used = np.zeros(len(order), bool)
+        too_late, starts = starts[~in_time], self._apart(starts[in_time])
+        windows = starts[:, None] + np.arange(n)
         used[windows] = True
-        waiting = self._still_hoping(module, place, group, used)
-        is_orphan = place < n
-        is_orphan &= ~used
+        too_late = self._apart(too_late[~used[too_late[:, None] + np.arange(n)].any(axis=1)])
+        waiting = self._still_hoping(shared, place, group, used)
+        is_orphan = is_member & ~used
         is_orphan[waiting] = False
+        if self._punctuality is not None:
+            over = place < n
+            over[waiting] = False
+            self._punctuality.remember(shared[over] * n + place[over], time_ns[over])
         rows = order[windows]
         last = rows[:, -1]
         if self._order != "given":
@@ -81,50 +97,66 @@ class Pairing:
         orphans = order[is_orphan]
         by_arrival = np.argsort(np.concatenate([last, orphans]), kind="stable")
         rows = np.concatenate([rows, np.repeat(orphans[:, None], n, axis=1)])[by_arrival]
-        return Pairs(rows, by_arrival < len(last), order[late], np.sort(order[waiting]))
+        return Pairs(rows, by_arrival < len(last), order[too_late], np.sort(order[waiting]), order[soon & is_orphan])
 
-    def _find_cycles(self, module: Indices, place: Places) -> Indices:
-        """First rows of runs of n frames of one module that are a whole cycle; runs do not overlap."""
+    def _judge(self, shared: Indices, place: Places, time_ns: Indices) -> tuple[Flags, Flags]:
+        """(m,) bool each: frames that came too soon or too late to tell their cycle from others."""
+        soon, late = np.zeros(len(place), bool), np.zeros(len(place), bool)
+        if self._punctuality is not None:
+            members = np.flatnonzero(place < self._n)
+            kind = shared[members] * self._n + place[members]
+            soon[members], late[members] = self._punctuality.judge(kind, time_ns[members])
+        return soon, late
+
+    def _find_cycles(self, shared: Indices, place: Places, soon: Flags, late: Flags) -> Indices:
+        """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap."""
         n = self._n
-        m = max(0, len(module) - n + 1)
+        m = max(0, len(shared) - n + 1)
         whole = np.ones(m, bool)
+        all_late = np.ones(m, bool)
         seen = np.zeros(m, np.uint32)
         for j in range(n):
-            whole &= module[j : m + j] == module[:m]
+            whole &= shared[j : m + j] == shared[:m]
+            whole &= ~soon[j : m + j]
+            all_late &= late[j : m + j]
             if self._order == "given":
                 whole &= place[j : m + j] == j
             else:
+                whole &= ~late[j : m + j]
                 seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
         if self._order != "given":
             whole &= seen == (1 << n) - 1
         if self._order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
-        starts = np.flatnonzero(whole)
-        if self._order == "any" and len(starts) > 1 and np.diff(starts).min() < n:
-            chosen: list[int] = []
-            for start in starts.tolist():
-                if not chosen or start >= chosen[-1] + n:
-                    chosen.append(start)
-            starts = np.array(chosen, np.int64)
-        return starts
+        return np.flatnonzero(whole & ~all_late)
 
-    def _still_hoping(self, module: Indices, place: Places, group: Groups, used: npt.NDArray[np.bool_]) -> Indices:
+    def _apart(self, starts: Indices) -> Indices:
+        """Of runs that overlap, the first."""
+        if len(starts) < 2 or np.diff(starts).min() >= self._n:
+            return starts
+        chosen: list[int] = []
+        for start in starts.tolist():
+            if not chosen or start >= chosen[-1] + self._n:
+                chosen.append(start)
+        return np.array(chosen, np.int64)
+
+    def _still_hoping(self, shared: Indices, place: Places, group: Groups, used: npt.NDArray[np.bool_]) -> Indices:
         """Rows at the end of each group that may become a cycle with what comes next."""
         n = self._n
-        if not len(module):
+        if not len(shared):
             return np.zeros(0, np.int64)
         ends = np.concatenate([np.flatnonzero(group[1:] != group[:-1]), [len(group) - 1]])
         ends = ends[(place[ends] < n) & ~used[ends]]
         if not len(ends):
             return np.zeros(0, np.int64)
-        keep = np.zeros(len(module), bool)
+        keep = np.zeros(len(shared), bool)
         for length in range(n - 1, 0, -1):
             first = ends - length + 1
             fits = first >= 0
             seen = np.zeros(len(ends), np.uint32)
             for j in range(length):
                 at = np.maximum(first + j, 0)
-                fits &= (module[at] == module[ends]) & ~used[at] & (place[at] < n)
+                fits &= (shared[at] == shared[ends]) & ~used[at] & (place[at] < n)
                 if self._order == "given":
                     fits &= place[at] == j
                 bit = np.left_shift(np.uint32(1), place[at].astype(np.uint32))

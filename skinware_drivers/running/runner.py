@@ -312,7 +312,8 @@ class Runner:
             writer = self.writer
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
-        decoder, watch = Decoder(self._layouts, tables), adapter.watch(tables)
+        periods_s = [line.adapter.period_s for line in self.lines]
+        decoder, watch = Decoder(self._layouts, tables, periods_s), adapter.watch(tables)
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request)

@@ -26,7 +26,7 @@ from skinware_drivers.layout import (
     Identifier,
     Layout,
     Sentinel,
-    Stamp,
+    SequenceNumber,
     StatusBytes,
     Values,
 )
@@ -324,7 +324,7 @@ def _frame(number: int, kind: Kind) -> Frame:
         values,
         module=Bits(0, 8, byte=0),
         flags=flags,
-        stamp=Stamp(1, "<u2"),
+        sequence=SequenceNumber(1, "<u2"),
         time=DeviceTime(3, "<u4", 1e-6),
     )
 

@@ -25,7 +25,7 @@ from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Stamp, Values
+from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
@@ -91,7 +91,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
                 [_BODY],
                 Values(4, "<f4", _N),
                 flags=[Sentinel(Status.NOT_CONNECTED, math.nan)],
-                stamp=Stamp(4 + 4 * _N, "<u2"),
+                sequence=SequenceNumber(4 + 4 * _N, "<u2"),
                 time=DeviceTime(6 + 4 * _N, "<u4", 1e-3),
             )
         ]

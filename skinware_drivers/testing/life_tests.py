@@ -8,10 +8,11 @@ import tracemalloc
 from collections.abc import Sequence
 from typing import Any
 
-from skinware.errors import BusError, StructureError
+from skinware.errors import BusError, ConfigurationError, StructureError
 from skinware.memory.namespace import Namespace
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import SkinTables, assemble
+from skinware_drivers.layout_check import check_layout
 from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.leaks import Belongings, files_left
@@ -61,9 +62,11 @@ class LifeTests(Suite):
         names = [patch.name for patch in patches]
         require(len(set(names)) == len(names), f"two patches of one bus have the same name: {names}")
         try:
-            return assemble([("bus", patches)], adapter.types, adapter.dtype)
-        except StructureError as error:
+            tables = assemble([("bus", patches)], adapter.types, adapter.dtype)
+            check_layout(adapter.layout, patches, tables, adapter.period_s)
+        except (StructureError, ConfigurationError) as error:
             return defect(f"the description is not valid: {error}")
+        return tables
 
     def test_handshakes_in_any_order(self) -> None:
         """Stop without start, twice, start again, close twice, use after close: only bus errors may come of it."""

@@ -16,7 +16,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, Stamp, Values
+from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
@@ -34,7 +34,7 @@ def half(number: int) -> Frame:
         length=(64,),
         values=Values(4, "<u2", 30, to=range(30 * number, 30 * number + 30)),
         patch=Bits(shift=8, width=8),
-        stamp=Stamp(0, "<u2"),
+        sequence=SequenceNumber(0, "<u2"),
     )
 
 

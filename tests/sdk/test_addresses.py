@@ -16,7 +16,7 @@ from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, join_types, taxels
-from skinware_drivers.layout import MOST_FRAMES, Bits, Byte, Cycle, Frame, Identifier, Layout, Stamp, Values
+from skinware_drivers.layout import MOST_FRAMES, Bits, Byte, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
 
 TYPES = [PRESSURE.measured(unit="counts")]
 NODE = Bits(shift=8, width=8)
@@ -178,7 +178,7 @@ def test_frames_of_three_kilobytes() -> None:
 
 
 def test_sequence_numbers_that_go_back_are_no_loss() -> None:
-    layout = Layout([Frame("data", (Identifier(0x100),), (8,), Values(2, "<u2", 1), stamp=Stamp(0, "<u2"))])
+    layout = Layout([Frame("data", (Identifier(0x100),), (8,), Values(2, "<u2", 1), sequence=SequenceNumber(0, "<u2"))])
     decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
     sequence = [10, 11, 13, 12, 12, 65_535, 1, 0]
     run(decoder, [(0, 0x100, numbers(number)) for number in sequence[:3]])
@@ -212,10 +212,27 @@ def test_identifiers_that_cannot_be_matched_are_refused() -> None:
 
 def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
     frames = [
-        Frame(f"f{i}", (Identifier(0x100 + i),), (8,), Values(2, "<u2", 1, to=(i,)), stamp=Stamp(0, "<u2"))
+        Frame(f"f{i}", (Identifier(0x100 + i),), (8,), Values(2, "<u2", 1, to=(i,)), sequence=SequenceNumber(0, "<u2"))
         for i in range(2)
     ]
     layout = Layout(frames, Cycle(["f0", "f1"], maximum_age_s=1.0))
     decoder = Decoder([layout], tables_of(patches(0, modules=(0,))))
     run(decoder, [(0, 0x101, numbers(1)), (0, 0x101, numbers(2))])
     assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
+
+
+def test_a_wide_key_of_a_module_is_not_taken_for_one_of_the_next_patch() -> None:
+    patch, module = Bits(shift=20, width=8), Bits(shift=0, width=20)
+    frame = Frame("f", (Identifier(0, mask=0, extended=True),), (8,), Values(0, "<u2", 2), patch=patch, module=module)
+    decoder = Decoder([Layout([frame])], tables_of(patches(0, 1, modules=(1,))))
+    foreign = run(
+        decoder, [(0, EXTENDED_FLAG | 0x1_0001, numbers(9, 9)), (0, EXTENDED_FLAG | 1 << 20 | 1, numbers(1, 2))]
+    )
+    assert foreign == [0]
+    assert decoder.state.values.tolist() == [0, 0, 1, 2]
+
+
+@pytest.mark.parametrize("bits", [Bits(0, 0), Bits(-1, 4), Bits(16, 16), Bits(0, 30)])
+def test_a_key_that_no_identifier_has_room_for_is_refused(bits: Bits) -> None:
+    with pytest.raises(ConfigurationError, match="an identifier has at most 29 bits"):
+        Layout([Frame("f", (), (8,), Values(0, "u1", 1), module=bits)])

@@ -11,7 +11,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
-from skinware_drivers.layout import Cycle, DeviceTime, Frame, Identifier, Layout, Stamp, Values
+from skinware_drivers.layout import Cycle, DeviceTime, Frame, Identifier, Layout, SequenceNumber, Values
 
 MS = 1_000_000
 BEGIN_NS = 7_000_000 * MS
@@ -21,7 +21,12 @@ TIME = DeviceTime(4, "<u2", 1e-3)
 def frame(name: str, identifier: int, first_channel: int) -> Frame:
     to = range(first_channel, first_channel + 2)
     return Frame(
-        name, [Identifier(identifier)], [8], Values(0, "<u2", 2, to=tuple(to)), stamp=Stamp(6, "u1"), time=TIME
+        name,
+        [Identifier(identifier)],
+        [8],
+        Values(0, "<u2", 2, to=tuple(to)),
+        sequence=SequenceNumber(6, "u1"),
+        time=TIME,
     )
 
 

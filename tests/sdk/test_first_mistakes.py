@@ -12,7 +12,19 @@ import pytest
 from skinware.cli._command import exit_status
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
+from skinware_drivers import (
+    Bits,
+    Cycle,
+    Frame,
+    Identifier,
+    Layout,
+    Module,
+    NoOptions,
+    Patch,
+    SequenceNumber,
+    Values,
+    taxels,
+)
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.cli import emulate
@@ -98,6 +110,30 @@ class Complete(CanAdapter[NoOptions]):
     layout = Layout([Frame("all", [Identifier(0x100)], [8], Values(0, "<u2", 4))])
 
 
+COUNTER = SequenceNumber(0, "u1", mask=0xF0)
+KEYED = Layout([Frame("all", [Identifier(0x100, mask=0x7F0)], [8], Values(0, "<u2", 4), module=Bits(0, 4))])
+
+
+def halves(maximum_age_s: float, counter: SequenceNumber | None = None, **more: Any) -> Layout:
+    frames = [Frame(f"half {i}", [Identifier(0x100 + i)], [8], Values(2, "<u2", 2, [2 * i, 2 * i + 1])) for i in (0, 1)]
+    return Layout(frames, Cycle([f.name for f in frames], maximum_age_s, counter=counter, **more))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"dtype": np.float32},
+        {"layout": halves(0.0199)},
+        {"layout": halves(0.0099, order="any")},
+        {"layout": halves(0.3, COUNTER)},
+        {"layout": Layout([Frame("d", [Identifier(1)], [8], Values(0, "<u4", 2, to=[None, None]))])},
+    ],
+)
+def test_what_fits_is_not_refused(changed: dict[str, Any]) -> None:
+    right: type[Complete] = type("Right", (Complete,), changed)
+    right(NoOptions()).check()
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
@@ -108,6 +144,19 @@ class Complete(CanAdapter[NoOptions]):
         ({"patches": (Patch("finger", Module(taxels(4))),)}, "make no skin: 'Module' object is not iterable"),  # type: ignore[arg-type]
         ({"patches": (Patch("finger", [Module(taxels(4, "presure"))]),)}, "declares no type 'presure'"),
         ({"dtype": np.uint64}, "values of dtype uint64: choose one of"),
+        ({"dtype": np.uint8}, "frame 'all': values of dtype '<u2' do not fit the driver's dtype uint8; .* = uint16"),
+        ({"dtype": np.int16}, "do not fit the driver's dtype int16; give it `dtype` = uint16"),
+        (
+            {"patches": (Patch("finger", [Module(taxels(3))]),)},
+            "channel 3, and a module of 'finger' has 3",
+        ),
+        (
+            {"patches": (Patch("f", [Module(taxels(4)), Module(taxels(2, first_uid=9), key=1)]),), "layout": KEYED},
+            "has 2",
+        ),
+        ({"layout": halves(0.02)}, "two cycles fit into maximum_age_s = 0.02.*`period_s` is 0.02 s.*or say where"),
+        ({"layout": halves(0.01, order="any")}, "make it shorter than half of that"),
+        ({"layout": halves(0.32, COUNTER)}, "its counter has 16 values"),
     ],
 )
 def test_what_a_driver_forgot_is_found_before_it_runs(changed: dict[str, Any], words: str) -> None:

@@ -27,7 +27,7 @@ from skinware_drivers.layout import (
     Layout,
     Packed,
     Sentinel,
-    Stamp,
+    SequenceNumber,
     StatusBytes,
     Values,
 )
@@ -225,7 +225,7 @@ def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
 
 
 def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
-    layout = one(Values(2, "u1", 1), stamp=Stamp(0, "<u2"))
+    layout = one(Values(2, "u1", 1), sequence=SequenceNumber(0, "<u2"))
     decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, (40000).to_bytes(2, "little") + bytes(6))])
     decoder.forget(0)
     batch = FrameBatch(16, 8, decoder.headroom)
@@ -238,7 +238,7 @@ def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
 
 
 def test_sequence_numbers_tell_losses_and_repeats() -> None:
-    layout = one(Values(1, "u1", 1), stamp=Stamp(0, "u1"))
+    layout = one(Values(1, "u1", 1), sequence=SequenceNumber(0, "u1"))
     numbers = [254, 255, 0, 3, 3]
     frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
     decoder = Decoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
@@ -354,7 +354,7 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: Layout([]), "1 to 200 frames"),
         (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
-        (lambda: one(Values(0, "u1", 1), stamp=Stamp(7, "<u2")), "sequence number is not in every"),
+        (lambda: one(Values(0, "u1", 1), sequence=SequenceNumber(7, "<u2")), "sequence number is not in every"),
         (lambda: Layout([Frame("f", [Byte(9, 1)], (8,), Values(0, "u1", 1))]), "byte 9 is not in every"),
     ],
 )

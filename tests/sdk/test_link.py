@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.errors import BusSendError, HandshakeTimeout
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.link import AT_ONCE, Link, Match, Reply
 
 
@@ -17,6 +17,7 @@ class Nowhere:
 
     listen_only = False
     name = "bus nowhere"
+    medium = "can"
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Gone."""
@@ -186,3 +187,14 @@ def test_frames_after_a_rest_are_not_made_up_for() -> None:
     at_once = [bus.tries_s.count(time_s) for time_s in dict.fromkeys(bus.tries_s)]
     assert max(at_once) <= AT_ONCE + 1
     loop.close()
+
+
+def test_an_identifier_of_29_bits_is_sent_with_its_flag_or_not_at_all() -> None:
+    async def scenario() -> None:
+        link = Link(Nowhere())  # type: ignore[arg-type]
+        with pytest.raises(BusSendError, match=r"has more than 11 bits: send it as EXTENDED_FLAG \| 0x18da00f1"):
+            await link.send(0x18DA00F1, b"")
+        await link.send(EXTENDED_FLAG | 0x18DA00F1, b"")
+        await link.send(0x7FF, b"")
+
+    asyncio.run(scenario())

@@ -14,7 +14,7 @@ from skinware.errors import HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Stamp, Values
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.notice import Notice
 from skinware_drivers.options import NoOptions
@@ -303,7 +303,7 @@ def test_sequence_numbers_of_a_patch_that_was_set_up_anew_begin_anew(devices: De
                     (3,),
                     Values(1, "u1", 2),
                     patch=Bits(0, 4),
-                    stamp=Stamp(0, "u1"),
+                    sequence=SequenceNumber(0, "u1"),
                 )
             ]
         )

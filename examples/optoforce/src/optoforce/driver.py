@@ -27,7 +27,7 @@ from skinware_drivers import (
     Link,
     Module,
     Patch,
-    Stamp,
+    SequenceNumber,
     Values,
     check_options,
     operation,
@@ -81,9 +81,9 @@ class OptoforceDriver(SerialAdapter[OptoforceOptions]):
             Flag(Status.SUSPECT, offset=2, dtype=">u2", mask=0xFC00),
             Flag(Status.OUT_OF_RANGE, offset=2, dtype=">u2", each=too_much),
         ]
-        counter = Stamp(offset=0, dtype=">u2")
+        counter = SequenceNumber(offset=0, dtype=">u2")
         self.layout = Layout(
-            [Frame("sample", [Identifier(identifier)], [4 + 6 * sensors], axes, flags=flags, stamp=counter)]
+            [Frame("sample", [Identifier(identifier)], [4 + 6 * sensors], axes, flags=flags, sequence=counter)]
         )
 
     async def start(self, link: Link) -> None:

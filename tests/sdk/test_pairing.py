@@ -1,0 +1,280 @@
+"""Which frames are joined to cycles, against an oracle that looks at one frame after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
+from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.layout import Bits, Cycle, Frame, Identifier, Layout, SequenceNumber, Values
+
+MS = 1_000_000
+PERIOD_NS = 20 * MS
+MODULES = 2
+Order = Literal["given", "any", "ends_with"]
+
+
+class Sent(NamedTuple):
+    """A frame on the wire."""
+
+    time_ns: int
+    module: int
+    place: int
+    cycle: int
+    serial: int
+
+
+@dataclass(frozen=True)
+class Device:
+    """One patch of two modules; its payloads: counter in the upper half of byte 1, serial number of the frame."""
+
+    members: int
+    order: Order
+    within: Literal["patch", "module"]
+    modulo: int  # 1: no counter
+    maximum_age_ns: int
+
+    @property
+    def decoder(self) -> Decoder:
+        frames = [
+            Frame(
+                f"part {place}",
+                [Identifier(0x100 | place << 4, mask=0x7F0)],
+                [8],
+                Values(2, "<u4", 1, to=[place]),
+                module=Bits(0, 4),
+            )
+            for place in range(self.members)
+        ]
+        counter = SequenceNumber(1, "u1", self.modulo, mask=0xF0) if self.modulo > 1 else None
+        cycle = Cycle([f.name for f in frames], self.maximum_age_ns / 1e9, self.within, self.order, counter)
+        modules = [Module(taxels(self.members, first_uid=10 * key), key=key) for key in range(MODULES)]
+        types = [PRESSURE.measured(unit="counts")]
+        return Decoder([Layout(frames, cycle)], assemble([("bus", [Patch("p", modules)])], types, "i4"), [0.02])
+
+    def joined(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> tuple[list[list[int]], dict[str, int]]:
+        """Serial numbers of the frames of each update, in the order of their places; and the patch's counters.
+
+        Args:
+            sent: what comes, in order.
+            cuts: after how many frames each batch ends.
+        """
+        decoder, found = self.decoder, list[list[int]]()
+        batch = FrameBatch(len(sent) + 1, 8, decoder.headroom)
+        for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
+            decoder.put_back(batch)
+            for frame in sent[begin:end]:
+                payload = (
+                    bytes([0xAA, frame.cycle % self.modulo << 4 | 5]) + frame.serial.to_bytes(4, "little") + bytes(2)
+                )
+                batch.append(0, frame.time_ns, 0x100 | frame.place << 4 | frame.module, payload)
+            updates, _ = decoder.decode(batch)
+            found += updates.values[updates.whole].tolist()
+        return sorted(found), dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
+
+
+def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
+    """What is to be joined, and how many frames will never be; one frame after the other, one group after the other."""
+    soon, late = set[int](), set[int]()
+    history: dict[tuple[int, int], tuple[int, int]] = {}  # time of the last of its kind, and its distance
+    reach_ns = device.maximum_age_ns * (2 if device.order == "any" else 1)
+    for frame in sent:
+        before = history.get((frame.module, frame.place))
+        distance = PERIOD_NS if before is None else frame.time_ns - before[0]
+        usual = max(PERIOD_NS, 0 if before is None else before[1])
+        if distance <= device.maximum_age_ns:
+            soon.add(frame.serial)
+        if distance - usual >= usual - reach_ns:
+            late.add(frame.serial)
+        history[frame.module, frame.place] = (frame.time_ns, distance)
+    found, orphans = [], 0
+    for group in range(1 if device.within == "patch" else MODULES):
+        line = [frame for frame in sent if device.within == "patch" or frame.module == group]
+        at, taken = 0, 0
+        while at + device.members <= len(line):
+            if _is_cycle(device, line[at : at + device.members], soon, late):
+                found.append([f.serial for f in sorted(line[at : at + device.members], key=lambda f: f.place)])
+                orphans += at - taken
+                at = taken = at + device.members
+            else:
+                at += 1
+        orphans += len(line) - taken - _waiting(device, line[taken:])
+    return sorted(found), orphans
+
+
+def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[int]) -> bool:
+    places = [frame.place for frame in frames]
+    if sorted(places) != list(range(device.members)) or len({frame.module for frame in frames}) > 1:
+        return False
+    if device.order == "given" and places != sorted(places):
+        return False
+    if device.order == "ends_with" and places[-1] != device.members - 1:
+        return False
+    if frames[-1].time_ns - frames[0].time_ns > device.maximum_age_ns:
+        return False
+    if device.modulo > 1:
+        return len({frame.cycle % device.modulo for frame in frames}) == 1
+    held_up = [frame.serial in late for frame in frames]
+    caught_up = any(frame.serial in soon for frame in frames)
+    return not caught_up and not (all(held_up) if device.order == "given" else any(held_up))
+
+
+def _waiting(device: Device, rest: Sequence[Sent]) -> int:
+    """How many of the last frames may still find partners."""
+    for count in range(min(device.members - 1, len(rest)), 0, -1):
+        frames = rest[-count:]
+        places = [frame.place for frame in frames]
+        one_cycle = len({(frame.module, frame.cycle % device.modulo) for frame in frames}) == 1
+        right = places == list(range(count)) if device.order == "given" else len(set(places)) == count
+        if one_cycle and right:
+            return count
+    return 0
+
+
+@st.composite
+def devices(draw: st.DrawFn, modulos: Sequence[int]) -> Device:
+    order: Order = draw(st.sampled_from(("given", "any", "ends_with")))
+    modulo = draw(st.sampled_from(modulos))
+    share = draw(st.sampled_from((0.2, 0.45))) if order == "any" else draw(st.sampled_from((0.2, 0.5, 0.9)))
+    within: Literal["patch", "module"] = draw(st.sampled_from(("patch", "module")))
+    return Device(draw(st.integers(2, 4)), order, within, modulo, round(share * PERIOD_NS))
+
+
+@st.composite
+def streams(draw: st.DrawFn, device: Device, cycles: int) -> tuple[list[Sent], list[int]]:
+    """Cycles of a device with losses, repeats, delays and senders that catch up; and where batches end."""
+    sent = []
+    gap_ns = draw(st.sampled_from((MS // 10, MS // 2)))
+    random = draw(st.randoms(use_true_random=False))
+    for cycle in range(cycles):
+        for module in range(MODULES):
+            places = list(range(device.members))
+            if device.order == "any":
+                random.shuffle(places)
+            if device.order == "ends_with":
+                places[:-1] = random.sample(places[:-1], device.members - 1)
+            for step, place in enumerate(places):
+                time_ns = cycle * PERIOD_NS + (module * device.members + step) * gap_ns + MS
+                sent.append(Sent(time_ns, module, place, cycle, 0))
+    of_cycle = MODULES * device.members
+    lost = set[int]()
+    for _ in range(draw(st.integers(0, 2))):  # a run is lost, as a rule one that makes a head and a tail neighbours
+        first = draw(st.integers(0, (cycles - 1) * of_cycle))
+        count = of_cycle * draw(st.integers(0, 2)) + draw(st.sampled_from((0, 0, 0, -1, 1, 2)))
+        lost |= set(range(first, first + count))
+        if draw(st.booleans()):  # while the sender stands still; then it catches up
+            begin_ns = sent[first].time_ns - draw(st.sampled_from((0, MS, PERIOD_NS // 2, PERIOD_NS)))
+            end_ns = sent[min(first + max(count, 0), len(sent) - 1)].time_ns + draw(st.sampled_from((0, PERIOD_NS)))
+            pace_ns = draw(st.sampled_from((0, MS // 10)))
+            free_ns = end_ns
+            for number, frame in enumerate(sent):
+                if frame.time_ns >= begin_ns:
+                    sent[number] = frame._replace(time_ns=max(frame.time_ns, free_ns))
+                    free_ns = sent[number].time_ns + pace_ns
+    sent = [frame for number, frame in enumerate(sent) if number not in lost]
+    is_repeated = draw(st.booleans())
+    if sent and is_repeated:
+        again = draw(st.integers(0, len(sent) - 1))
+        sent[again:again] = [sent[again]]
+    sent = [frame._replace(serial=number) for number, frame in enumerate(sent)]
+    return sent, sorted(draw(st.lists(st.integers(0, len(sent)), max_size=8)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_cycles_are_those_that_an_oracle_finds_wherever_batches_end(data: st.DataObject) -> None:
+    device = data.draw(devices((1, 4, 16)))
+    sent, cuts = data.draw(streams(device, 8))
+    joined, counters = device.joined(sent, cuts)
+    expected, orphans = oracle(device, sent)
+    assert joined == expected
+    assert counters["orphans"] == orphans
+    assert counters["updates"] == len(joined)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_with_a_counter_halves_of_different_cycles_are_never_joined(data: st.DataObject) -> None:
+    device = data.draw(devices((16,)))
+    sent, cuts = data.draw(streams(device, 12))
+    for serials in device.joined(sent, cuts)[0]:
+        assert len({sent[serial].cycle for serial in serials}) == 1
+
+
+def regular(device: Device, cycles: int) -> list[Sent]:
+    """A device that sends as it should."""
+    return [
+        Sent(cycle * PERIOD_NS + (module * device.members + place + 1) * MS // 4, module, place, cycle, 0)
+        for cycle in range(cycles)
+        for module in range(MODULES)
+        for place in range(device.members)
+    ]
+
+
+def torn(device: Device, sent: Sequence[Sent]) -> int:
+    """How many joined cycles are of frames of different ones."""
+    numbered = [frame._replace(serial=number) for number, frame in enumerate(sent)]
+    joined, _ = device.joined(numbered)
+    return sum(len({numbered[serial].cycle for serial in serials}) > 1 for serials in joined)
+
+
+def held_up(sent: Sequence[Sent], begin_ns: int, end_ns: int) -> list[Sent]:
+    """The sender stands still from one moment to another, and then catches up."""
+    late = [
+        frame._replace(time_ns=max(frame.time_ns, end_ns)) if frame.time_ns >= begin_ns else frame for frame in sent
+    ]
+    return [frame._replace(time_ns=frame.time_ns + number) for number, frame in enumerate(late)]
+
+
+def test_what_is_known_to_be_lost_between_two_batches_joins_nothing() -> None:
+    device = Device(2, "given", "module", 1, PERIOD_NS // 2)
+    first, second = (Sent(MS, 0, 0, 0, 0), Sent(2 * MS, 0, 1, 1, 1))
+    decoder = device.decoder
+    batch = FrameBatch(8, 8, decoder.headroom)
+    batch.append(0, first.time_ns, 0x100, bytes(8))
+    decoder.decode(batch)
+    decoder.put_back(batch)
+    batch.append(0, second.time_ns, 0x110, bytes(8))
+    updates, _ = decoder.decode(batch, interrupted=[0])
+    assert not updates.whole.any()
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
+    assert not len(decoder.decode(_empty(decoder, batch))[0])
+
+
+def _empty(decoder: Decoder, batch: FrameBatch) -> FrameBatch:
+    decoder.put_back(batch)
+    return batch
+
+
+def test_any_order_recovers_from_one_lost_frame_at_once() -> None:
+    device = Device(2, "any", "module", 1, PERIOD_NS // 4)
+    sent = [frame._replace(serial=number) for number, frame in enumerate(regular(device, 6))]
+    joined, _ = device.joined(sent[1:])
+    assert len(joined) >= 2 * 6 - 2
+
+
+def every_run(device: Device) -> list[tuple[int, int]]:
+    """Beginning and end of every run of frames up to two cycles long that begins in the third cycle."""
+    of_cycle = MODULES * device.members
+    return [(begin, begin + count) for begin in range(2 * of_cycle, 3 * of_cycle) for count in range(2 * of_cycle + 1)]
+
+
+ORDERS: tuple[Order, ...] = ("given", "ends_with", "any")
+
+
+def test_without_a_counter_no_lost_run_joins_halves_whether_the_sender_catches_up_or_not() -> None:
+    for order in ORDERS:
+        device = Device(2, order, "module", 1, PERIOD_NS // (4 if order == "any" else 2))
+        sent = regular(device, 7)
+        for begin, end in every_run(device):
+            for stall_begin, stall_cycles in ((0, 0), (1, 2), (2, 1), (2, 2), (2, 3)):
+                held = held_up(sent, stall_begin * PERIOD_NS, (stall_begin + stall_cycles) * PERIOD_NS + MS // 8)
+                assert torn(device, held[:begin] + held[end:]) == 0, (order, begin, end, stall_begin, stall_cycles)

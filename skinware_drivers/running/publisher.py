@@ -16,6 +16,7 @@ from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 from skinware_drivers.running.bursts import Bursts
+from skinware_drivers.running.guard import failure
 from skinware_drivers.running.patch_timing import PatchTiming
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
@@ -79,7 +80,7 @@ class Publisher:
         self._patience_ns = self._period_ns * 3 // 2
         self._pause_ns = self._period_ns // 2
         self._silence_ns = max(_SILENT_PERIODS * self._period_ns, _LEAST_SILENCE_NS)
-        structure = decoder.tables.structure
+        self._structure = structure = decoder.tables.structure
         self._module_patch = structure.module_patch.astype(np.intp)
         self._sensor_module = structure.sensor_module.astype(np.intp)
         self._first_module = np.searchsorted(self._module_patch, np.arange(structure.n_patches))
@@ -204,8 +205,14 @@ class Publisher:
 
     def _show(self, updates: Updates) -> None:
         self._state.show(updates)
-        if updates.flagged:
+        if not updates.flagged:
+            return
+        try:
             self._watch.look(updates)
+        except Exception as error:
+            buses = np.unique(self._structure.patch_bus[self._module_patch[updates.module]]).tolist()
+            names = ", ".join(self._structure.buses[bus] for bus in buses)
+            raise failure("Watch.look", f"bus {names}", error) from error
 
     def _look_at_frame(self, time_ns: int) -> None:
         """After new data: publish a complete frame, or say when it will be due."""

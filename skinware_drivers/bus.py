@@ -20,6 +20,8 @@ from skinware_drivers.counters import BusCounters
 
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h)."""
+IDENTIFIER_MASK = 0x1FFF_FFFF
+"""All bits of an identifier, without these flags."""
 REMOTE_FLAG = 0x4000_0000
 """Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
 ERROR_FLAG = 0x2000_0000
@@ -279,6 +281,7 @@ class Bus(ABC):
 __all__ = [
     "ERROR_FLAG",
     "EXTENDED_FLAG",
+    "IDENTIFIER_MASK",
     "REMOTE_FLAG",
     "Bus",
     "Filter",

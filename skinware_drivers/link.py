@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import Bus, Filter, FrameBatch
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, Bus, Filter, FrameBatch
 from skinware_drivers.decoding.filters import fewest, filters_of
 from skinware_drivers.layout import Layout
 
@@ -36,15 +36,24 @@ class Reply(NamedTuple):
 
 
 class Match(NamedTuple):
-    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``."""
+    """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
+
+    Identifiers of 11 and of 29 bits are told apart whatever the mask is: ``value`` has the ``EXTENDED_FLAG``, or not.
+    """
 
     value: int
-    mask: int = 0x7FF
+    mask: int = IDENTIFIER_MASK
     prefix: bytes = b""
+
+    @property
+    def filter(self) -> Filter:
+        """Which identifiers they have."""
+        return Filter(self.value, self.mask | EXTENDED_FLAG)
 
     def fits(self, frame: Reply) -> bool:
         """Whether a frame is such an answer."""
-        return frame.identifier & self.mask == self.value and frame.payload.startswith(self.prefix)
+        value, mask = self.filter
+        return frame.identifier & mask == value and frame.payload.startswith(self.prefix)
 
 
 class Heard(NamedTuple):
@@ -131,7 +140,7 @@ class Link:
         if self._heard is not None:
             self._bus.narrow(())
             return
-        awaited = [Filter(m.value, m.mask) for matches, _ in self._waiters for m in matches]
+        awaited = [match.filter for matches, _ in self._waiters for match in matches]
         self._bus.narrow(fewest([*self._wanted, *awaited]))
 
     @contextmanager
@@ -239,5 +248,6 @@ class Link:
 def _any_match(matches: Sequence[Match], identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:
     found = np.zeros(len(identifier), bool)
     for match in matches:
-        found |= (identifier & match.mask) == match.value
+        value, mask = match.filter
+        found |= (identifier & mask) == value
     return found

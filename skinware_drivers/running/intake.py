@@ -12,7 +12,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import bus_failure
 
-_TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
+_TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
 _REST, _REST_WHILE_ASKING = 16, 4  # after a take: so many times its duration, while more arrives (decision 0006)
 DEFAULT_LATENCY_S = 0.005
 """What the longest rest is if nobody says."""
@@ -60,7 +60,10 @@ class Intake:
 
     def take(self) -> Literal["nothing", "all", "some"]:
         """Take what has arrived, now. ``some``: more is waiting."""
+        begun_ns = now_ns()
         for turn in range(_TURNS):
+            if now_ns() - begun_ns > _TURN_NS:
+                return "some"
             events = self._epoll.poll(0)
             if not events:
                 return "all" if turn else "nothing"

@@ -285,7 +285,7 @@ class Runner:
             raise failure("watch", f"buses {', '.join(line.name for line in self.lines)}", error) from error
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
-        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request)
+        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)
         self._publish_when_due()
 

@@ -89,6 +89,18 @@ class PeerGone(RequestError):
     """The service's writer is dead, or died or was restarted while the request was under way."""
 
 
+class DriverError(SkinwareError):
+    """A driver's own code failed; the message names bus, hook and cause.
+
+    Attributes:
+        bus: name of the bus that it failed for, "" if it concerns all.
+    """
+
+    def __init__(self, message: str, *, bus: str = "") -> None:
+        super().__init__(message)
+        self.bus = bus
+
+
 class BusError(SkinwareError):
     """Base of what can go wrong with a bus."""
 

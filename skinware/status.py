@@ -47,7 +47,7 @@ class BusState(enum.IntEnum):
     SILENT = 2
     """Open, but nothing came for longer than the driver's silence limit."""
     DOWN = 3
-    """The interface exists but is down, or its controller is off the bus; the driver waits for it."""
+    """The interface exists but is down, its controller is off the bus, or the driver set it aside; it is waited for."""
     GONE = 4
     """The interface vanished; it is opened again as soon as it is back."""
 
@@ -81,6 +81,8 @@ class BusReason(enum.IntEnum):
     """The controller hears broken frames: another bit rate, missing termination, bad wires."""
     REMOVED = 12
     """The driver was told to do without this bus."""
+    SET_ASIDE = 13
+    """The driver's own code failed on this bus: it was closed, and is tried again later. The driver's log says why."""
 
 
 LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF

@@ -32,7 +32,8 @@ class Adapter(HasOptions[OptionsT], ABC):
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
     ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
     of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went
-    down); the runner then says so and tries again later.
+    down) or ``OSError``; the runner then says so and tries again later. Anything else is a fault of the driver's
+    code: the bus is set aside and tried again later, and if no other one is served, the driver ends.
 
     In listen-only mode only ``describe``, ``attend`` and ``join`` are called, and every send is refused.
 
@@ -119,7 +120,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         """Make them send data."""
 
     async def stop(self, link: Link) -> None:
-        """Make them silent."""
+        """Make them silent; also if ``configure`` or ``start`` was interrupted. It has less than a second."""
 
     async def probe(self, link: Link, patch: Patch) -> bool:
         """Ask a patch that sends no data whether it is there; it is asked again as long as it is silent.

@@ -49,6 +49,8 @@ class BusCounters:
     """Polls of devices that only answer which could not be sent in time."""
     polls_unanswered: int = 0
     """Polls in lock step whose answer did not come in time."""
+    updates_skipped: int = 0
+    """Updates of modules that were never published, as newer ones came before that was possible."""
     overflows: int = 0
     """How often the controller told that it had lost frames."""
     bus_offs: int = 0

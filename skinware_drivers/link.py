@@ -15,9 +15,11 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import (
+    ERROR_FLAG,
     EXTENDED_FLAG,
     LARGEST_IDENTIFIER,
     LARGEST_STANDARD,
+    REMOTE_FLAG,
     Bus,
     Filter,
     FrameBatch,

@@ -25,6 +25,7 @@ from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import make_bus
+from skinware_drivers.running.guard import failure
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.sdk.driving import Chatter
 
@@ -65,6 +66,11 @@ def ConfigurationError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 def StructureError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
     twice = [Patch("left", [Module(taxels(1))], key=7), Patch("right", [Module(taxels(1))], key=7)]
     return assemble([("can0", twice)], [PRESSURE], "u1")
+
+
+@produces
+def DriverError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
+    raise failure("probe", "bus can0", KeyError("board"), only="can0")
 
 
 @produces

@@ -131,6 +131,7 @@ typedef enum skinware_result {
 #define SKINWARE_BUS_REASON_NO_ACKNOWLEDGEMENT 10u
 #define SKINWARE_BUS_REASON_BUS_ERRORS 11u
 #define SKINWARE_BUS_REASON_REMOVED 12u
+#define SKINWARE_BUS_REASON_SET_ASIDE 13u
 
 /* An attached service. */
 typedef struct skinware_reader skinware_reader;

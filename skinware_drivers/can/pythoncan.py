@@ -21,6 +21,17 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
 _NUMBERS = (int, float)
+_LISTENING: dict[str, dict[str, Any]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "slcan": {"listen_only": True},
+    "vector": {"listen_only": True},
+}
+"""What makes an interface's controller only listen: it does not even acknowledge frames. By python-can's sources."""
+_WITHOUT_CONTROLLER = ("udp_multicast", "virtual")
 
 
 class PythonCanBus(Bus):
@@ -69,6 +80,8 @@ class PythonCanBus(Bus):
         keywords: dict[str, Any] = {name: _typed(text) for name, text in self.options.items()}
         if self.payload_size > 8:
             keywords.setdefault("fd", True)
+        if self.listen_only:
+            keywords = _LISTENING.get(self.interface, {}) | keywords
         try:
             self._bus = can.Bus(interface=self.interface, channel=self.channel or None, **keywords)
         except Exception as error:  # noqa: BLE001  (see the class)
@@ -84,6 +97,22 @@ class PythonCanBus(Bus):
         self._wake_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._thread = threading.Thread(target=self._take_messages, name=f"bus {self.channel}", daemon=True)
         self._thread.start()
+
+    @property
+    def note(self) -> str:
+        """That the controller acknowledges what it hears, though nothing may be sent."""
+        if not self.listen_only or self.interface in (*_LISTENING, *_WITHOUT_CONTROLLER):
+            return ""
+        return (
+            f"bus {self.interface}:{self.channel}: nothing is sent, but its controller acknowledges the frames that it"
+            " hears: this interface cannot be told to only listen"
+        )
+
+    def check(self) -> None:
+        """Whether messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
+        if self._failure is not None and not self._queue:
+            why = f"bus {self.interface}:{self.channel} failed: {self._failure}"
+            raise BusNotAvailable(why, reason=BusReason.FAILED)
 
     def fileno(self) -> int:
         """An eventfd that is readable while messages wait, -1 while closed."""
@@ -103,11 +132,10 @@ class PythonCanBus(Bus):
                 continue
             batch.append(ordinal, time_ns, identifier, payload)
             count += 1
-        if self._queue:
+        if not count:
+            self.check()
+        if self._queue or self._failure is not None:  # the failure comes after the last messages: look again
             os.eventfd_write(self._wake_fd, 1)
-        elif self._failure is not None and not count:
-            why = f"bus {self.interface}:{self.channel} failed: {self._failure}"
-            raise BusNotAvailable(why, reason=BusReason.FAILED)
         self.counters.frames += count
         return count
 
@@ -144,25 +172,26 @@ class PythonCanBus(Bus):
 
     def _take_messages(self) -> None:
         bus = self._bus
-        while bus is not None and not self._stop.is_set():
-            try:
+        try:
+            while bus is not None and not self._stop.is_set():
                 message = bus.recv(_POLL_S)
-            except Exception as error:  # noqa: BLE001  (see the class)
-                self._failure = str(error) or type(error).__name__
-                os.eventfd_write(self._wake_fd, 1)
-                return
-            if message is None:
-                continue
-            if message.is_error_frame:
-                self.counters.errors += 1
-            elif message.is_remote_frame:
-                self.counters.refused += 1
-            elif len(self._queue) >= _QUEUE_FRAMES:
-                self.counters.lost += 1
-            else:
-                flag = EXTENDED_FLAG if message.is_extended_id else 0
-                self._queue.append((now_ns(), message.arbitration_id | flag, bytes(message.data)))
-                os.eventfd_write(self._wake_fd, 1)
+                if message is not None:
+                    self._take(message)
+        except Exception as error:  # noqa: BLE001  (see the class)
+            self._failure = str(error) or type(error).__name__
+            os.eventfd_write(self._wake_fd, 1)
+
+    def _take(self, message: can.Message) -> None:
+        if message.is_error_frame:
+            self.counters.errors += 1
+        elif message.is_remote_frame:
+            self.counters.refused += 1
+        elif len(self._queue) >= _QUEUE_FRAMES:
+            self.counters.lost += 1
+        else:
+            flag = EXTENDED_FLAG if message.is_extended_id else 0
+            self._queue.append((now_ns(), message.arbitration_id | flag, bytes(message.data)))
+            os.eventfd_write(self._wake_fd, 1)
 
 
 def _typed(text: str) -> int | float | bool | str:

@@ -33,8 +33,14 @@ _recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int
 _recvmmsg.restype = ctypes.c_int
 
 
+_CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
+"""``struct can_frame`` and ``struct canfd_frame``: the kernel hands out a CAN FD frame as the whole of the latter."""
+
+
 class Rows:
     """What ``recvmmsg`` needs to put frames straight into the rows of one batch; see ``rows_of``.
+
+    The end of a CAN FD frame may lie beyond a row that was made for shorter payloads; it goes where nobody looks.
 
     Attributes:
         control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, what was left
@@ -44,12 +50,17 @@ class Rows:
     def __init__(self, batch: FrameBatch) -> None:
         capacity, rows = batch.capacity, np.arange(batch.capacity)
         self.control: npt.NDArray[np.int64] = np.zeros((capacity, CONTROL_WORDS), np.int64)
-        self._iov = np.zeros(capacity, _IOVEC)
-        self._iov["base"] = batch.wire.ctypes.data + batch.wire.strides[0] * rows
-        self._iov["length"] = batch.wire.strides[0]
+        row_bytes = batch.wire.strides[0]
+        beyond = _FD_FRAME_BYTES - row_bytes if row_bytes > _CLASSIC_ROW_BYTES else 0
+        self._beyond = np.zeros(_FD_FRAME_BYTES, np.uint8)
+        self._iov = np.zeros((capacity, 2), _IOVEC)
+        self._iov["base"][:, 0] = batch.wire.ctypes.data + row_bytes * rows
+        self._iov["length"][:, 0] = row_bytes
+        self._iov["base"][:, 1] = self._beyond.ctypes.data
+        self._iov["length"][:, 1] = max(0, beyond)
         self._headers = np.zeros(capacity, _MMSGHDR)
-        self._headers["iov"] = self._iov.ctypes.data + _IOVEC.itemsize * rows
-        self._headers["iov_count"] = 1
+        self._headers["iov"] = self._iov.ctypes.data + self._iov.strides[0] * rows
+        self._headers["iov_count"] = 2 if beyond > 0 else 1
         self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
         self._control_length = self._headers["control_length"]
         self._flags = self._headers["flags"]
@@ -67,7 +78,7 @@ class Rows:
         self.control[rows] = 0
 
     def any_cut(self, rows: slice) -> bool:
-        """Whether one of these frames was longer than a row: an FD frame where the layout knows none."""
+        """Whether one of these was longer than a frame can be: an FD frame where the layout knows none."""
         return bool(np.bitwise_or.reduce(self._flags[rows]) & np.uint64(socket.MSG_TRUNC))
 
     def cut(self, rows: slice) -> npt.NDArray[np.bool_]:

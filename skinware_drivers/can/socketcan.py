@@ -274,7 +274,8 @@ class SocketCanBus(Bus):
         """Take what is no data frame of this layout out of the new rows; returns how many are left."""
         wire, first = batch.wire[new], new.start
         identifier = wire["identifier"]
-        if not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new):
+        is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new)
+        if is_usual and (not len(wire) or int(wire["length"].max()) <= batch.payload_size):
             self._health.heard_data()
             return len(wire)
         is_error = (identifier & np.uint32(ERROR_FLAG)) != 0

@@ -15,7 +15,7 @@ import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
 from skinware.cli._format import plural
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, DriverError
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
@@ -171,6 +171,7 @@ def command(
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
+    from skinware_drivers.running.guard import hook
     from skinware_drivers.running.intake import DEFAULT_LATENCY_S
     from skinware_drivers.running.runner import Runner
 
@@ -196,7 +197,8 @@ def command(
     def adapter_of(bus_name: str, file: ConfigFile) -> AnyAdapter:
         options = file.options_of_bus(driver.Options, bus_name, given)
         with file.blamed_for(bus_name):
-            adapter = driver(options)
+            with hook("__init__", bus_name):
+                adapter = driver(options)
             adapter.check()
         return adapter
 
@@ -238,12 +240,13 @@ def command(
 
 async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Coroutine[Any, Any, None]]) -> None:
     loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: _end(runner, context))  # by default it would be logged, and no more
     reading: set[asyncio.Task[None]] = set()
 
     async def read_again() -> None:
         try:
             await read_buses_again()
-        except ConfigurationError as error:
+        except (ConfigurationError, DriverError) as error:
             log.error("buses stay as they are: %s", error)
 
     had_terminal = _has_terminal()
@@ -261,6 +264,8 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         loop.add_signal_handler(number, runner.stop)
     loop.add_signal_handler(signal.SIGHUP, on_hangup)
     reporting = asyncio.create_task(_report(runner)) if as_json else None
+    if reporting is not None:
+        reporting.add_done_callback(lambda task: None if task.cancelled() else task.result())
     try:
         await runner.run()
     finally:
@@ -273,6 +278,15 @@ async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Cor
         if as_json:
             with contextlib.suppress(BrokenPipeError):
                 print_json({"event": "stopped", "name": runner.name, **runner.status()})
+
+
+def _end(runner: Runner, context: dict[str, Any]) -> None:
+    """What went wrong in the event loop outside of everything that is looked after: it ends the driver."""
+    error = context.get("exception")
+    if error is None:
+        log.warning("%s", context["message"])
+    else:
+        runner.fail(error)
 
 
 def _has_terminal() -> bool:

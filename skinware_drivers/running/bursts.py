@@ -4,6 +4,9 @@ Every patch sends bursts: each of its modules once. A burst is over when one of 
 pause: half a period, or less if the patch's own pauses are shorter and stand out (long bursts). A frame holds at most
 one burst of each patch. When one patch begins its next burst while another is in the middle of its own, that next
 burst is held back until the other's is whole.
+
+What was held up for long, or a device that sends far more often than it should, brings more bursts at once than the
+ring has slots. Then the last of them are not told apart: each module's newest update is shown, the others are skipped.
 """
 
 from __future__ import annotations
@@ -31,10 +34,16 @@ class Bursts:
         module_patch: (n_modules,) int64.
         period_ns: nominal time from burst to burst.
         show: shows updates in ``state``.
+        skip: told how many updates of each patch were skipped, (n_patches,) int64.
     """
 
     def __init__(
-        self, state: SkinState, module_patch: Indices, period_ns: int, show: Callable[[Updates], None]
+        self,
+        state: SkinState,
+        module_patch: Indices,
+        period_ns: int,
+        show: Callable[[Updates], None],
+        skip: Callable[[Indices], None],
     ) -> None:
         self._state = state
         self._module_patch = module_patch
@@ -45,6 +54,8 @@ class Bursts:
         self._gap_ns = np.zeros(len(module_patch), np.int64)  # before the last update of each module
         self._longest_pause_ns = period_ns // 2
         self._show = show
+        self._skip = skip
+        self._left = 0  # publications of this take
         self._held: Updates | None = None
 
     @property
@@ -52,19 +63,36 @@ class Bursts:
         """Whether updates are held back for the sake of another patch's burst."""
         return self._held is not None
 
-    def take(self, updates: Updates | None, living: Flags, publish: Callable[[], None]) -> None:
+    def take(self, updates: Updates | None, living: Flags, publish: Callable[[], None], most: int) -> None:
         """Show updates, and what was held back before them, in as many frames as they belong to.
 
         Args:
             updates: what has arrived, in order of time; None: nothing new.
             living: (n_modules,) bool, modules that can be expected to send.
             publish: called whenever a frame is over and more belongs to the next one.
+            most: how often, at the most.
         """
+
+        def count_and_publish() -> None:
+            self._left -= 1
+            publish()
+
+        self._left = most
         parts = [part for part in (self._held, updates) if part is not None]
         self._held = None
         rest = Updates.join(parts) if parts else None
         while rest is not None:
-            rest = self._take_in_order(rest, living, publish)
+            if self._left <= 0:
+                self._show_the_newest(rest)
+                return
+            rest = self._take_in_order(rest, living, count_and_publish)
+
+    def _show_the_newest(self, updates: Updates) -> None:
+        """Show updates in one frame, whatever bursts they are of."""
+        of_module = np.bincount(updates.module[updates.whole], minlength=len(self._module_patch))
+        skipped = np.maximum(of_module + self._state.updated - 1, 0)
+        self._skip(np.bincount(self._module_patch, skipped, self._n_patches).astype(np.int64))
+        self._show(updates)
 
     def in_the_middle(self, living: Flags, time_ns: int) -> Flags:
         """(n_patches,) bool: patches whose burst has begun in this frame, is not whole, and not too old to go on."""
@@ -96,6 +124,8 @@ class Bursts:
                 self._show(updates.take(slice(begin, end)))
             if end == len(updates):
                 return None
+            if self._left <= 0:
+                return updates.take(slice(end, None))
             open_patches = self.in_the_middle(living, int(updates.oldest_ns[end]))
             open_patches[self._module_patch[updates.module[end]]] = False
             if open_patches.any():

@@ -6,22 +6,25 @@ import asyncio
 import contextlib
 import logging
 import select
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 
-from skinware.errors import BusError, BusNotAvailable, ConfigurationError
+from skinware.errors import BusError, BusNotAvailable, ConfigurationError, DriverError, PlatformError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
+from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_news import WORDS, BusNews, reason_text
+from skinware_drivers.running.guard import bus_failure, hook
 from skinware_drivers.running.limits import BusLimits
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
-_STOP_TIMEOUT_S = 2.0
+_FIRST_PAUSE_ASIDE_S, _LONGEST_PAUSE_ASIDE_S = 1.0, 60.0
+_STOP_TIMEOUT_S = 0.8
 _CHECK_PAUSE_NS = NS_PER_S // 2
 _NEVER_NS = 1 << 63
 
@@ -45,7 +48,9 @@ class BusLine:
         since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
-        started: its devices have been told to send.
+        started: its devices have been told to send, or may have been.
+        is_aside: the driver's own code failed on it, and has not succeeded since.
+        aside: how long it is left alone then.
         lost: set while it is away.
         suspects: keys of the patches that report errors.
         revived_ns: when one of its patches was last set up anew.
@@ -66,6 +71,8 @@ class BusLine:
         self.heard_ns = 0
         self.opened_ns: int = 0
         self.started: bool = False
+        self.is_aside: bool = False
+        self.aside: Backoff = Backoff(_FIRST_PAUSE_ASIDE_S, _LONGEST_PAUSE_ASIDE_S)
         self.lost: asyncio.Event = asyncio.Event()
         self.busy: asyncio.Lock = asyncio.Lock()
         self.suspects: set[int] = set()
@@ -77,15 +84,23 @@ class BusLine:
         self._checked_ns = 0
         self._speaks_from_ns = 0 if bus.listen_only else _NEVER_NS  # before, it only answers
         self._has_spoken = False
+        self._reopening = _attempts()
 
     def open(self) -> None:
         """Open the bus.
 
         Raises:
             BusNotAvailable: it cannot be opened now.
+            ConfigurationError: it can never be opened like this.
+            PlatformError: this system cannot.
         """
-        self.bus.open()
-        self._is_open()
+        try:
+            self.bus.open()
+            self._is_open()
+        except (BusNotAvailable, ConfigurationError, PlatformError):
+            raise
+        except Exception as error:
+            raise bus_failure(self.name, "open", error) from error
 
     def _is_open(self) -> None:
         self._epoll.register(self.bus.fileno(), select.EPOLLIN)
@@ -98,21 +113,27 @@ class BusLine:
 
     def lose(self, error: BusNotAvailable) -> None:
         """Close it because it went away; ``reopen`` waits for it."""
-        with contextlib.suppress(OSError):
-            self._epoll.unregister(self.bus.fileno())
+        self._let_go()
+        self._is_away(error)
+
+    def _let_go(self) -> None:
+        if self.bus.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                self._epoll.unregister(self.bus.fileno())
         self.bus.close()
         self.lost.set()
-        self._is_away(error)
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
-        for pause_s in _pauses():
-            await asyncio.sleep(pause_s)
+        if now_ns() - self.opened_ns > self._reopening.longest_s * NS_PER_S:
+            self._reopening.begin_again()  # it was there for a while, and not for a moment again and again
+        while True:
+            await asyncio.sleep(self._reopening.next_s())
             self._news.catch_up()
             try:
                 await self._open_again()
-            except (BusNotAvailable, ConfigurationError, OSError) as error:
-                self._is_away(error)
+            except Exception as error:  # noqa: BLE001  (what buses raise, they may also raise later)
+                self._is_away(error if isinstance(error, ConfigurationError) else bus_failure(self.name, "open", error))
             else:
                 return
 
@@ -169,8 +190,8 @@ class BusLine:
         self._checked_ns = time_ns
         try:
             self.bus.check()
-        except BusNotAvailable as error:
-            self.lose(error)
+        except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
+            self.lose(bus_failure(self.name, "check", error))
 
     def _become(self, state: BusState, reason: BusReason) -> bool:
         """Returns whether it was in another state, or for another reason."""
@@ -199,20 +220,22 @@ class BusLine:
         Args:
             described: called after every answer, also after an empty one.
         """
-        told = False
-        for pause_s in _pauses():
-            await asyncio.sleep(pause_s)
+        told, attempts = False, _attempts()
+        while True:
+            await asyncio.sleep(attempts.next_s())
             if self.lost.is_set():
                 await self.reopen()
+            found: Sequence[Patch] = ()
             try:
-                self.patches = await self.adapter.describe(self.link)
+                with hook("describe", self.name):
+                    found = are_patches(await self.adapter.describe(self.link))
                 why = "no patch is heard, and nobody may be asked" if self.bus.listen_only else "no patch answers"
             except BusError as error:
-                self.patches = ()
                 why = str(error)
                 self._check(now_ns())
+            self.patches = found or self.patches or ()  # what was known of a bus that was set aside stays
             await described()
-            if self.patches:
+            if found:
                 return
             if not told:
                 log.warning("%s: %s; waiting for one to appear", self.name, why)
@@ -220,19 +243,22 @@ class BusLine:
 
     async def set_up(self) -> None:
         """Set its devices up and make them send, for as long as it takes."""
-        for pause_s in _pauses():
-            await asyncio.sleep(pause_s)
+        attempts = _attempts()
+        while True:
+            await asyncio.sleep(attempts.next_s())
             if self.lost.is_set():
                 await self.reopen()
+            self.started = True  # devices may begin to send at any moment of it
             try:
                 async with self.busy:
-                    await self.adapter.configure(self.link)
-                    await self.adapter.start(self.link)
+                    with hook("configure", self.name):
+                        await self.adapter.configure(self.link)
+                    with hook("start", self.name):
+                        await self.adapter.start(self.link)
             except BusError as error:
                 self._news.tell(f"{self.name}: set-up failed: {error}; trying again")
                 self._check(now_ns())
             else:
-                self.started = True
                 self._speaks_from_ns = now_ns()
                 return
 
@@ -249,31 +275,51 @@ class BusLine:
 
     def remove(self) -> None:
         """Let go of the bus for good."""
-        if self.bus.fileno() >= 0:
-            with contextlib.suppress(OSError):
-                self._epoll.unregister(self.bus.fileno())
-        self.bus.close()
-        self.lost.set()
+        self._let_go()
         self.patches = ()
         self._become(BusState.GONE, BusReason.REMOVED)
 
+    async def set_aside(self, error: Exception) -> None:
+        """Stop its devices and close it, because the driver's own code failed on it; ``reopen`` opens it again."""
+        self.is_aside = True
+        with contextlib.suppress(DriverError):  # which failed already
+            await self.stop()
+        self._let_go()
+        self.patches = self.patches or ()
+        self._become(BusState.DOWN, BusReason.SET_ASIDE)
+        self._news.tell(f"{error}; bus {self.name} is set aside, and tried again later")
+
     async def stop(self) -> None:
-        """Make its devices silent, if they were told to send and it can be done now."""
+        """Make its devices silent, if they may have been told to send and it can be done now.
+
+        Raises:
+            DriverError: the driver's own code failed.
+        """
         if not self.started or self.bus.fileno() < 0:
             return
         try:
             async with asyncio.timeout(_STOP_TIMEOUT_S):
-                await self.adapter.stop(self.link)
-        except BusError as error:
+                with hook("stop", self.name):
+                    await self.adapter.stop(self.link)
+        except (BusError, ConfigurationError) as error:
             log.warning("%s: not stopped in good order: %s", self.name, str(error))
         except TimeoutError:
             log.warning("%s: not stopped in good order: it took too long", self.name)
 
 
-def _pauses() -> Iterator[float]:
-    """What to wait before each attempt, s: nothing first, then longer and longer."""
-    yield 0.0
-    pause_s = _FIRST_PAUSE_S
-    while True:
-        yield pause_s
-        pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+def are_patches(found: Iterable[object]) -> Sequence[Patch]:
+    """What ``describe`` or ``join`` of an adapter returned.
+
+    Raises:
+        TypeError: these are no patches.
+    """
+    patches = []
+    for patch in found:
+        if not isinstance(patch, Patch):
+            raise TypeError(f"it returned {patch!r} among its patches; a sequence of Patch is needed")
+        patches.append(patch)
+    return patches
+
+
+def _attempts() -> Backoff:
+    return Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S, at_once=True)

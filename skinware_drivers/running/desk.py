@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from skinware.errors import BusError, ConfigurationError
+from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import now_ns
 from skinware.service import Request, RequestServer
 from skinware.service.messages import ACQUIRE
 from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.guard import hook
+
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 Changed = Callable[[BusLine, Sequence[Patch], bool], object]
 
@@ -25,13 +29,22 @@ class RequestDesk:
         lines: the driver's buses.
         listen_only: nothing may be sent: operations are refused.
         changed: called after an operation with its bus, its patches, and whether it set them up anew.
+        fail: called with what goes wrong here and is no fault of an operation.
     """
 
-    def __init__(self, server: RequestServer, lines: Sequence[BusLine], listen_only: bool, changed: Changed) -> None:
+    def __init__(
+        self,
+        server: RequestServer,
+        lines: Sequence[BusLine],
+        listen_only: bool,
+        changed: Changed,
+        fail: Callable[[BaseException], None],
+    ) -> None:
         self._server = server
         self._lines = lines
         self._listen_only = listen_only
         self._changed = changed
+        self._fail = fail
         self._waiting: list[tuple[int, Request]] = []
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -43,7 +56,13 @@ class RequestDesk:
             else:
                 task = asyncio.get_running_loop().create_task(self._carry_out(request))
                 self._tasks.add(task)
-                task.add_done_callback(self._tasks.discard)
+                task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:
+            self._fail(error)
 
     @property
     def waited_for(self) -> bool:
@@ -106,8 +125,18 @@ class RequestDesk:
                 return None
             if line.lost.is_set():
                 raise ConfigurationError("the bus is away")
-            result = await operation.method(line.adapter, line.link, patches, **arguments)
-        self._changed(line, patches, operation.sets_up)
+            try:
+                with hook(request.operation, line.name):
+                    result = await operation.method(line.adapter, line.link, patches, **arguments)
+            except DriverError as error:
+                if not isinstance(error.__cause__, ValueError):  # which says that the arguments make no sense
+                    log.warning("%s", str(error))
+                raise error.__cause__ if isinstance(error.__cause__, Exception) else error from None
+        try:
+            self._changed(line, patches, operation.sets_up)
+        except Exception as error:
+            self._fail(error)
+            raise
         return result
 
     def _meant(self, bus: object, patch: object) -> list[tuple[BusLine, Sequence[Patch]]]:

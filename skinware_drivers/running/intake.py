@@ -7,12 +7,12 @@ import select
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from skinware.errors import BusNotAvailable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.guard import bus_failure
 
-_TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
+_TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
 _REST, _REST_WHILE_ASKING = 16, 4  # after a take: so many times its duration, while more arrives (decision 0006)
 DEFAULT_LATENCY_S = 0.005
 """What the longest rest is if nobody says."""
@@ -27,6 +27,7 @@ class Intake:
         empty_batch: gives the batch to fill.
         digest: gets it, filled.
         latency_s: the longest rest.
+        guard: makes of a callback one that may fail in the event loop.
     """
 
     def __init__(
@@ -36,18 +37,20 @@ class Intake:
         empty_batch: Callable[[], FrameBatch],
         digest: Callable[[FrameBatch], None],
         latency_s: float,
+        guard: Callable[[Callable[[], None]], Callable[[], None]] = lambda callback: callback,
     ) -> None:
         self._epoll = epoll
         self._lines = lines
         self._empty_batch = empty_batch
         self._digest = digest
         self._latency_s = latency_s
+        self._look = guard(self._on_readable)
         self._rest: asyncio.TimerHandle | None = None
         self._by_fd: dict[int, BusLine] = {}
 
     def start(self) -> None:
         """Begin to listen, in the running loop."""
-        asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._on_readable)
+        asyncio.get_running_loop().add_reader(self._epoll.fileno(), self._look)
 
     def stop(self) -> None:
         """Listen no more."""
@@ -57,7 +60,10 @@ class Intake:
 
     def take(self) -> Literal["nothing", "all", "some"]:
         """Take what has arrived, now. ``some``: more is waiting."""
+        begun_ns = now_ns()
         for turn in range(_TURNS):
+            if now_ns() - begun_ns > _TURN_NS:
+                return "some"
             events = self._epoll.poll(0)
             if not events:
                 return "all" if turn else "nothing"
@@ -79,7 +85,7 @@ class Intake:
             loop.remove_reader(self._epoll.fileno())
             factor = _REST_WHILE_ASKING if any(line.link.is_awaiting for line in self._lines) else _REST
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self._latency_s)
-            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
+            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:
         """Fill a batch from those buses that have something; whether one of them has more than its share."""
@@ -92,8 +98,8 @@ class Intake:
                 if line.bus.receive(batch, line.ordinal):
                     line.heard_ns = time_ns
                     is_behind |= not batch.free
-            except BusNotAvailable as error:
-                line.lose(error)
+            except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
+                line.lose(bus_failure(line.name, "receive", error))
         return is_behind
 
     def _line_of(self, fd: int) -> BusLine | None:

@@ -14,6 +14,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 HIGH_LOAD = 0.8
 """Of what the wire can carry. Beyond it, frames of low priority wait for long."""
+FULL = 0.95
+"""From here on they may wait indefinitely: what the wire takes is an estimate."""
 HIGH_FILL = 0.5
 """Of the receive buffer."""
 SOFTNET = Path("/proc/net/softnet_stat")
@@ -70,6 +72,11 @@ class BusLimits:
         if bus.counters.lost > self._lost:
             lost = bus.counters.lost - self._lost
             self._tell("lost", f"{lost} frames were lost: the receive buffer was full (or the adapter's queue)")
+
+    @property
+    def is_full(self) -> bool:
+        """Whether frames of low priority may find no room at all."""
+        return self.load is not None and self.load > FULL
 
     @property
     def permille(self) -> int:

@@ -16,14 +16,36 @@ from skinware_drivers.description import Patch
 from skinware_drivers.notice import Notice
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
+from skinware_drivers.running.guard import hook
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
-_FIRST_PAUSE_NS, _LONGEST_PAUSE_NS = NS_PER_S, 60 * NS_PER_S  # between set-ups that disturb living patches
+_FIRST_PAUSE_NS, _LONGEST_PAUSE_NS = NS_PER_S, 60 * NS_PER_S
 
 Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
+
+
+class _SetUps:
+    """Set-ups of which nothing came, or that disturb others: at once, then after 1 s, 2 s, 4 s and so on, to 60 s."""
+
+    def __init__(self) -> None:
+        self.begun = 0
+        self._pause_ns = self._not_before_ns = 0
+
+    @property
+    def are_due(self) -> bool:
+        return now_ns() >= self._not_before_ns
+
+    def begin(self) -> None:
+        self.begun += 1
+        self._pause_ns = min(max(2 * self._pause_ns, _FIRST_PAUSE_NS), _LONGEST_PAUSE_NS)
+        self._not_before_ns = now_ns() + self._pause_ns
+
+    def put_off(self) -> None:
+        """The longest pause comes first."""
+        self._not_before_ns = now_ns() + _LONGEST_PAUSE_NS
 
 
 class PatchCare:
@@ -53,7 +75,9 @@ class PatchCare:
         adapter = type(line.adapter)
         self._revives_all = adapter.revive is Adapter.revive
         self._knows_only_all = self._revives_all and adapter.probe is Adapter.probe
-        self._pause_ns = self._not_before_ns = 0
+        self._set_ups: dict[int, _SetUps] = {}  # by patch key, of those that answer and send nothing
+        self._set_ups_of_all = _SetUps()
+        self._told = ""
         self._begun_ns, self._error = 0, ""  # of the last set-up
 
     async def check_data(self) -> None:
@@ -83,27 +107,56 @@ class PatchCare:
         silent, asked_ns = generation.patches_in(line, *states), now_ns()
         if self._knows_only_all:
             silent = silent[:1] if self._may_set_up_all(silent) else []  # the others are set up with it
+        for patch in self._patches_in(PatchState.LIVE):
+            self._set_ups.pop(patch.key, None)
         for patch in silent:
-            try:
+            if await self._is_to_be_set_up(patch):
+                await self._revive(patch, asked_ns)
+
+    async def _is_to_be_set_up(self, patch: Patch) -> bool:
+        """Whether a silent patch answers, and has not been set up in vain a moment ago."""
+        line, set_ups = self._line, self._set_ups.get(patch.key)
+        if set_ups is not None and not set_ups.are_due:
+            return False
+        try:
+            with hook("probe", line.name):
                 if not await line.adapter.probe(line.link, patch):
-                    continue
-                log.warning("%s: %s is silent but answers: it has restarted", line.name, patch.name)
-            except BusError as error:
-                log.debug("%s: %s", line.name, str(error))
-                continue
-            await self._revive(patch, asked_ns)
+                    return False
+        except BusError as error:
+            log.debug("%s: %s", line.name, str(error))
+            return False
+        if set_ups is None:
+            set_ups = self._set_ups[patch.key] = _SetUps()
+            if line.limits.is_full:
+                set_ups.put_off()
+                log.warning(
+                    "%s: %s answers, but its data finds no room: the bus is full; fewer boards, or a longer period"
+                    " (see docs/troubleshooting.md)",
+                    line.name,
+                    patch.name,
+                )
+                return False
+        if not set_ups.begun:
+            log.warning("%s: %s is silent but answers: it has restarted, or was never set up", line.name, patch.name)
+        elif set_ups.begun == 1:
+            log.warning(
+                "%s: %s answers and was set up, but sends nothing; tried again, more and more rarely",
+                line.name,
+                patch.name,
+            )
+        set_ups.begin()
+        return True
 
     def _may_set_up_all(self, silent: Sequence[Patch]) -> bool:
         """Whether the whole bus is to be set up for silent patches: more and more rarely while that disturbs others."""
         if not silent:
-            self._pause_ns = self._not_before_ns = 0
+            self._set_ups_of_all = _SetUps()
             return False
         if not self._patches_in(PatchState.LIVE):
             return True
-        if now_ns() < self._not_before_ns:
+        if not self._set_ups_of_all.are_due:
             return False
-        self._pause_ns = min(max(2 * self._pause_ns, _FIRST_PAUSE_NS), _LONGEST_PAUSE_NS)
-        self._not_before_ns = now_ns() + self._pause_ns
+        self._set_ups_of_all.begin()
         return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
@@ -118,15 +171,22 @@ class PatchCare:
         try:
             while True:
                 try:
-                    await adapter.attend(self._line.link)
+                    with hook("attend", self._line.name):
+                        await adapter.attend(self._line.link)
                     await asyncio.Event().wait()  # for ever: it may still tell something when it is asked
                 except BusError as error:
-                    log.debug("%s: %s", self._line.name, str(error))
+                    self._tell(str(error))
                 await asyncio.sleep(pause_s())
         finally:
             adapter.heard_by = None
             for task in reviving.values():
                 task.cancel()
+
+    def _tell(self, text: str) -> None:
+        """What went wrong in attending, once in a row, unless it is that the bus is away."""
+        if text != self._told and not self._line.lost.is_set():
+            self._told = text
+            log.warning("%s: %s; attending to it again", self._line.name, text)
 
     def _note(self, reviving: dict[int, asyncio.Task[None]], patch: Patch, notice: Notice) -> None:
         """A patch says something of itself."""
@@ -136,10 +196,12 @@ class PatchCare:
             return
         if notice is Notice.SUSPECT:
             line.suspects.add(patch.key)
-            generation.watch.suspect(number)
+            with hook("watch", line.name):
+                generation.watch.suspect(number)
         elif notice is Notice.SOUND:
             line.suspects.discard(patch.key)
-            generation.watch.forget(number)
+            with hook("watch", line.name):
+                generation.watch.forget(number)
         elif notice is Notice.LOST or self._listen_only:
             generation.publisher.lose(number, PatchState.STALE)
         elif notice is Notice.CHANGED:
@@ -171,13 +233,15 @@ class PatchCare:
                 generation.publisher.lose(number, PatchState.STALE)
             else:
                 line.suspects.discard(patch.key)
-                generation.watch.forget(number)
+                with hook("watch", line.name):
+                    generation.watch.forget(number)
 
     async def _set_up(self, patch: Patch) -> None:
         """Have the driver set one patch up."""
         self._begun_ns, self._error = now_ns(), ""
         try:
-            await self._line.adapter.revive(self._line.link, patch)
+            with hook("revive", self._line.name):
+                await self._line.adapter.revive(self._line.link, patch)
         except BusError as error:
             self._error = str(error) or type(error).__name__
         else:

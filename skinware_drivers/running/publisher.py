@@ -11,11 +11,13 @@ import numpy.typing as npt
 from skinware.driver_service import DriverWriter
 from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.service import DEFAULT_SLOTS
 from skinware.status import LOAD_UNKNOWN, BusState, PatchState, Status
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
 from skinware_drivers.running.bursts import Bursts
+from skinware_drivers.running.guard import failure
 from skinware_drivers.running.patch_timing import PatchTiming
 from skinware_drivers.watch import Watch
 
@@ -56,6 +58,7 @@ class Publisher:
         by_cycle: see above.
         desk: who asks for frames.
         on_request: publish only what somebody waits for (beside the very first frame).
+        most_at_once: frames that are published of one take, at the most: more than the ring holds are seen by nobody.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Publisher:
         by_cycle: bool,
         desk: Desk | None = None,
         on_request: bool = False,
+        most_at_once: int = DEFAULT_SLOTS,
     ) -> None:
         self._writer = writer
         self._state = decoder.state
@@ -74,16 +78,17 @@ class Publisher:
         self._period_ns = round(period_s * NS_PER_S)
         self._by_cycle = by_cycle
         self._desk, self._on_request = desk, on_request
+        self._most_at_once = most_at_once
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
         self._patience_ns = self._period_ns * 3 // 2
         self._pause_ns = self._period_ns // 2
         self._silence_ns = age_limit_ns(self._period_ns)
-        structure = decoder.tables.structure
+        self._structure = structure = decoder.tables.structure
         self._module_patch = structure.module_patch.astype(np.intp)
         self._sensor_module = structure.sensor_module.astype(np.intp)
         self._first_module = np.searchsorted(self._module_patch, np.arange(structure.n_patches))
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
-        self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show)
+        self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show, self._skip)
         self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
         self.timing: PatchTiming = PatchTiming(structure)
         self._behind = np.zeros(structure.n_modules, bool)
@@ -113,7 +118,7 @@ class Publisher:
         return max(self._not_before_ns, min(self._due_ns, idle_ns) if self._due_ns else idle_ns)
 
     def take(self, updates: Updates) -> None:
-        """Show updates, publishing as often as needed for none to be overwritten unseen."""
+        """Show updates, publishing as often as needed for none to be overwritten unseen, up to ``most_at_once``."""
         if not len(updates):
             return
         time_ns = now_ns()
@@ -123,7 +128,7 @@ class Publisher:
         if not self._by_cycle:
             self._show(updates)
             return
-        self._bursts.take(updates, self._living(time_ns), self.publish)
+        self._bursts.take(updates, self._living(time_ns), self.publish, self._most_at_once - 1)
         self._look_at_frame(time_ns)
 
     def publish_if_due(self) -> None:
@@ -140,7 +145,7 @@ class Publisher:
                 self._due_ns = self._not_before_ns = self._bursts.pause_ends_ns(open_patches)
                 return
             self.publish()
-            self._bursts.take(None, living, self.publish)
+            self._bursts.take(None, living, self.publish, self._most_at_once - 2)
             self._look_at_frame(time_ns)
         else:
             self.publish()
@@ -203,8 +208,18 @@ class Publisher:
 
     def _show(self, updates: Updates) -> None:
         self._state.show(updates)
-        if updates.flagged:
+        if not updates.flagged:
+            return
+        try:
             self._watch.look(updates)
+        except Exception as error:
+            buses = np.unique(self._structure.patch_bus[self._module_patch[updates.module]]).tolist()
+            names = ", ".join(self._structure.buses[bus] for bus in buses)
+            raise failure("Watch.look", f"bus {names}", error) from error
+
+    def _skip(self, of_patch: npt.NDArray[np.int64]) -> None:
+        for patch in np.flatnonzero(of_patch).tolist():
+            self.bus_counters[int(self._structure.patch_bus[patch])].updates_skipped += int(of_patch[patch])
 
     def _look_at_frame(self, time_ns: int) -> None:
         """After new data: publish a complete frame, or say when it will be due."""

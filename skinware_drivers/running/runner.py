@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import select
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from skinware.driver_service import DriverWriter
-from skinware.errors import BusError, BusNotAvailable, StructureError
+from skinware.errors import BusNotAvailable, DriverError, StructureError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.service import DEFAULT_SLOTS
@@ -23,16 +22,16 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
 from skinware_drivers.operations import operations_of
-from skinware_drivers.polling import Poller
 from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
+from skinware_drivers.running.guard import end_of_driver, failure
 from skinware_drivers.running.intake import DEFAULT_LATENCY_S, Intake
 from skinware_drivers.running.limits import MachineLimits
-from skinware_drivers.running.patch_care import PatchCare
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.serving import Serving
 from skinware_drivers.running.turns import short_turns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -97,14 +96,15 @@ class Runner:
         self._group = group
         self._on_ready = on_ready
         self._machine = MachineLimits()
-        self._serving: dict[BusLine, asyncio.Task[None]] = {}
-        self._intake = Intake(self._epoll, self.lines, self._empty_batch, self._digest, latency_s)
+        self._intake = Intake(self._epoll, self.lines, self._empty_batch, self._digest, latency_s, self._guard)
         self._first_batch = make_batch(self.lines)
         self._stopping = asyncio.Event()
         self._failure: BaseException | None = None
         self._built = asyncio.Condition()
+        self._serving = Serving(
+            self.lines, listen_only, lambda: self.generation, self._built, self._build, self._tell_ready, self.fail
+        )
         self._timer: asyncio.TimerHandle | None = None
-        self._join_requested = asyncio.Event()
 
     @property
     def _layouts(self) -> list[Layout | None]:
@@ -119,6 +119,8 @@ class Runner:
 
         Raises:
             BusNotAvailable: at the start, not one bus is there, or this user may not open one.
+            ConfigurationError: devices cannot be used as they are configured, and no other bus is served.
+            DriverError: the driver's own code failed: for all buses, or for the last one that was served.
             NameInUse: a living driver has this name.
             NamespaceError: the namespace cannot be used.
         """
@@ -130,16 +132,14 @@ class Runner:
         try:
             self._open_buses()
             self._intake.start()
-            self._serving = {line: self._beside(self._serve(line)) for line in self.lines}
+            for line in self.lines:
+                self._serving.begin(line)
             await self._stopping.wait()
-            if self._failure is not None:
-                raise self._failure
         finally:
-            tasks = list(self._serving.values())
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await self._serving.end()
             await self._shut_down(loop)
+        if self._failure is not None:
+            raise self._failure
 
     def _open_buses(self) -> None:
         absent: list[tuple[BusLine, BusNotAvailable]] = []
@@ -159,9 +159,28 @@ class Runner:
         """Ask ``run`` to come back; safe in a signal handler of the loop."""
         self._stopping.set()
 
+    def fail(self, error: BaseException) -> None:
+        """End ``run`` with this error: nothing may go on as if it had not happened. Only the first one counts."""
+        if self._failure is None:
+            self._failure = end_of_driver(error)
+        self._stopping.set()
+
+    def _guard(self, callback: Callable[[], None]) -> Callable[[], None]:
+        """The same for the event loop, which would log what it raises and go on."""
+
+        def call() -> None:
+            if self._failure is not None:
+                return
+            try:
+                callback()
+            except (Exception, SystemExit) as error:  # noqa: BLE001  (whatever it is, it ends the driver)
+                self.fail(error)
+
+        return call
+
     def join(self) -> None:
         """Take in what has appeared on the buses since the start, as a new generation."""
-        self._join_requested.set()
+        self._serving.join()
 
     async def _put_in(self, line: BusLine) -> None:
         """Begin with a bus that joins: users see a new generation."""
@@ -169,14 +188,15 @@ class Runner:
             line.begin_lost()
             self.lines[line.ordinal : line.ordinal + 1] = [line]
             self._rebuild(anew=True)  # nothing of it may arrive before there is a place for it
-        self._serving[line] = self._beside(self._serve(line))
+        self._serving.begin(line)
 
     async def _take_out(self, line: BusLine) -> None:
         """Stop what is on a bus, and close it. The sensors stay in the structure until that is built again."""
-        task = self._serving.pop(line)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        await line.stop()
+        await self._serving.end(line)
+        try:
+            await line.stop()
+        except DriverError as error:
+            log.warning("%s", str(error))  # the bus goes all the same
         async with self._built:
             line.remove()
 
@@ -184,8 +204,10 @@ class Runner:
         if self._desk is not None and self.writer is not None:
             loop.remove_reader(self.writer.request_server().fileno())
             await self._desk.close()
-        for line in self.lines:
-            await line.stop()
+        stopped = await asyncio.gather(*(line.stop() for line in self.lines), return_exceptions=True)
+        for failed in stopped:
+            if isinstance(failed, Exception):
+                self.fail(failed)
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
@@ -195,66 +217,10 @@ class Runner:
         if self.writer is not None:
             self.writer.close()
 
-    async def _serve(self, line: BusLine) -> None:
-        """One bus from discovery to the end: describe, set up, then look after it."""
-        care = PatchCare(line, lambda: self.generation, self._listen_only, self.join, self._beside)
-        await line.describe(self._build)
-        beside = [self._beside(self._join_on_request(line)), self._beside(care.attend(lambda: self._silence_s))]
-        try:
-            if not self._listen_only:
-                await line.set_up()
-                poller = Poller(line.link, line.bus.counters)
-                beside.append(self._beside(poller.run(lambda: line.adapter.polls, line.lost.is_set)))
-            async with self._built:  # other buses may still be asked what hangs on them
-                await self._built.wait_for(lambda: self.generation is not None)
-            await care.check_data()
-            self._tell_ready()
-            while True:
-                if line.lost.is_set():
-                    await line.reopen()
-                await care.recover_silent()
-                with contextlib.suppress(TimeoutError):
-                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
-                    async with asyncio.timeout(self._silence_s):
-                        await line.lost.wait()
-        finally:
-            for task in beside:
-                task.cancel()
-            await asyncio.gather(*beside, return_exceptions=True)
-
-    def _beside(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start what goes on beside serving a bus; should it fail, the driver does."""
-
-        def look(done: asyncio.Task[None]) -> None:
-            if not done.cancelled() and done.exception() is not None:
-                self._failure = done.exception()
-                self._stopping.set()
-
-        task = asyncio.get_running_loop().create_task(work)
-        task.add_done_callback(look)
-        return task
-
     def _tell_ready(self) -> None:
         if not self.ready:
             self.ready = True
             self._on_ready()
-
-    @property
-    def _silence_s(self) -> float:
-        return self.generation.publisher.silence_ns / NS_PER_S if self.generation is not None else 0.5
-
-    async def _join_on_request(self, line: BusLine) -> None:
-        while True:
-            await self._join_requested.wait()
-            self._join_requested.clear()
-            try:
-                patches = await line.adapter.join(line.link, line.patches or ())
-            except BusError as error:
-                log.warning("%s: nothing joined: %s", line.name, str(error))
-                continue
-            if patches:  # also the same ones: what is known of their types and frames may have changed
-                line.patches = patches
-                await self._build()
 
     # -- structure ------------------------------------------------------------------------------------------------
 
@@ -306,17 +272,21 @@ class Runner:
                 operations={name: operation.method for name, operation in operations_of(type(adapter)).items()},
             )
             server = writer.request_server()
-            self._desk = RequestDesk(server, self.lines, self._listen_only, self._after_operation)
-            asyncio.get_running_loop().add_reader(server.fileno(), self._desk.take)
+            self._desk = RequestDesk(server, self.lines, self._listen_only, self._after_operation, self.fail)
+            asyncio.get_running_loop().add_reader(server.fileno(), self._guard(self._desk.take))
         else:
             writer = self.writer
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
         periods_s = [line.adapter.period_s for line in self.lines]
-        decoder, watch = Decoder(self._layouts, tables, periods_s), adapter.watch(tables)
+        decoder = Decoder(self._layouts, tables, periods_s)
+        try:
+            watch = adapter.watch(tables)
+        except Exception as error:
+            raise failure("watch", f"buses {', '.join(line.name for line in self.lines)}", error) from error
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
-        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request)
+        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)
         self._publish_when_due()
 
@@ -373,7 +343,7 @@ class Runner:
             if not self._timer.cancelled() and loop.time() < self._timer.when() <= due_s:
                 return  # it comes early enough and then looks again
             self._timer.cancel()
-        self._timer = loop.call_at(due_s, self._publish_when_due)
+        self._timer = loop.call_at(due_s, self._guard(self._publish_when_due))
 
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""

@@ -13,6 +13,7 @@ import pytest
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 
@@ -88,6 +89,23 @@ def test_fd_frames_and_29_bits_go_both_ways(vcan: Callable[[], str]) -> None:
         ours.send(0x123, bytes(65))
     ours.close()
     theirs.close()
+
+
+@pytest.mark.parametrize("length", [8, 12, 16, 20, 24, 32, 48, 64])
+def test_a_layout_of_every_fd_length_is_received(vcan: Callable[[], str], length: int) -> None:
+    layout = Layout((Frame("all", (Identifier(0x123),), (length,), Values(0, "u1", length)),))
+    interface = vcan()
+    bus, out = (SocketCanBus(interface, payload_size=layout.payload_size) for _ in range(2))
+    bus.open()
+    out.open()
+    batch = FrameBatch.for_buses(1, layout.payload_size)
+    out.send(0x123, bytes(range(length)))
+    receive(bus, batch, 1)
+    assert batch.wire["length"][0] == length
+    assert batch.wire["payload"][0][:length].tobytes() == bytes(range(length))
+    assert bus.counters.refused == 0
+    bus.close()
+    out.close()
 
 
 def test_drops_are_counted_exactly(vcan: Callable[[], str]) -> None:

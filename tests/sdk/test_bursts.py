@@ -106,7 +106,7 @@ def check_bursts(
     monkeypatch: pytest.MonkeyPatch, clocks: tuple[Sender, ...], cuts: list[int], missing: Missing
 ) -> None:
     with monkeypatch.context() as patch:
-        desk = Desk(patch, boards=BOARDS)
+        desk = Desk(patch, boards=BOARDS, slots=64)
         try:
             recorder = Recorder(desk)
             stream: list[Wire] = []

@@ -78,6 +78,31 @@ def test_while_an_answer_is_waited_for_it_is_shorter(monkeypatch: pytest.MonkeyP
     assert rest_after_a_take(monkeypatch, latency_s=1.0, is_awaiting=True) == pytest.approx(4 * TAKE_NS / 1e9)
 
 
+def test_a_wake_up_ends_in_time_however_much_waits() -> None:
+    """Between two of them come signals, timers and handshakes."""
+    clock_ns = now_ns()
+    taken = 0
+
+    def receive(batch: FrameBatch, ordinal: int) -> int:
+        nonlocal taken
+        taken += 1
+        batch.stop = batch.limit
+        return 64
+
+    def digest(batch: FrameBatch) -> None:
+        nonlocal clock_ns
+        clock_ns += 15_000_000
+
+    fd = os.eventfd(1)
+    line: Any = SimpleNamespace(bus=SimpleNamespace(receive=receive, fileno=lambda: fd), ordinal=0)
+    with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(intake, "now_ns", lambda: clock_ns)
+        epoll.register(fd, select.EPOLLIN)
+        assert Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, 0.0).take() == "some"
+    os.close(fd)
+    assert taken == 2
+
+
 @pytest.mark.parametrize("latency_s", [0.0, 1e-4, 1e-3])
 def test_it_is_never_longer_than_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, latency_s: float) -> None:
     assert rest_after_a_take(monkeypatch, latency_s=latency_s) == latency_s

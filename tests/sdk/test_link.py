@@ -53,6 +53,22 @@ def test_a_request_that_is_cancelled_as_its_answer_arrives_does_not_go_on(turns:
     asyncio.run(scenario())
 
 
+@pytest.mark.parametrize("match", [Match(0x750), Match(0x700, 0x70F), Match(0x750, 0x7FF)])
+def test_a_29_bit_identifier_is_no_answer_where_one_of_11_bits_is_awaited_nor_the_other_way_round(match: Match) -> None:
+    """Their lowest 11 bits may be the same: frames of other devices made boards that do not exist."""
+
+    async def scenario() -> None:
+        link = Link(Nowhere())  # type: ignore[arg-type]
+        with link.follow(match) as heard:
+            assert offer(link, (EXTENDED_FLAG | 0x18DA_F750, b""), (EXTENDED_FLAG | 0x750, b""), (0x750, b"")) == [0, 1]
+            assert [reply.identifier for reply in heard._queue] == [0x750]  # type: ignore[attr-defined]
+        with link.follow(Match(EXTENDED_FLAG | 0x18DA_F750)):
+            assert offer(link, (0x750, b""), (EXTENDED_FLAG | 0x18DA_F750, b""), (EXTENDED_FLAG | 0x750, b"")) == [0, 2]
+        assert match.filter.mask & EXTENDED_FLAG
+
+    asyncio.run(scenario())
+
+
 def test_who_follows_hears_everything_that_matches_in_order_until_it_stops() -> None:
     async def scenario() -> None:
         link = Link(Nowhere())  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, PatchState, Status
-from skinware.errors import HandshakeTimeout
+from skinware.errors import DriverError, HandshakeTimeout
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
@@ -217,7 +217,10 @@ def test_an_adapter_that_fails_while_it_attends_ends_the_driver(devices: Devices
         wait_until(lambda: running.failure is not None)
         ended_by_itself.append(True)
 
-    with pytest.raises(ZeroDivisionError, match="a bug"), driving_lines(lines, "speaking", wait=False) as running:
+    with (
+        pytest.raises(DriverError, match=r"^bus bus0: `attend` failed: .*a bug"),
+        driving_lines(lines, "speaking", wait=False) as running,
+    ):
         see_it_end(running)
     assert ended_by_itself
 

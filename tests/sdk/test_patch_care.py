@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from skinware.errors import HandshakeTimeout
-from skinware.realtime import NS_PER_S
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import PatchState
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
@@ -59,9 +59,11 @@ class Stage:
         states: of the patches, by their keys.
         forgotten: keys of the patches whose sequence numbers may begin anew.
         tasks: what was started beside the rest.
+        is_full: what the bus' limits say.
     """
 
-    def __init__(self, adapter: Silent) -> None:
+    def __init__(self, adapter: Silent, *, is_full: bool = False) -> None:
+        self.is_full = is_full
         self.states = dict.fromkeys(range(len(PATCHES)), PatchState.STALE)
         self.forgotten: list[int] = []
         self.tasks: list[asyncio.Task[None]] = []
@@ -83,6 +85,7 @@ class Stage:
             opened_ns=0,
             revived_ns=0,
             suspects=set(),
+            limits=self,
         )
         self.care = PatchCare(cast(Any, line), lambda: cast(Any, generation), False, lambda: None, self._begin)
 
@@ -94,7 +97,7 @@ class Stage:
 @pytest.mark.parametrize("fails", [False, True])
 @pytest.mark.parametrize(("kind", "set_ups"), [(Silent, 1), (Answering, 1), (OneByOne, 8)])
 def test_silent_patches_that_can_only_be_set_up_together_are_so_once(
-    kind: type[Silent], set_ups: int, fails: bool
+    kind: type[Silent], set_ups: int, fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def run() -> None:
         adapter = kind(fails=fails)
@@ -102,6 +105,8 @@ def test_silent_patches_that_can_only_be_set_up_together_are_so_once(
         await stage.care.recover_silent()
         assert adapter.set_ups == set_ups
         assert stage.forgotten == ([] if kind is Silent else list(range(8)))
+        later_ns = now_ns() + NS_PER_S
+        monkeypatch.setattr(patch_care, "now_ns", lambda: later_ns)
         await stage.care.recover_silent()  # the next time it is tried again
         assert adapter.set_ups == 2 * set_ups
 
@@ -135,6 +140,42 @@ def test_a_patch_that_stays_away_has_the_living_ones_disturbed_more_and_more_rar
     assert asyncio.run(at_seconds(3)) == [0, 1]
     stage.states = dict.fromkeys(stage.states, PatchState.STALE)  # nobody is disturbed
     assert asyncio.run(at_seconds(3)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("is_full", "set_up_at_s"),
+    [(False, [0, 1, 3, 7, 15, 31, 63, 123, 183]), (True, [60, 61, 63, 67, 75, 91, 123, 183])],
+)
+def test_a_patch_that_answers_but_sends_nothing_is_set_up_more_and_more_rarely(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, is_full: bool, set_up_at_s: list[int]
+) -> None:
+    """Each set-up moves its baseline; and on a full bus it is most likely in order, and its frames find no room."""
+    clock_ns = 1000 * NS_PER_S
+    monkeypatch.setattr(patch_care, "now_ns", lambda: clock_ns)
+    adapter = OneByOne(fails=False)
+    stage = Stage(adapter, is_full=is_full)
+    stage.states = {key: PatchState.STALE if key == 3 else PatchState.LIVE for key in stage.states}
+    times = []
+
+    async def see(end_s: int) -> None:
+        nonlocal clock_ns
+        for second in range(end_s):
+            before = adapter.set_ups
+            await stage.care.recover_silent()
+            times.extend([second] * (adapter.set_ups - before))
+            clock_ns += NS_PER_S
+
+    asyncio.run(see(200))
+    assert times == set_up_at_s
+    assert len(caplog.records) == 2 + is_full  # however often
+    assert ("the bus is full" in caplog.text) == is_full
+    stage.states[3] = PatchState.LIVE  # it sends: another time it has restarted
+    asyncio.run(see(1))
+    stage.states[3] = PatchState.STALE
+    times.clear()
+    stage.is_full = False
+    asyncio.run(see(1))
+    assert times == [0]
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, PatchState, Status
+from skinware.service import DEFAULT_SLOTS
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.running import publisher as publisher_module
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.watch import Watch
@@ -22,17 +24,22 @@ class Desk:
     """A publisher of one board, or more, in front of a real ring; ``watched`` as the driver watches them."""
 
     def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...] = (7,), *, watched: bool = False
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        boards: tuple[int, ...] = (7,),
+        *,
+        watched: bool = False,
+        slots: int = DEFAULT_SLOTS,
     ) -> None:
         self.clock = clock = Clock()
         monkeypatch.setattr(publisher_module, "now_ns", lambda: clock.now_ns)
         self.rig = Rig(boards=boards)
         tables = self.rig.decoder.tables
         self.writer = DriverWriter(
-            "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
+            "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS, slots=slots
         )
         self.watch = self.rig.driver.watch(tables) if watched else Watch(tables)
-        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)
+        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True, most_at_once=slots)
         self.reader = DriverReader("desk")
 
     def feed(self, frames: list[Wire]) -> None:
@@ -105,6 +112,35 @@ def test_many_cycles_at_once_become_a_frame_each(monkeypatch: pytest.MonkeyPatch
     assert desk.writer.sequence == 5
     copies = [desk.reader._ring.copy(sequence) for sequence in range(1, 6)]
     assert [set(f.values.tolist()) for f in copies if f] == [{1}, {2}, {3}, {4}, {5}]
+    desk.close()
+
+
+@pytest.mark.parametrize("triangles", [range(16), range(3, 4)])
+def test_a_take_publishes_no_more_than_the_ring_holds_and_counts_what_it_skips(
+    monkeypatch: pytest.MonkeyPatch, triangles: range
+) -> None:
+    """What is overwritten before anybody could read it costs time, in which the driver does nothing else."""
+    desk = Desk(monkeypatch)
+    desk.feed(desk.burst(1, triangles))
+    counters = [BusCounters()]
+    desk.publisher.bus_counters = counters
+    before, taken = desk.writer.sequence, 40
+    frames: list[Wire] = []
+    for value in range(1, taken + 1):
+        desk.clock.now_ns += 50 * MS
+        frames += desk.burst(value, triangles)
+    desk.feed(frames)
+    published = desk.writer.sequence - before
+    assert 2 <= published <= DEFAULT_SLOTS
+    if desk.publisher._state.updated.any():  # the last one waits for the others of its board
+        desk.clock.now_ns += 100 * MS
+        desk.publisher.publish_if_due()
+        published = desk.writer.sequence - before
+    frame = desk.reader.read()
+    values = frame.values.reshape(16, 12)[triangles]
+    assert set(values.ravel().tolist()) == {taken}  # the newest
+    first = 0 if before else 1  # the update before these
+    assert counters[0].updates_skipped == (taken + first - published) * len(triangles)
     desk.close()
 
 

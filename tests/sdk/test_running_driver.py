@@ -6,6 +6,7 @@ import itertools
 import logging
 import os
 import time
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -23,9 +24,14 @@ from tests.sdk.driving import EveryFrame, LateBoards, Together, commands, drivin
 
 
 class Flood(VirtualCanBus):
-    """A bus on which more foreign frames wait, always, than a batch holds."""
+    """A bus on which more frames wait, always, than a batch holds.
+
+    Attributes:
+        frames: which frames.
+    """
 
     flooding = False
+    frames: Sequence[tuple[int, bytes]] = ()
     _always_readable = -1
 
     def open(self) -> None:
@@ -44,25 +50,40 @@ class Flood(VirtualCanBus):
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
         count = super().receive(batch, ordinal)
         while self.flooding and batch.free:
-            batch.append(ordinal, time.monotonic_ns(), 0x7F1, b"")
+            identifier, payload = self.frames[self.counters.frames % len(self.frames)]
+            batch.append(ordinal, time.monotonic_ns(), identifier, payload)
             count += 1
             self.counters.frames += 1
         return count
 
 
+FOREIGN = [(0x7F1, b"")]
+ONE_TRIANGLE = [(0x473, b"\x40" + bytes(7)), (0x473, b"\xc0" + bytes(7))]
+
+
 @pytest.mark.usefixtures("hurry")
-def test_a_flood_on_one_bus_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("frames", [FOREIGN, ONE_TRIANGLE])
+def test_a_flood_on_one_bus_holds_up_no_other(
+    monkeypatch: pytest.MonkeyPatch, frames: Sequence[tuple[int, bytes]]
+) -> None:
     monkeypatch.setattr("skinware_drivers.bus.BATCH_FRAMES", 128)
     hardware = EmulatedRoboskin(EmulatorOptions(boards=(7,)))
     flood = Flood.with_hardware(hardware)
+    flood.frames = frames
     others = [emulated(boards=(board,), pattern="idle") for board in (8, 9)]
     with driving(flood, *others) as running, DriverReader("roboskin") as reader:
         read_until(reader, lambda f: not f.status.any())
         running.do(lambda: setattr(flood, "flooding", True))
         flooded = flood.counters.frames
-        first = read_until(reader, lambda f: reader.bus_counters(f)[0]["frames"] > flooded + 10_000)
-        later = read_until(reader, lambda f: bool((f.module_time_ns > first.module_time_ns + 10**9).all()))
-        read_until(reader, lambda f: f.sequence >= later.sequence and f.patch_state.tolist() == [PatchState.LIVE] * 3)
+        wait_until(lambda: reader.bus_counters(reader.read())[0]["frames"] > flooded + 10_000)
+        first = reader.read()
+
+        def all_go_on() -> bool:
+            frame = reader.read()
+            others = frame.module_time_ns[16:] > first.module_time_ns[16:] + 10**9
+            return bool(others.all()) and frame.patch_state.tolist() == [PatchState.LIVE] * 3
+
+        wait_until(all_go_on)
         running.do(lambda: setattr(flood, "flooding", False))
 
 

@@ -162,6 +162,27 @@ def test_fd_frames_on_a_classic_layout_are_counted_whatever_their_length(cable: 
     assert (bus.counters.frames, bus.counters.refused, bus.counters.errors) == (1, 3, 0)
 
 
+@pytest.mark.parametrize("size", [16, 24, 32, 40, 48, 56, 64])
+def test_fd_frames_of_every_length_that_fits_are_received_and_the_others_counted(cable: Cable, size: int) -> None:
+    """The kernel hands out CAN FD frames of 72 bytes always, however short their payload."""
+    bus = SocketCanBus("can0", payload_size=size)
+    bus.adopt(cable.end)
+    lengths = [*range(9), 12, 16, 20, 24, 32, 48, 64]
+    for length in lengths:
+        cable.out.send(struct.pack("=IBB2x", 0x123, length, 4) + bytes(range(length)).ljust(64, b"\xff"))
+    cable.put(0x124, b"classic")
+    batch = FrameBatch(100, size)
+    drain(bus, batch)
+    fitting = [length for length in lengths if length <= size]
+    wire = batch.wire[: len(batch)]
+    assert wire["length"].tolist() == [*fitting, 7]
+    assert [row["payload"][: row["length"]].tobytes() for row in wire] == [
+        *(bytes(range(length)) for length in fitting),
+        b"classic",
+    ]
+    assert bus.counters.refused == len(lengths) - len(fitting)
+
+
 def test_fd_frames_are_data_of_a_layout_that_has_some(cable: Cable) -> None:
     bus = SocketCanBus("can0", payload_size=64)
     bus.adopt(cable.end)

@@ -1,0 +1,104 @@
+"""Interfaces that are reached through python-can: what they lose is noticed, and to listen is to be silent."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import threading
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+import pytest
+
+from skinware.errors import BusNotAvailable
+from skinware.status import BusReason
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.can.pythoncan import PythonCanBus
+from skinware_drivers.testing.waiting import wait_until
+
+
+class Unplugged:
+    """An adapter that delivers some messages, and is unplugged right after them.
+
+    Attributes:
+        failed: set once it has failed.
+    """
+
+    def __init__(self, messages: int) -> None:
+        self._left = messages
+        self.failed = threading.Event()
+
+    def recv(self, _timeout: float) -> can.Message:
+        if self._left:
+            self._left -= 1
+            return can.Message(arbitration_id=0x473, data=b"\x40" + bytes(7), is_extended_id=False)
+        self.failed.set()
+        raise can.CanOperationError("adapter unplugged")
+
+    def shutdown(self) -> None:
+        """Nothing is left to shut down."""
+
+
+@pytest.mark.parametrize(("messages", "rows"), [(0, 64), (3, 64), (3, 3), (64, 8)])
+@pytest.mark.parametrize("by", ["receive", "check"])
+def test_an_adapter_that_is_unplugged_after_its_last_messages_is_noticed(
+    monkeypatch: pytest.MonkeyPatch, messages: int, rows: int, by: str
+) -> None:
+    adapter = Unplugged(messages)
+    monkeypatch.setattr(can, "Bus", lambda **_: adapter)
+    bus = PythonCanBus("slcan", "/dev/ttyACM0")
+    bus.open()
+    assert bus._thread is not None
+    bus._thread.join()  # messages and failure wait together
+    assert adapter.failed.is_set()
+    received = 0
+    with select.epoll() as epoll:
+        epoll.register(bus.fileno(), select.EPOLLIN)
+        with pytest.raises(BusNotAvailable, match="adapter unplugged") as raised:  # noqa: PT012
+            while epoll.poll(0):
+                received += bus.receive(FrameBatch(rows), 0)
+                if by == "check" and received == messages:
+                    bus.check()
+    assert received == messages
+    assert raised.value.reason == BusReason.FAILED
+    bus.close()
+
+
+@contextmanager
+def adapter_on_a_pty() -> Iterator[tuple[int, str]]:
+    """The device's end, and the path of a port."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    try:
+        yield ours, os.ttyname(theirs)
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+@pytest.mark.parametrize(("listen_only", "command"), [(True, b"L\r"), (False, b"O\r")])
+def test_an_slcan_adapter_is_told_to_only_listen(listen_only: bool, command: bytes) -> None:
+    """Opened the usual way it acknowledges every frame that it hears: it takes part in the bus."""
+    with adapter_on_a_pty() as (device, path):
+        bus = PythonCanBus("slcan", path, {"bitrate": "1000000", "sleep_after_open": "0"}, listen_only=listen_only)
+        bus.open()
+        told = bytearray()
+
+        def is_open() -> bool:
+            while select.select([device], [], [], 0)[0]:
+                told.extend(os.read(device, 4096))
+            return told.endswith((b"L\r", b"O\r"))
+
+        wait_until(is_open)
+        assert told.endswith(command)
+        assert bus.note == ""
+        bus.close()
+
+
+def test_an_interface_that_cannot_only_listen_says_so() -> None:
+    assert "acknowledges" in PythonCanBus("gs_usb", "0", listen_only=True).note
+    assert PythonCanBus("gs_usb", "0").note == ""
+    assert PythonCanBus("udp_multicast", "239.74.163.2", listen_only=True).note == ""

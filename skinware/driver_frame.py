@@ -11,6 +11,7 @@ from skinware.freshness import age_limit_ns, is_fresh
 from skinware.memory.ring import Frame
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.samples import SAMPLE, SAMPLES
 from skinware.structure import Structure
 
 
@@ -70,6 +71,15 @@ class DriverFrame(Frame):
         0: not known, or the driver does not tell; 0xFFFF: not known because of the bus' filters.
         """
         return self._told("bus_load", (len(self.structure.buses),), np.uint16)
+
+    @property
+    def bus_samples(self) -> npt.NDArray[np.void]:
+        """(n_buses, SAMPLES) of :data:`skinware.samples.SAMPLE`: frames that were not used, the newest few of a kind.
+
+        Empty places where there are none, or the driver does not tell.
+        """
+        shape = (len(self.structure.buses), SAMPLES)
+        return self._told("bus_samples", shape, SAMPLE).view(SAMPLE).reshape(shape)
 
     @property
     def patch_interval_counts(self) -> npt.NDArray[np.uint64]:

@@ -1,7 +1,8 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
 Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
-``bus_since_ns``, ``bus_load``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``, ``patch_age_counts``.
+``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``,
+``patch_age_counts``.
 Static columns: the structure's tables, ``driver_type`` and the names of the counters.
 """
 
@@ -18,6 +19,7 @@ from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import _segment
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
+from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import DEFAULT_SLOTS, Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
@@ -154,6 +156,7 @@ class DriverWriter:
             "bus_reason": ("u1", len(structure.buses)),
             "bus_since_ns": ("<i8", len(structure.buses)),
             "bus_load": ("<u2", len(structure.buses)),
+            "bus_samples": (f"V{SAMPLE.itemsize}", len(structure.buses) * SAMPLES),
             "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
             "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
             "patch_interval_counts": ("<u8", structure.n_patches * BUCKETS),
@@ -222,6 +225,7 @@ class DriverReader(ServiceReader[DriverFrame]):
                 "bus_state": len(structure.buses),
             }
             optional = dict.fromkeys(("bus_reason", "bus_since_ns", "bus_load"), len(structure.buses))
+            optional["bus_samples"] = len(structure.buses) * SAMPLES
             optional |= dict.fromkeys(("patch_interval_counts", "patch_age_counts"), structure.n_patches * BUCKETS)
             expected |= {name: count for name, count in optional.items() if name in columns}
             for name, count in expected.items():

@@ -87,12 +87,24 @@ MAGNETIC_FIELD_X = SensorType("magnetic_field_x", 12, "T")
 MAGNETIC_FIELD_Y = SensorType("magnetic_field_y", 13, "T")
 MAGNETIC_FIELD_Z = SensorType("magnetic_field_z", 14, "T")
 
+FORCE_X = SensorType("force_x", 15, "N")
+FORCE_Y = SensorType("force_y", 16, "N")
+FORCE_Z = SensorType("force_z", 17, "N")
+"""Along the normal of the skin, for devices that tell a force and not a pressure; ``force_x`` and ``_y`` lie in it."""
+
 ACCELERATION = (ACCELERATION_X, ACCELERATION_Y, ACCELERATION_Z)
 ANGULAR_RATE = (ANGULAR_RATE_X, ANGULAR_RATE_Y, ANGULAR_RATE_Z)
 MAGNETIC_FIELD = (MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z)
+FORCE = (FORCE_X, FORCE_Y, FORCE_Z)
 
 CATALOGUE: dict[str, SensorType] = {
     t.name: t
-    for t in (PRESSURE, SHEAR_X, SHEAR_Y, PROXIMITY, TEMPERATURE, *ACCELERATION, *ANGULAR_RATE, *MAGNETIC_FIELD)
+    for t in (
+        *(PRESSURE, SHEAR_X, SHEAR_Y, PROXIMITY, TEMPERATURE),
+        *ACCELERATION,
+        *ANGULAR_RATE,
+        *MAGNETIC_FIELD,
+        *FORCE,
+    )
 }
 """The types of vendor 0, by name."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.samples import Samples
 
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h).
@@ -172,6 +173,7 @@ class Bus(ABC):
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
         counters: what happened on it so far.
+        samples: some of the frames that could not be used.
         narrows: frames that nobody wants can be left out, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
@@ -207,6 +209,7 @@ class Bus(ABC):
         self.payload_size = payload_size
         self.listen_only = listen_only
         self.counters: BusCounters = BusCounters()
+        self.samples: Samples = Samples()
         self.narrows = False
         self.bit_rate = 0
         self.wire_bits: float = 0.0

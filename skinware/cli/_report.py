@@ -23,6 +23,7 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.samples import sample_report
 from skinware.service import ServiceReader
 from skinware.status import load_report
 
@@ -181,6 +182,7 @@ def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, An
             "reason": bus_reason_name(int(frame.bus_reason[bus])),
             "state_age_s": round((time_ns - since_ns) / NS_PER_S, 3) if since_ns else None,
             **load_report(int(frame.bus_load[bus])),
+            "samples": sample_report(frame.bus_samples[bus]),
         }
         entries.append(_with_counters(own, counters))
     return entries

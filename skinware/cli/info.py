@@ -95,6 +95,7 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in told.values())),
             {"frames", "lost"},
         ),
+        *_sample_lines(driver["buses"]),
         "",
         *_counter_table(
             driver["patch_list"],
@@ -201,7 +202,7 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
-_OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown"}
+_OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown", "samples"}
 _OWN_KEYS |= {"bus", "age_ms", "modules", "sensors", "fresh"}
 _OWN_KEYS |= set(_OF_A_PATCH.values())
 
@@ -220,6 +221,18 @@ def _counter_table(
         [[*cells(row), *(count_text(row.get(name)) for name in shown)] for row in rows],
         left=min(len(titles), 3),
     )
+
+
+def _sample_lines(buses: list[dict[str, Any]]) -> list[str]:
+    """A few of the frames that were not used: identifier, length, first bytes."""
+    from skinware.samples import sample_text
+
+    rows = [
+        [bus["name"], sample["why"].replace("_", " "), sample_text(sample)]
+        for bus in buses
+        for sample in bus.get("samples", ())
+    ]
+    return ["", *table(("bus", "not used", "for example"), rows, left=3)] if rows else []
 
 
 def _reader_lines(entry: dict[str, Any]) -> list[str]:

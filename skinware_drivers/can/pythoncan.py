@@ -13,6 +13,7 @@ import can
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
+from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 
@@ -129,6 +130,7 @@ class PythonCanBus(Bus):
             time_ns, identifier, payload = self._queue.popleft()
             if len(payload) > batch.payload_size:
                 self.counters.refused += 1
+                self.samples.note(Unused.REFUSED, identifier, payload)
                 continue
             batch.append(ordinal, time_ns, identifier, payload)
             count += 1
@@ -186,6 +188,7 @@ class PythonCanBus(Bus):
             self.counters.errors += 1
         elif message.is_remote_frame:
             self.counters.refused += 1
+            self.samples.note(Unused.REFUSED, message.arbitration_id, b"")
         elif len(self._queue) >= _QUEUE_FRAMES:
             self.counters.lost += 1
         else:

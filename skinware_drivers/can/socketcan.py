@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
+from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
@@ -283,6 +284,7 @@ class SocketCanBus(Bus):
         other &= ~is_error
         self.counters.errors += int(np.count_nonzero(is_error))
         self.counters.refused += int(np.count_nonzero(other))
+        self.samples.take(Unused.REFUSED, wire[other])
         good = np.flatnonzero(~(is_error | other))
         self._take_errors(np.flatnonzero(is_error), good, identifier, wire["payload"])
         good += first

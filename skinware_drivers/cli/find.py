@@ -119,7 +119,7 @@ def _chosen(
     """CAN interfaces, serial ports, and names of other buses; all of the machine if none is named."""
     from skinware.errors import BusNotAvailable
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.finding.ports import serial_ports
+    from skinware_drivers.finding.ports import pseudo_terminal, serial_ports
     from skinware_drivers.finding.running import same_bus
 
     if not buses:
@@ -129,6 +129,7 @@ def _chosen(
         interface, channel, _ = parse_bus_name(name)
         if interface in ("serial", "pty"):
             port = next((port for port in serial_ports() if same_bus(port.path, channel or name)), None)
+            port = port or pseudo_terminal(channel)
             if port is None:
                 raise BusNotAvailable(f"there is no serial port {name}; skin-find shows those that are there")
             chosen[1].append(port)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.decoding.device_stamps import DeviceStamps
@@ -29,6 +30,7 @@ from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
 from skinware_drivers.numbering import SequenceNumber
+from skinware_drivers.samples import Samples
 
 _NO_KIND = 255
 _EARLIEST_NS = 1
@@ -73,6 +75,9 @@ class Decoder:
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 
+    Attributes:
+        samples: for each bus, some of the frames that could not be used.
+
     Raises:
         ConfigurationError: the buses have more kinds of frame than can be told apart.
     """
@@ -83,6 +88,7 @@ class Decoder:
         self.layouts: list[Layout | None] = list(layouts)
         self.tables = tables
         self.state: SkinState = SkinState(tables)
+        self.samples: list[Samples] = [Samples() for _ in layouts]
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
@@ -155,7 +161,7 @@ class Decoder:
         payload = wire["payload"]
         slots = self._addresses.slots(bus, wire["identifier"])
         entry = self._addresses.entry[slots]
-        kind, wrong = self._tell_kinds(slots, entry, wire["length"], payload, bus)
+        kind, wrong = self._tell_kinds(slots, entry, wire, bus)
         for number, compiled in enumerate(self._kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
@@ -201,6 +207,7 @@ class Decoder:
         """Count frames of a batch as unknown identifiers."""
         bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]
         self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
+        self._keep_samples(Unused.UNKNOWN, batch.bus, batch.wire, rows)
         standard = identifier < STANDARD_IDENTIFIERS
         np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
@@ -210,6 +217,14 @@ class Decoder:
         if early.any():
             time_ns[early] = _EARLIEST_NS
             self.state.bus_counters[:, 3] += np.bincount(bus[early], minlength=len(self.state.bus_counters))
+
+    def _keep_samples(
+        self, why: Unused, bus: npt.NDArray[np.uint16], wire: npt.NDArray[np.void], rows: Indices
+    ) -> None:
+        if len(rows):
+            for ordinal, samples in enumerate(self.samples):
+                if samples.wants(why):
+                    samples.take(why, wire[rows[bus[rows] == ordinal]])
 
     # -- compiling ----------------------------------------------------------------------------------------------
 
@@ -275,13 +290,13 @@ class Decoder:
     # -- decoding -----------------------------------------------------------------------------------------------
 
     def _tell_kinds(
-        self, slots: Indices, entry: Indices, length: Bytes, payload: Bytes, bus: npt.NDArray[np.uint16]
+        self, slots: Indices, entry: Indices, wire: npt.NDArray[np.void], bus: npt.NDArray[np.uint16]
     ) -> tuple[Bytes, Indices]:
         """(n,) kind of each frame, 255 = none; and the rows that are ours and of no kind or of a wrong length.
 
         Those are counted here.
         """
-        n_buses = len(self.state.bus_counters)
+        n_buses, length, payload = len(self.state.bus_counters), wire["length"], wire["payload"]
         ours = entry < self._n_modules + self._n_patches
         if self._header is not None:
             at, table = self._header
@@ -300,6 +315,8 @@ class Decoder:
             is_length = ~self._length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
+            self._keep_samples(Unused.BAD_LENGTH, bus, wire, rows[is_length])
+            self._keep_samples(Unused.BAD_CONTENT, bus, wire, rows[~is_length])
         return kind, rows
 
     def _name_known_modules(self, kind: Bytes, entry: Indices, payload: Bytes, length: Bytes) -> Flags:

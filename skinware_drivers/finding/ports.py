@@ -82,7 +82,7 @@ class SerialPort:
     def name(self) -> str:
         """What it is, in words."""
         if self.usb is None:
-            return "built-in port"
+            return "pseudo terminal" if Path(self.path).parent.name == "pts" else "built-in port"
         return " ".join(part for part in (self.usb.manufacturer, self.usb.product) if part) or "USB serial device"
 
     def advice(self) -> list[str]:
@@ -132,6 +132,17 @@ def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
         _port(path, devices[name], links.get(path, ()), users.get(path, ()), all_seen)
         for name, path in sorted(present.items(), key=lambda item: _natural(item[0]))
     ]
+
+
+def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | None:
+    """The port behind a path that is no hardware, as ``skin-emulate --bus pty:port`` makes it; None if it is none."""
+    machine = machine or Machine()
+    real = Path(path).resolve()
+    if real.parent != machine.dev / "pts" or not real.is_char_device():
+        return None
+    users, all_seen = _users(machine, {real})
+    links = (path,) if path != str(real) else ()
+    return _port(real, machine.sys / "devices/virtual", links, users.get(real, ()), all_seen)
 
 
 def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, ...], all_seen: bool) -> SerialPort:

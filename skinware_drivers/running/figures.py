@@ -8,6 +8,7 @@ from typing import Any
 from skinware.driver_service import DriverWriter
 from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
+from skinware.samples import sample_report
 from skinware.status import PatchState, load_report
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
@@ -56,7 +57,8 @@ def _bus(line: BusLine) -> dict[str, Any]:
     state_age_s = round((now_ns() - line.since_ns) / 1e9, 3)
     reason = line.reason.name.lower() if line.reason else None
     state = {"name": line.name, "state": line.state.name.lower(), "reason": reason, "state_age_s": state_age_s}
-    return {**state, **load_report(line.limits.permille)}
+    samples = sample_report(line.bus.samples.rows)
+    return {**state, **load_report(line.limits.permille), "samples": samples}
 
 
 def _bounds(counts: list[int]) -> dict[str, int | None]:

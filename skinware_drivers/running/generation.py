@@ -63,6 +63,7 @@ class Generation:
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patch_state.copy()
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
+        self.decoder.samples = [line.bus.samples for line in self.lines]
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
@@ -109,6 +110,7 @@ class Generation:
             self.publisher.bus_reason[line.ordinal] = line.reason
             self.publisher.bus_since_ns[line.ordinal] = line.since_ns
             self.publisher.bus_load[line.ordinal] = line.limits.permille
+            self.publisher.bus_samples[line.ordinal] = line.bus.samples.rows
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
         """Number of a patch in the structure, None if it is not in it (any more)."""

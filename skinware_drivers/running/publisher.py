@@ -11,6 +11,7 @@ import numpy.typing as npt
 from skinware.driver_service import DriverWriter
 from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import LOAD_UNKNOWN, BusState, PatchState, Status
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
@@ -102,6 +103,7 @@ class Publisher:
         self.bus_reason: npt.NDArray[np.uint8] = np.zeros(len(structure.buses), np.uint8)
         self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
         self.bus_load: npt.NDArray[np.uint16] = np.full(len(structure.buses), LOAD_UNKNOWN, np.uint16)
+        self.bus_samples: npt.NDArray[np.void] = np.zeros((len(structure.buses), SAMPLES), SAMPLE)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -181,6 +183,7 @@ class Publisher:
         columns["bus_reason"][:] = self.bus_reason
         columns["bus_since_ns"][:] = self.bus_since_ns
         columns["bus_load"][:] = self.bus_load
+        columns["bus_samples"][:] = self.bus_samples.view(columns["bus_samples"].dtype).reshape(-1)
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)

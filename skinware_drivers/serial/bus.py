@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.options import options_from_strings
@@ -199,7 +200,10 @@ class SerialBus(Bus):
         known = framer.position
         damaged = counters.checksum_errors + counters.refused
         framed = framer.feed(chunk)
-        self.counters.errors += counters.checksum_errors + counters.refused - damaged
+        damaged = counters.checksum_errors + counters.refused - damaged
+        self.counters.errors += damaged
+        if damaged and not len(framed):
+            self.samples.note(Unused.REFUSED, 0, chunk)
         self._reads.append((framer.position, time_ns))
         fitting = [frame for frame in framed if len(frame.body) <= self.payload_size]
         self.counters.refused += len(framed) - len(fitting)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ _LATE_NS = 6_000_000
 _LAGS = 3
 _ENOUGH = 0.9
 _MOST_NAMED = 3
+_FEWEST_UPDATES = 3
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class Comparison:
                 f"{because}: {len(wrong)} updates show values that were never sent together, the first for module"
                 f" {update.module}: {shown}; it is shown as fresh"
             )
+        self.require_no_shift()
         bad = sorted({int(s) for u in wrong for s in self._wrong_sensors(u)})
         reasons = [f"{sensor_name(self.structure, sensor)}: {self._explain(sensor)}" for sensor in bad[:_MOST_NAMED]]
         more = f"\n... and {len(bad) - _MOST_NAMED} more" if len(bad) > _MOST_NAMED else ""
@@ -103,6 +105,44 @@ class Comparison:
             + "\n".join(reasons)
             + more
         )
+
+    def require_no_shift(self) -> None:
+        """No module shows what another one felt; a defect names all that do at once."""
+        whose = {module: other for module in range(len(self._sensors)) if (other := self._whose(module)) is not None}
+        for step in sorted({other - module for module, other in whose.items()}, key=abs):
+            modules = [module for module, other in whose.items() if other - module == step]
+            others = [module + step for module in modules]
+            defect(
+                f"{self._in_words(modules)} received what {self._in_words(others)} sent: the keys are shifted, or the"
+                " modules are in another order; look at `patch` and `module` of the frames (`Bits`), and at the keys of"
+                " patches and modules"
+            )
+
+    def _whose(self, module: int) -> int | None:
+        """The other module whose values a module shows, if nearly all of its updates do."""
+        frames = [update.frame for update in self.updates if update.module == module]
+        if len(frames) < _FEWEST_UPDATES or self.bursts_shown(module):
+            return None
+        sensors = self._sensors[module]
+        shown = np.array([_as_numbers(self.rig.record.frames[frame].values[sensors]) for frame in frames])
+        for other in sorted(range(len(self._sensors)), key=lambda other: abs(other - module)):
+            if other == module or len(self._sensors[other]) != len(sensors):
+                continue
+            device = self._device[other]
+            felt = self._felt[device][:, self._sensors[other] - device * self.rig.truth.n_values]
+            newest = np.array([self._newest_burst(device, frame) for frame in frames])
+            rows = np.maximum(newest[:, None] - np.arange(_LAGS), 0)
+            if (felt[rows] == shown[:, None]).all(axis=2).any(axis=1).mean() >= _ENOUGH:
+                return other
+        return None
+
+    def _in_words(self, modules: Sequence[int]) -> str:
+        patches = self.structure.module_patch[[modules[0], modules[-1]]]
+        first, last = (bytes(name).decode() for name in self.structure.patch_name[patches])
+        if len(modules) == 1:
+            return f"module {modules[0]} ({first!r})"
+        names = f"{first!r}" if first == last else f"{first!r} to {last!r}"
+        return f"modules {modules[0]} to {modules[-1]} ({names})"
 
     def require_complete(self, spare: Callable[[int], bool] = lambda _time_ns: False, because: str = "") -> None:
         """Every burst was shown, from the first one shown on, but for those around a moment that is to be spared.

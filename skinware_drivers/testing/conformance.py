@@ -30,7 +30,7 @@ from skinware_drivers.testing.value_tests import ValueTests
 
 
 @pytest.mark.usefixtures("namespace")
-class DriverConformance(LifeTests, ValueTests, FaultTests, SilenceTests):
+class DriverConformance(SilenceTests, FaultTests, LifeTests, ValueTests):  # pytest begins with the last
     """Tests for a driver. Subclass it, say which driver and which emulator, and nothing else.
 
     Attributes:

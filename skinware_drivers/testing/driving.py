@@ -17,10 +17,12 @@ from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.runner import PublishMode, Runner
 from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.waiting import SLOWER
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
-_LONGEST_S = 60.0
+_LONGEST_S = 15.0 * SLOWER
+"""For a driver to begin, and to end: a wrong one is to be told soon."""
 
 
 class Driving:

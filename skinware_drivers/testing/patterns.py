@@ -8,14 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.testing.wire import Pattern
+from skinware_drivers.virtual.emulator import each_value
 
 Values = npt.NDArray[np.int64]
 
 
 def limits(emulator: Any, n_values: int) -> tuple[Values, Values]:
     """Least and greatest value that each sensor of a device can send."""
-    lowest, highest = getattr(emulator, "lowest", 0), emulator.full_scale
-    return np.broadcast_to(np.int64(lowest), n_values), np.broadcast_to(np.int64(highest), n_values)
+    lowest = each_value("lowest", getattr(emulator, "lowest", 0), n_values)
+    return lowest, each_value("full_scale", emulator.full_scale, n_values)
 
 
 def lively(emulator: Any) -> Pattern:
@@ -39,17 +40,19 @@ def extreme(emulator: Any) -> Pattern:
         moments = (
             lowest,
             highest,
-            lowest | (highest & 0x5555_5555) if (lowest == 0).all() else np.minimum(0x55, highest),
-            lowest | (highest & 0xAAAA_AAAA) if (lowest == 0).all() else np.maximum(-0x56, lowest),
+            lowest | (highest & 0x5555_5555) if (lowest == 0).all() else 0x55,
+            lowest | (highest & 0xAAAA_AAAA) if (lowest == 0).all() else -0x56,
             np.where(odd, lowest, highest),
             np.where(odd, highest, lowest),
             middle,
             middle - 1,
-            np.clip(-1, lowest, highest),
-            np.clip(1, lowest, highest),
+            -1,
+            1,
         )
         which, is_between = divmod(cycle, 2)
-        return between(number, cycle, n_values) if is_between else np.array(moments[which % len(moments)])
+        if is_between:
+            return between(number, cycle, n_values)
+        return np.clip(moments[which % len(moments)], lowest, highest)
 
     return feel
 

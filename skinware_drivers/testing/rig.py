@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_service import DriverFrame, DriverReader
-from skinware.errors import ServiceTimeout, StructureChanged
+from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.samples import sample_report, sample_text
 from skinware.status import BusState, PatchState, Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
@@ -51,7 +52,12 @@ class Case:
 
     def adapter(self) -> AnyAdapter:
         """The driver's object for one bus."""
-        return self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
+        adapter = self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
+        try:
+            adapter.check()
+        except ConfigurationError as error:
+            defect(str(error))
+        return adapter
 
     def options(self, **more: Any) -> Any:
         """Options of the devices; of ``more``, those that they have."""
@@ -265,13 +271,17 @@ class Running(Rig):
             raise
 
     def _explain_why_not_fresh(self, within_s: float) -> None:
+        from skinware_drivers.testing.comparison import Comparison  # which looks at rigs
+
         within = f"after {within_s:g} s of emulated data"
         if not self.record.frames:
             if self.wire.frames:
                 defect(f"nothing was published {within}, though the devices sent {self.wire.frames} frames")
             defect(f"nothing was published {within}: the devices sent no frame; the driver: {self.sent_in_words()}")
         frame = self.record.frames[-1]
-        if not self.truth.bursts:
+        if self.truth.bursts:
+            Comparison(self).require_no_shift()
+        else:
             defect(f"the devices sent no data {within}: did `start` tell them to? It sent: {self.sent_in_words()}")
         missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
         counters = {k: v for k, v in self.counters().items() if v and k in ("unknown", "bad_length", "bad_content")}
@@ -282,7 +292,7 @@ class Running(Rig):
         defect(
             f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}. No frame of the"
             " layout writes them: is a frame, a module or a channel missing, or are two channels `to` one?"
-            f" Frames that the layout did not take: {counters or 'none'}"
+            f" Frames that the layout did not take: {counters or 'none'}{self.samples_in_words()}"
         )
 
     def counters(self) -> dict[str, int]:
@@ -297,9 +307,18 @@ class Running(Rig):
                     counters[name] = counters.get(name, 0) + count
         return counters
 
+    def samples_in_words(self) -> str:
+        """Some of the frames that were not used: identifier, length, first bytes."""
+        told = [
+            f"{sample['why']} {sample_text(sample)}"
+            for line in (self.runner.lines if self.runner is not None else ())
+            for sample in sample_report(line.bus.samples.rows)
+        ]
+        return f"; for example {', '.join(told)}" if told else ""
+
     def sent_in_words(self) -> str:
         """The first and the last frames that the driver sent."""
-        sent = [f"{identifier:X} [{payload.hex(' ')}]" for identifier, payload in self.wire.sent]
+        sent = [f"{identifier_text(identifier)} [{payload.hex(' ')}]" for identifier, payload in self.wire.sent]
         return ", ".join(sent if len(sent) <= 6 else [*sent[:3], "...", *sent[-3:]]) or "nothing"
 
     def first_patch_of(self, number: int) -> int:

@@ -23,6 +23,37 @@ _NOTHING_OF_THESE = ("lost", "errors", "refused", "unknown", "bad_length", "bad_
 class ValueTests(Suite):
     """Values of good data."""
 
+    def test_every_value_is_right_and_in_order(self) -> None:
+        """Each sensor shows what it felt, every burst is shown once, and nothing is counted as wrong."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                await rig.sleep(_BURSTS * rig.adapter.period_s)
+                comparison = Comparison(rig)
+                comparison.require_right()
+                comparison.require_complete()
+                wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
+                require(
+                    not wrong,
+                    f"of good data, something was counted as wrong: {wrong}{rig.samples_in_words()}: does the layout"
+                    " know every frame and every length that the devices send?",
+                )
+                self.require_all_counted(rig)
+
+        play(scenario)
+
+    def test_extreme_values(self) -> None:
+        """Least and greatest values, alternating bits, the sign bit alone: also these are shown as they were sent."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock, pattern=extreme) as rig:
+                await rig.until_fresh()
+                await rig.sleep(24 * rig.adapter.period_s)
+                Comparison(rig).require_right()
+
+        play(scenario)
+
     def test_nothing_is_valid_before_the_first_data(self) -> None:
         """As long as no data came, every sensor is NEVER_SEEN; and what has come makes only itself valid."""
 
@@ -65,37 +96,6 @@ class ValueTests(Suite):
             return bool(bursts)
 
         return is_data
-
-    def test_every_value_is_right_and_in_order(self) -> None:
-        """Each sensor shows what it felt, every burst is shown once, and nothing is counted as wrong."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock) as rig:
-                await rig.until_fresh()
-                await rig.sleep(_BURSTS * rig.adapter.period_s)
-                comparison = Comparison(rig)
-                comparison.require_right()
-                comparison.require_complete()
-                wrong = {name: n for name, n in rig.counters().items() if n and name in _NOTHING_OF_THESE}
-                require(
-                    not wrong,
-                    f"of good data, something was counted as wrong: {wrong}: does the layout know every frame and every"
-                    " length that the devices send?",
-                )
-                self.require_all_counted(rig)
-
-        play(scenario)
-
-    def test_extreme_values(self) -> None:
-        """Least and greatest values, alternating bits, the sign bit alone: also these are shown as they were sent."""
-
-        async def scenario(clock: HandClock) -> None:
-            async with self.running(clock, pattern=extreme) as rig:
-                await rig.until_fresh()
-                await rig.sleep(24 * rig.adapter.period_s)
-                Comparison(rig).require_right()
-
-        play(scenario)
 
     def test_the_rate_is_the_one_it_tells(self) -> None:
         """Updates come every ``period_s``: readers, staleness and pairing depend on it."""

@@ -6,26 +6,49 @@
     assert shown.values[:4].tolist() == [1, 2, 3, 4]
     assert shown.never_seen.sum() == 12
 
-Bytes that a program computed, say the driver's emulator, prove only that two programs agree.
+An identifier of 29 bits is written as everywhere: ``EXTENDED_FLAG | 0x18DA00F1``.
+
+A test fails if something of what it decodes is not shown, and says what and why. Where that is what is tested, say
+``strict=False`` and look at ``problems``. Bytes that a program computed, say the driver's emulator, prove only that two
+programs agree.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import BusError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.adapter import Adapter, AnyAdapter
+from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.description import assemble
+from skinware_drivers.decoding.skin_state import BUS_COUNTERS
+from skinware_drivers.description import Patch, assemble
+from skinware_drivers.link import Link
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.testing.clock import HandClock, run_in_its_time
+from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.wire import make_bus
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 
 _MS = 1_000_000
+_WHY = dict(
+    zip(
+        BUS_COUNTERS,
+        (
+            "no frame of the layout has this identifier, or it names no patch or module",
+            "the layout has no frame of this length",
+            "its identifier and length are known, its content is that of no frame of the layout",
+        ),
+        strict=True,
+    )
+)
 
 
 class Shown(NamedTuple):
@@ -38,6 +61,8 @@ class Shown(NamedTuple):
     """(n_sensors,) bits of :class:`skinware.status.Status`."""
     unknown: int
     """Frames that belong to no module."""
+    problems: tuple[str, ...]
+    """What was not shown, and why, a line each."""
 
     @property
     def never_seen(self) -> npt.NDArray[np.bool_]:
@@ -46,32 +71,143 @@ class Shown(NamedTuple):
         return never_seen
 
 
-def decode_frames(adapter: AnyAdapter, frames: Sequence[tuple[int, str | bytes]]) -> Shown:
+def decode_frames(
+    adapter: AnyAdapter,
+    frames: Sequence[tuple[int, str | bytes]],
+    *,
+    strict: bool = True,
+    devices: EmulatedHardware | None = None,
+) -> Shown:
     """What a driver makes of frames that arrive a millisecond apart.
 
     Args:
-        adapter: the driver. Its ``layout`` and ``patches`` are used, nothing is sent.
+        adapter: the driver. Its ``layout`` is used, and its ``patches`` or what its ``describe`` finds.
         frames: identifier and payload (bytes, or hexadecimal digits) of each.
+        strict: fail the test if one of them is not shown.
+        devices: emulated ones, for a ``describe`` that asks.
     """
-    decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
-    batch = FrameBatch(len(frames), adapter.payload_size, decoder.headroom)
-    for number, (identifier, payload) in enumerate(frames):
-        batch.append(0, (number + 1) * _MS, identifier, _bytes(payload))
-    updates, foreign = decoder.decode(batch)
-    decoder.state.show(updates)
-    state = decoder.state
-    return Shown(decoder.tables.structure, state.values.copy(), state.status.copy(), len(foreign))
+    return _decode(adapter, frames, [], strict, devices)
 
 
-def decode_stream(adapter: SerialAdapter[Any], stream: str | bytes) -> Shown:
+def decode_stream(
+    adapter: SerialAdapter[Any],
+    stream: str | bytes,
+    *,
+    strict: bool = True,
+    devices: EmulatedHardware | None = None,
+) -> Shown:
     """What a driver makes of bytes on a serial line.
 
     Args:
-        adapter: the driver. Its ``framing``, ``layout`` and ``patches`` are used, nothing is sent.
+        adapter: the driver. Its ``framing`` and ``layout`` are used, and its ``patches``, or what ``describe`` finds.
         stream: the bytes, or their hexadecimal digits.
+        strict: fail the test if some of them are not shown.
+        devices: emulated ones, for a ``describe`` that asks.
     """
-    framed = adapter.framing.framer().feed(_bytes(stream))
-    return decode_frames(adapter, [(frame.identifier, frame.body) for frame in framed])
+    framer = adapter.framing.framer()
+    framed = framer.feed(_bytes(stream))
+    counters, pending = framer.counters, framer.pending
+    problems = [
+        text
+        for count, text in (
+            (counters.checksum_errors, f"{counters.checksum_errors} x the checksum is wrong"),
+            (counters.refused, f"{counters.refused} x what begins like a packet has a form that cannot be"),
+            (counters.skipped_bytes, f"{counters.skipped_bytes} bytes belong to no good packet"),
+            (pending, f"the last {pending} bytes are no whole packet: more would have to follow"),
+        )
+        if count
+    ]
+    return _decode(adapter, [(frame.identifier, frame.body) for frame in framed], problems, strict, devices)
+
+
+def _decode(
+    adapter: AnyAdapter,
+    frames: Sequence[tuple[int, str | bytes]],
+    problems: list[str],
+    strict: bool,
+    devices: EmulatedHardware | None,
+) -> Shown:
+    patches = _patches(adapter, devices)
+    decoder = Decoder([adapter.layout], assemble([("bus", patches)], adapter.types, adapter.dtype))
+    state, unknown = decoder.state, 0
+    batch = FrameBatch(1, adapter.payload_size, decoder.headroom)
+    for number, (identifier, digits) in enumerate(frames):
+        payload = _bytes(digits)
+        if adapter.medium == "can":
+            check_identifier(identifier)
+        name = f"frame {number}, {identifier_text(identifier)} [{len(payload)}] {payload[:8].hex(' ').upper()}"
+        if len(payload) > adapter.payload_size:
+            problems.append(f"{name}: too long, the longest of the layout has {adapter.payload_size} bytes")
+            continue
+        decoder.put_back(batch)
+        batch.append(0, (number + 1) * _MS, identifier, payload)
+        before = state.bus_counters[0].copy()
+        updates, foreign = decoder.decode(batch)
+        decoder.count_unknown(batch, foreign)
+        unknown += len(foreign)
+        state.show(updates)
+        problems += [f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(state.bus_counters[0] - before)]
+    decoder.put_back(batch)
+    orphans = int(state.patch_counters[:, 1].sum())
+    if orphans:
+        problems.append(f"{orphans} frames have no partners of their cycle")
+    if len(batch):
+        problems.append(f"{len(batch)} frames wait for the others of their cycle")
+    if strict and problems:
+        defect("not everything was shown (if that is right, say strict=False):\n" + "\n".join(problems))
+    return Shown(decoder.tables.structure, state.values.copy(), state.status.copy(), unknown, tuple(problems))
+
+
+class _Nobody:
+    """Devices that are not there."""
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        pass
+
+    def next_due_ns(self) -> int | None:
+        return None
+
+    def emit(self, now_ns: int) -> list[WireFrame]:  # noqa: ARG002
+        return []
+
+    def skip(self, now_ns: int) -> int:  # noqa: ARG002
+        return 0
+
+    def totals(self) -> dict[str, int]:
+        return {}
+
+
+def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[Patch]:
+    """The declared ones, or those that ``describe`` finds."""
+    if type(adapter).describe is Adapter.describe:
+        return adapter.patches
+    clock = HandClock()
+
+    async def describe() -> Sequence[Patch]:
+        bus = make_bus(adapter, devices or _Nobody(), clock, listen_only=False)
+        adapter.fit(bus)
+        link = Link(bus)
+
+        def hear() -> None:
+            batch = FrameBatch(4096, bus.payload_size)
+            bus.receive(batch, 0)
+            link.offer(batch, np.arange(batch.start, batch.stop))
+
+        bus.open()
+        asyncio.get_running_loop().add_reader(bus.fileno(), hear)
+        try:
+            return await adapter.describe(link)
+        except BusError as error:
+            return defect(
+                f"`describe` asks its devices, and nobody answers: give emulated ones as `devices=` ({error})"
+            )
+        finally:
+            asyncio.get_running_loop().remove_reader(bus.fileno())
+            bus.close()
+
+    patches = run_in_its_time(clock, describe)
+    require(patches, "`describe` finds no patch: if it asks its devices, give emulated ones as `devices=`")
+    return patches
 
 
 def _bytes(data: str | bytes) -> bytes:

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import time
+import warnings
 from collections.abc import Callable
 
+import numpy as np
+
 from skinware.driver_service import DriverFrame, DriverReader
+from skinware.errors import ServiceTimeout
+from skinware.samples import sample_report, sample_text
+from skinware.status import Status
 from skinware_drivers.testing.defect import defect, require
+
+SLOWER = 4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1
+"""In the CAN lab the processor is emulated."""
+PATIENCE_S = 12.0 * SLOWER
+"""How long a test of a right driver has to wait at most."""
 
 
 def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:
@@ -17,13 +29,49 @@ def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:
         time.sleep(0.005)
 
 
-def read_until(reader: DriverReader, condition: Callable[[DriverFrame], bool], frames: int = 1200) -> DriverFrame:
-    """The first frame that fulfils a condition; fails the test if none of so many does."""
-    for count, frame in enumerate(reader.in_order(timeout_s=30)):
-        if condition(frame):
-            return frame
-        require(count < frames, f"none of {frames} frames fulfils the condition {condition}")
-    return defect("the driver ended")
+def read_until(
+    reader: DriverReader,
+    condition: Callable[[DriverFrame], bool],
+    within_s: float = PATIENCE_S,
+    *,
+    frames: int | None = None,
+) -> DriverFrame:
+    """The first frame that fulfils a condition; fails the test if none does in time, and tells what was in the last.
+
+    Args:
+        reader: of the driver.
+        condition: to be fulfilled.
+        within_s: how long to wait, s.
+        frames: means nothing any more: say ``within_s``.
+    """
+    if frames is not None:
+        warnings.warn("read_until(frames=...): say how long, within_s=...", DeprecationWarning, stacklevel=2)
+    end, last, count = time.monotonic() + within_s, None, 0
+    try:
+        for frame in reader.in_order(timeout_s=within_s):
+            if condition(frame):
+                return frame
+            last, count = frame, count + 1
+            if time.monotonic() > end:
+                break
+        else:
+            return defect("the driver ended")
+    except ServiceTimeout:
+        pass
+    seen = f"; {_in_words(reader, last)}" if last is not None else ""
+    return defect(f"none of the {count} frames of {within_s:g} s fulfils the condition {condition}{seen}")
+
+
+def _in_words(reader: DriverReader, frame: DriverFrame) -> str:
+    """What is not as it should be in a frame."""
+    told = [f"of the last, {np.count_nonzero(frame.status == 0)} of {len(frame.status)} sensors are fresh"]
+    told += [f"{n} {bit.name}" for bit in Status if (n := np.count_nonzero(frame.status & np.uint8(bit)))]
+    for bus, counters in enumerate(reader.bus_counters(frame)):
+        names = ("errors", "refused", "unknown", "bad_length", "bad_content", "polls_unanswered")
+        told += [f"{name.replace('_', ' ')}: {counters[name]}" for name in names if counters.get(name)]
+        samples = [sample_text(sample) for sample in sample_report(frame.bus_samples[bus])]
+        told += [f"for example {', '.join(samples)}"] if samples else []
+    return ", ".join(told)
 
 
 __all__ = ["read_until", "wait_until"]

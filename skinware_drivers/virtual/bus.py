@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
+from skinware.samples import Unused
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, emulators_instead, load_emulator
@@ -194,7 +195,10 @@ class VirtualCanBus(Bus):
             self.counters.lost += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         frames = self.hardware.emit(now_ns)
         fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
-        self.counters.refused += len(frames) - len(fitting)
+        for frame in frames:
+            if len(frame.payload) > self.payload_size:
+                self.counters.refused += 1
+                self.samples.note(Unused.REFUSED, frame.identifier, frame.payload)
         self._pending += fitting
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:

@@ -119,7 +119,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         numbers: of the devices. To be set before ``Emulator.__init__`` where the options say which there are.
         identifiers: every one that the devices or their host can use: no foreign device does.
         period_s: time from burst to burst of a device that sends by itself; an option ``period_ms`` sets it.
-        full_scale: greatest value that a device can send.
+        full_scale: greatest value that a device can send. This, and the next three: one number, or one for each value.
         lowest: least value that it can send.
         rest: value of a sensor that nobody touches.
         swing: what a firm press adds to it.
@@ -131,10 +131,10 @@ class Emulator(Stage, HasOptions[OptionsT]):
     least_options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
     numbers: Sequence[int] = (0,)
     identifiers: Collection[int] = ()
-    full_scale: ClassVar[int]
-    lowest: ClassVar[int] = 0
-    rest: ClassVar[int] = 0
-    swing: ClassVar[int]
+    full_scale: ClassVar[int | Sequence[int]]
+    lowest: ClassVar[int | Sequence[int]] = 0
+    rest: ClassVar[int | Sequence[int]] = 0
+    swing: ClassVar[int | Sequence[int]]
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
         Stage.__init__(self, log, ("lost", "repeated", "truncated", "corrupted", "foreign"))
@@ -174,8 +174,9 @@ class Emulator(Stage, HasOptions[OptionsT]):
 
         The options ``pattern=idle`` and ``pattern=cycle`` come before this.
         """
-        felt = self.swing * self._press[device.number].strength(time_s)
-        return [self.rest + round(value) for value in felt.tolist()]
+        felt = np.rint(self._each("swing") * self._press[device.number].strength(time_s)).astype(np.int64)
+        told: list[int] = (self._each("rest") + felt).tolist()
+        return told
 
     def on_timer(self, device: Device, name: str, time_ns: int) -> None:  # noqa: ARG002
         """What a device does by itself; by default it has one timer, for its data."""
@@ -283,12 +284,19 @@ class Emulator(Stage, HasOptions[OptionsT]):
         if self._source is not None:
             return list(self._source(device.number, device.cycle))
         if self.options.pattern == "cycle":
-            return [device.cycle % (self.full_scale + 1)] * self._n_values
+            return [device.cycle % (int(self._each("full_scale").min()) + 1)] * self._n_values
+        told: list[int]
         if self.options.pattern == "idle":
-            return [self.rest] * self._n_values
+            told = self._each("rest").tolist()
+            return told
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
         felt = self.feel(device, (time_ns - from_ns) * 1e-9)
-        return [min(max(value, self.lowest), self.full_scale) for value in felt]
+        told = np.clip(felt, self._each("lowest"), self._each("full_scale")).tolist()
+        return told
+
+    def _each(self, name: str) -> npt.NDArray[np.int64]:
+        """(n_values,) of what the class says of all values at once, or of each."""
+        return each_value(name, getattr(self, name), self._n_values)
 
     def _delay(self, device: Device, time_ns: int) -> int:
         if not self.options.jitter_us:
@@ -365,5 +373,18 @@ class Emulator(Stage, HasOptions[OptionsT]):
 
 
 _FAULTS: tuple[events.FrameDamage, ...] = ("lost", "truncated", "corrupted", "repeated")
+
+
+def each_value(name: str, said: int | Sequence[int], n_values: int) -> npt.NDArray[np.int64]:
+    """(n_values,) int64: what an emulator says of its values, in one number or one by one.
+
+    Raises:
+        ConfigurationError: it says it of another number of values.
+    """
+    numbers = np.asarray(said, np.int64)
+    if numbers.shape not in ((), (n_values,)):
+        raise ConfigurationError(f"{name} has {numbers.size} numbers, `places` tells of {n_values} values")
+    return np.broadcast_to(numbers, n_values)
+
 
 __all__ = ["CanFrame", "Device", "Emulator", "EmulatorOptions", "Source", "on_a_grid"]

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from skinware import BusState, DriverReader, DriverWriter, Namespace, PatchState, Status, Structure
 from skinware.errors import ServiceError
+from skinware.samples import SAMPLE, SAMPLES
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware_drivers.testing.waiting import wait_until
 
@@ -76,6 +77,7 @@ class FakeSkin:
         self.bus_reason = np.zeros(len(self.structure.buses), np.uint8)
         self.bus_since_ns = np.zeros(len(self.structure.buses), np.int64)
         self.bus_load = np.zeros(len(self.structure.buses), np.uint16)
+        self.bus_samples = np.zeros((len(self.structure.buses), SAMPLES), SAMPLE)
         self.interval_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
         self.age_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
         self.bus_counters = np.zeros((len(self.structure.buses), len(BUS_COUNTERS)), np.uint64)
@@ -102,6 +104,7 @@ class FakeSkin:
             columns["bus_reason"][:] = self.bus_reason
             columns["bus_since_ns"][:] = self.bus_since_ns
             columns["bus_load"][:] = self.bus_load
+            columns["bus_samples"][:] = self.bus_samples.view(columns["bus_samples"].dtype).ravel()
             columns["patch_interval_counts"][:] = self.interval_counts.ravel()
             columns["patch_age_counts"][:] = self.age_counts.ravel()
             columns["bus_counters"][:] = self.bus_counters.ravel()

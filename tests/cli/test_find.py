@@ -18,6 +18,7 @@ from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
+from skinware_drivers.testing.carrying import emulated_on_a_pty
 from tests.finding.fakes import see_only
 from tests.sdk.driving import driving, emulated
 
@@ -171,11 +172,26 @@ def test_ports_that_cannot_be_asked_are_told(
     assert words in found(capsys, "/dev/ttyUSB0", "--probe", "--driver", "roboskin")
 
 
+def test_the_port_of_an_emulator_is_a_port(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """What `skin-emulate --bus pty:port` makes, named as it is named to `skin-driver`; and it can be asked."""
+    with emulated_on_a_pty("weiss_wts") as path:
+        link = tmp_path / "port"
+        link.symlink_to(path)
+        text = found(capsys, str(link))
+        (port,) = found_data(capsys, str(link), "--probe", "--driver", "weiss_wts")["ports"]
+    assert f"{path}  pseudo terminal" in text
+    assert str(link) in text
+    assert (port["path"], port["links"], port["may_open"]) == (path, [str(link)], True)
+    assert "weiss_wts" in port["probe"]["asked"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
         (["no-such-can0"], 3, "CAN"),
         (["/dev/ttyUSB7"], 3, "there is no serial port /dev/ttyUSB7"),
+        (["./port"], 3, "there is no serial port ./port"),
+        (["/dev/null"], 3, "there is no serial port /dev/null"),
         (["--driver", "robskin"], 2, "did you mean 'roboskin'"),
         (["virtual?board=7"], 2, "did you mean 'boards'"),
         (["nonsense:0"], 2, "no interface 'nonsense'"),

@@ -17,12 +17,13 @@ from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
 from skinware.realtime import now_ns
+from skinware.samples import Unused
 from skinware.service import Columns
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
-UNTOLD = {"reason": None, "state_age_s": None, "load": None, "load_unknown": "bit_rate"}
+UNTOLD: dict[str, Any] = {"reason": None, "state_age_s": None, "load": None, "load_unknown": "bit_rate", "samples": []}
 """What a driver need not tell of a bus."""
 
 
@@ -103,6 +104,26 @@ def test_why_a_bus_is_as_it_is_and_for_how_long(capsys: pytest.CaptureFixture[st
     assert re.search(r"^  bus   state  reason +for  frames", out, re.MULTILINE)
     assert re.search(r"^  can0  down   bus-off  1\d\.\d s ", out, re.MULTILINE)
     assert re.search(r"^  can1  live   99 +-  ", out, re.MULTILINE)
+
+
+def test_frames_that_were_not_used_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso", fake_structure(2, 4, buses=2)) as skin:
+        skin.publish()
+        assert told(capsys)["drivers"][0]["buses"][0]["samples"] == []
+        assert "not used" not in text(capsys)
+        skin.bus_samples[1][0] = (0x98DA00F1, 8, Unused.UNKNOWN, 0, range(1, 9))
+        skin.bus_samples[1][3] = (0x12, 64, Unused.BAD_LENGTH, 0, range(8))
+        skin.bus_samples[1][6] = (0x12, 64, 77, 0, range(8))  # of a later version
+        skin.publish()
+        none, some = told(capsys)["drivers"][0]["buses"]
+        out = text(capsys)
+    assert none["samples"] == []
+    assert some["samples"] == [
+        {"why": "unknown", "identifier": 0x18DA00F1, "extended": True, "length": 8, "data": "0102030405060708"},
+        {"why": "bad_length", "identifier": 0x12, "extended": False, "length": 64, "data": "0001020304050607"},
+    ]
+    assert re.search(r"^  can1  unknown +18DA00F1 \[8\] 01 02 03 04 05 06 07 08$", out, re.MULTILINE)
+    assert re.search(r"^  can1  bad length +012 \[64\] 00 01 02 03 04 05 06 07 \.\.\.$", out, re.MULTILINE)
 
 
 def test_how_much_of_a_bus_is_in_use_or_why_that_is_not_known(capsys: pytest.CaptureFixture[str]) -> None:

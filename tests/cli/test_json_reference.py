@@ -26,6 +26,7 @@ from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
+from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import running
@@ -140,14 +141,14 @@ def printing(capsys: pytest.CaptureFixture[str]) -> Print:
 
 def test_a_driver_and_those_that_look_at_it(printing: Print, namespace: Namespace) -> None:
     with (
-        running("skin-driver", "--bus", VIRTUAL) as driver,
+        running("skin-driver", "--bus", f"{VIRTUAL}&foreign_hz=200") as driver,
         ServiceWriter("pose", {"angle": ("f4", (2,)), "at": ([("x", "i4")], ())}, namespace=namespace) as service,
     ):
         check("`ready`", driver.wait_for("ready"))
         service.begin()
         service.commit(now_ns())
         with DriverReader("roboskin") as reader, ServiceReader[Frame]("pose") as other:
-            reader.read(timeout_s=60)
+            read_until(reader, lambda frame: bool(frame.bus_samples["why"].any()))
             other.read()
             (namespace.path / "broken.ring").write_bytes(b"x")
             (told,) = printing(info)

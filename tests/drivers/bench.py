@@ -86,7 +86,7 @@ class Case:
 
     def felt(self, number: int, cycle: int) -> list[int]:
         """What a device feels: other values for each sensor, device and cycle."""
-        modulo = self.emulator.full_scale + 1
+        modulo = int(np.max(self.emulator.full_scale)) + 1
         return [(cycle * 1117 + sensor * 2903 + number * 77) % modulo for sensor in range(self.n_values)]
 
     def expected(self, number: int, cycles: int) -> np.ndarray[Any, Any]:

@@ -61,7 +61,7 @@ def test_several_ports_feed_one_buffer_and_one_may_go_and_come_back(tmp_path: Pa
             link.unlink()
             link.symlink_to(again.path)
             with device(again, "right"):
-                frame = read_until(reader, lambda frame: fresh(frame, 0) and fresh(frame, 1), 5000)
+                frame = read_until(reader, lambda frame: fresh(frame, 0) and fresh(frame, 1))
                 assert frame.bus_state[1] == BusState.LIVE
             reader.close()
 
@@ -121,7 +121,7 @@ def test_damaged_frames_are_not_shown() -> None:
         shown = 0xAAAA  # to which the device has not counted before
         tip._flood = bytes(damaged) + data_frame(shown) + bytes(damaged)
         with DriverReader("fingertip") as reader:
-            read_until(reader, lambda frame: frame.values[0] == shown, 20000)
+            read_until(reader, lambda frame: frame.values[0] == shown)
             for _, frame in zip(range(200), reader.in_order(timeout_s=30), strict=False):
                 assert (frame.values == shown).all()
         assert runner.lines[0].bus.counters.errors > 200

@@ -44,7 +44,9 @@ def test_a_sample_of_one_sensor() -> None:
 
 def test_a_sample_with_a_wrong_sum_is_not_shown() -> None:
     """One bit is enough."""
-    assert decode_stream(one(), "AA 07 08 0A 00 01 00 00 00 01 FF FE 3E A5 03 A4").never_seen.all()
+    shown = decode_stream(one(), "AA 07 08 0A 00 01 00 00 00 01 FF FE 3E A5 03 A4", strict=False)
+    assert shown.never_seen.all()
+    assert shown.problems[0] == "1 x the checksum is wrong"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,110 @@
+"""What literal bytes become, and that nothing of them is passed over in silence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from skinware.errors import ConfigurationError
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Frame, Layout, Link, Match, Module, NoOptions, Patch, Values, taxels
+from skinware_drivers.serial import SUM8, Packet, SerialAdapter
+from skinware_drivers.testing.vectors import Shown, decode_frames, decode_stream
+from skinware_drivers.virtual.emulator import EmulatorOptions
+from tests.testing.fingertips import EmulatedFingertips, Fingertips
+
+PROXIMAL, DISTAL = (0x101, "00 0001 0002 0003"), (0x101, "01 0004 0005 0006")
+
+
+class Declared(Fingertips):
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        return self.patches[:1]
+
+
+class AsksFirst(Fingertips):
+    """Its patches are what its devices say."""
+
+    patches = ()
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        await link.request(0x82, b"\2", Match(0x182), timeout_s=0.1)
+        return [Patch("finger 2", [Module(taxels(6))], key=2)]
+
+
+class FindsNone(Fingertips):
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        return ()
+
+
+class Strip(SerialAdapter[NoOptions]):
+    framing = Packet(sync=(0xF0,), length=4, checksum=SUM8)
+    types = (PRESSURE.measured(unit="counts"),)
+    patches = (Patch("strip", [Module(taxels(2))]),)
+    layout = Layout([Frame("all", length=[2], values=Values(0, "u1", 2))])
+
+
+def decode(*frames: tuple[int, str], **more: bool) -> Shown:
+    return decode_frames(Declared(NoOptions()), frames, **more)  # type: ignore[arg-type]
+
+
+def stream(digits: str, **more: bool) -> Shown:
+    return decode_stream(Strip(NoOptions()), digits, **more)  # type: ignore[arg-type]
+
+
+def test_what_is_whole_is_shown() -> None:
+    shown = decode(PROXIMAL, DISTAL)
+    assert shown.values.tolist() == [1, 2, 3, 4, 5, 6]
+    assert shown.problems == ()
+    assert stream("F0 01 02 F3 F0 03 04 F7").values.tolist() == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("decoding", "words"),
+    [
+        (
+            lambda **m: decode(PROXIMAL, DISTAL, (0x133, "01"), **m),
+            r"frame 2, 133 \[1\] 01: no frame of the layout",
+        ),
+        (lambda **m: decode((0x102, PROXIMAL[1]), **m), r"frame 0, 102 \[7\].*: no frame .* names no patch"),
+        (
+            lambda **m: decode((0x101, "00 01"), **m),
+            r"frame 0, 101 \[2\] 00 01: the layout has no frame of this le",
+        ),
+        (lambda **m: decode((0x101, "07" * 7), **m), r"frame 0, .*its content is that of no frame of the"),
+        (
+            lambda **m: decode((0x101, "07" * 9), **m),
+            r"frame 0, .*too long, the longest of the layout has 8 bytes",
+        ),
+        (lambda **m: decode(PROXIMAL, **m), r"1 frames wait for the others of their cycle"),
+        (lambda **m: decode(DISTAL, PROXIMAL, DISTAL, **m), r"1 frames have no partners of their cycle"),
+        (
+            lambda **m: stream("F0 01 02 F4", **m),
+            r"1 x the checksum is wrong(?s:.*)4 bytes belong to no good packet",
+        ),
+        (lambda **m: stream("55 F0 01 02 F3", **m), r"1 bytes belong to no good packet"),
+        (lambda **m: stream("F0 01 02 F3 F0 01", **m), r"the last 2 bytes are no whole packet"),
+    ],
+)
+def test_what_is_not_shown_fails_the_test_unless_it_is_meant_to(decoding: Callable[..., Shown], words: str) -> None:
+    with pytest.raises(pytest.fail.Exception, match=words):
+        decoding()
+    assert decoding(strict=False).problems
+
+
+def test_what_describe_finds_counts() -> None:
+    assert decode(PROXIMAL, DISTAL).structure.n_patches == 1  # and not the two that are declared
+    devices = EmulatedFingertips(EmulatorOptions())
+    shown = decode_frames(AsksFirst(NoOptions()), [(0x102, PROXIMAL[1]), (0x102, DISTAL[1])], devices=devices)
+    assert shown.values.tolist() == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.parametrize("driver", [AsksFirst, FindsNone])
+def test_without_devices_that_answer_it_says_what_is_missing(driver: type[Fingertips]) -> None:
+    with pytest.raises(pytest.fail.Exception, match="give emulated ones as `devices=`"):
+        decode_frames(driver(NoOptions()), [PROXIMAL])
+
+
+def test_an_identifier_of_29_bits_without_its_flag() -> None:
+    with pytest.raises(ConfigurationError, match=r"written EXTENDED_FLAG \| 0x18DA00F1"):
+        decode((0x18DA00F1, "00"))

@@ -139,8 +139,8 @@ class RingReader(Generic[F]):
         self.segment = segment
         self.generation: int = segment.generation
         self.period_ns: int = int(segment.header["period_ns"])
-        self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
-        self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
+        self._words = segment.data.data.cast("Q")
+        self._half_words = segment.data.data.cast("I")
         self.wake_word: _futex.Word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slots = _slots(segment)
@@ -256,8 +256,8 @@ class RingWriter:
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout
         self.segment = segment
-        self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
-        self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
+        self._words = segment.data.data.cast("Q")
+        self._half_words = segment.data.data.cast("I")
         self._wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slot_words = _slot_headers(segment)
@@ -373,7 +373,7 @@ def _slots(segment: Segment) -> list[memoryview]:
     """The bytes of every slot, its header and its columns, in place."""
     layout = segment.layout
     starts = range(layout.slot_offset, layout.slot_offset + layout.slot_count * layout.slot_stride, layout.slot_stride)
-    return [memoryview(segment.data)[start : start + layout.slot_stride] for start in starts]  # type: ignore[arg-type]
+    return [segment.data.data[start : start + layout.slot_stride] for start in starts]
 
 
 def _slot_headers(segment: Segment) -> list[memoryview]:

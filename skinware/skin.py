@@ -21,7 +21,7 @@ from skinware.errors import (
     ServiceTimeout,
     StructureError,
 )
-from skinware.memory import _futex
+from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.structure import Index, Structure
@@ -30,6 +30,7 @@ log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
+_REFUSED_FOR_NS = 10 * NS_PER_S
 
 Told = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
@@ -197,6 +198,7 @@ class Skin:
         self.namespace: Namespace = Namespace.of(namespace)
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._readers: dict[str, DriverReader] = {}
+        self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
         self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
@@ -313,13 +315,20 @@ class Skin:
                 _call(self._on_structure, name, structure)
 
     def _attach(self, name: str) -> DriverReader | None:
+        inode = _segment.living_inode(self.namespace, name)
+        refused, again_ns = self._refused.get(name, (None, 0))
+        if inode is None or (inode == refused and now_ns() < again_ns):
+            return None
         try:
             reader = DriverReader(name, namespace=self.namespace)
-        except (BadServiceFile, ServiceNotFound):
-            return None  # not a driver, or just gone
+        except BadServiceFile:  # not a driver; or memory was short, so that another look is worth it
+            self._refused[name] = inode, now_ns() + _REFUSED_FOR_NS
+            return None
+        except ServiceNotFound:
+            return None  # just gone
         if reader.alive and reader.latest is not None:
             return reader
-        reader.close()
+        reader.close()  # another generation came in between
         return None
 
     @staticmethod
@@ -329,7 +338,10 @@ class Skin:
         if reader.structure_changed:
             try:
                 reader.reattach()
-            except (BadServiceFile, ServiceNotFound):
+            except ServiceNotFound:
+                return False
+            except BadServiceFile as error:
+                log.warning("driver %r left the skin: %s", reader.name, str(error))
                 return False
         return reader.alive
 

@@ -16,18 +16,21 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, ServiceTimeout, StructureChanged
+from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
 from skinware.service import ServiceReader, ServiceWriter
 from skinware.skin import Skin, Snapshot
 
 log: logging.Logger = logging.getLogger("skinware.threads")
+
+_REST_AFTER_OVERRUN_S = 0.01
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Frame)
@@ -132,7 +135,8 @@ def read(
 ) -> Worker[F]:
     """Call a function with the frames of a service.
 
-    When the service comes back with another structure, its frames of that structure follow.
+    When the service comes back with another structure, its frames of that structure follow. A frame that the writer
+    overwrites too fast for a copy is left out (``reader.statistics.overruns``).
 
     Args:
         reader: belongs to the thread from now on.
@@ -149,6 +153,8 @@ def read(
                 return
             except StructureChanged:
                 reader.reattach()
+            except Overrun:  # the reader has counted it
+                time.sleep(_REST_AFTER_OVERRUN_S)
 
     return Worker(f"reader of {reader.name}", reader, frames, function, profile)
 

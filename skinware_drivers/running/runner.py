@@ -326,8 +326,9 @@ class Runner:
 
     def _publish_when_due(self) -> None:
         self._intake.take()  # what has arrived comes first: this may be late
-        if self.generation is None:
+        if self.writer is None or self.generation is None:
             return
+        self.writer.keep_files()
         self._machine.look()
         self.generation.update_bus_states()
         self.generation.publisher.publish_if_due()

@@ -15,7 +15,7 @@ from skinware.freshness import age_limit_ns
 from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.service._tap import Tap
+from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.structure import Structure
@@ -143,7 +143,7 @@ class Skin:
             raise Closed("this skin was closed")
         if now_ns() >= self._next_look_ns or self._moved_on():
             self._discover()
-        words = [reader.word for reader in self._readers.values()]
+        words = [wake_word_of(reader) for reader in self._readers.values()]
         is_newer = self._readers and self._is_newer(known)
         snapshot = self._snapshot(align) if is_newer else None
         if align and snapshot is not None and known is not None and _same_frames(snapshot, known):

@@ -12,6 +12,7 @@ from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.freshness import age_limit_ns
+from skinware.geometry import Geometry
 from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
@@ -88,6 +89,16 @@ class Skin:
         self._next_discovery_ns = 0
         self._discover()
         return self._layout
+
+    def geometry(self, type_name: str) -> Geometry:
+        """Where every sensor of a type is, as the drivers tell, in the order of snapshots of the present layout.
+
+        Positions, normals and radii are NaN where a driver has no geometry, or none for that sensor.
+
+        Raises:
+            StructureError: no driver has such sensors; before the first ``read`` no driver is known.
+        """
+        return self._layout.geometry(type_name)
 
     def reader(self, driver: str) -> DriverReader:
         """The reader behind one driver, for its counters and losses.

@@ -12,10 +12,11 @@ from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.freshness import age_limit_ns
+from skinware.geometry import Geometry
 from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.service._tap import Tap
+from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.structure import Structure
@@ -90,6 +91,16 @@ class Skin:
         self._discover()
         return self._layout
 
+    def geometry(self, type_name: str) -> Geometry:
+        """Where every sensor of a type is, as the drivers tell, in the order of snapshots of the present layout.
+
+        Positions, normals and radii are NaN where a driver has no geometry, or none for that sensor.
+
+        Raises:
+            StructureError: no driver has such sensors; before the first ``read`` no driver is known.
+        """
+        return self._layout.geometry(type_name)
+
     def reader(self, driver: str) -> DriverReader:
         """The reader behind one driver, for its counters and losses.
 
@@ -144,7 +155,7 @@ class Skin:
             raise Closed("this skin was closed")
         if now_ns() >= self._next_look_ns or self._moved_on():
             self._discover()
-        words = [reader.word for reader in self._readers.values()]
+        words = [wake_word_of(reader) for reader in self._readers.values()]
         is_newer = self._readers and self._is_newer(known)
         snapshot = self._snapshot(align) if is_newer else None
         if align and snapshot is not None and known is not None and _same_frames(snapshot, known):

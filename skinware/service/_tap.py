@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from skinware.errors import Overrun
 from skinware.memory._futex import Word
 from skinware.memory.ring import FrameT
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader
+
+
+def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
+    """The futex that every publication wakes, and its present value; take it before looking for what is new."""
+    ring = reader._ring  # noqa: SLF001
+    return ring.wake_word, ring.wake_count
 
 
 class Tap(ServiceReader[FrameT]):
@@ -21,11 +29,6 @@ class Tap(ServiceReader[FrameT]):
     def inode(self) -> tuple[int, int]:
         """Device and number of the file that is being read."""
         return self._ring.segment.inode
-
-    @property
-    def word(self) -> tuple[Word, int]:
-        """The futex that every publication wakes, and its present value; take it before ``latest``."""
-        return self._ring.wake_word, self._ring.wake_count
 
     @property
     def period_ns(self) -> int:

@@ -149,15 +149,8 @@ class Decoder:
             whoever knows that nobody waits for them has them counted (``count_unknown``).
         """
         first, last = batch.start, batch.stop
-        wire, bus = batch.wire[first:last], batch.bus[first:last]
-        payload = wire["payload"]
-        slots = self._addresses.slots(bus, wire["identifier"])
-        entry = self._addresses.entry[slots]
-        kind, wrong = self._tell_kinds(slots, entry, wire["length"], payload, bus)
-        for number, compiled in enumerate(self._kinds):
-            if compiled.module_by_byte is not None:
-                rows = np.flatnonzero(kind == number)
-                entry[rows] = compiled.name_modules(entry[rows], payload[rows])
+        bus, payload = batch.bus[first:last], batch.wire["payload"][first:last]
+        entry, kind, wrong = self.name(batch)
         new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
         self.device_stamps.tell(kind[new], entry[new], payload[new], batch.time_ns[first:last][new])
         is_module = entry < self._n_modules
@@ -184,6 +177,23 @@ class Decoder:
         elif (newest_ns[1:] < newest_ns[:-1]).any():
             updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
+
+    def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:
+        """Tell whose the frames of a batch are, and what; count those of our modules that are wrong.
+
+        Returns:
+            (n,) module of each, ``n_modules`` or more: of none; (n,) number of its kind, 255: none; and the wrong rows.
+        """
+        wire, bus = batch.wire[batch.start : batch.stop], batch.bus[batch.start : batch.stop]
+        payload = wire["payload"]
+        slots = self._addresses.slots(bus, wire["identifier"])
+        entry = self._addresses.entry[slots]
+        kind, wrong = self._tell_kinds(slots, entry, wire["length"], payload, bus)
+        for number, compiled in enumerate(self._kinds):
+            if compiled.module_by_byte is not None:
+                rows = np.flatnonzero(kind == number)
+                entry[rows] = compiled.name_modules(entry[rows], payload[rows])
+        return entry, kind, wrong
 
     def forget(self, patch: int) -> None:
         """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""

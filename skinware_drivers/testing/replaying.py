@@ -41,8 +41,8 @@ class Recording(NamedTuple):
         tables: the skin.
         period_s: from burst to burst.
         size: frames of a burst.
-        wire: (BURSTS * size,) frames, as in a batch.
-        time_ns: (BURSTS * size,) int64.
+        wire: (bursts * size,) frames, as in a batch.
+        time_ns: (bursts * size,) int64.
     """
 
     layout: Layout
@@ -96,9 +96,9 @@ class Outcome:
 
 
 def record(
-    layout: Layout, tables: SkinTables, period_s: float, wire: npt.NDArray[Any], time_ns: Indices
+    layout: Layout, tables: SkinTables, period_s: float, wire: npt.NDArray[Any], time_ns: Indices, bursts: int = BURSTS
 ) -> Recording | None:
-    """Of the frames of a bus, those of its first patch; None if they are fewer than ``BURSTS`` bursts.
+    """Of the frames of a bus, those of its first patch; None if they are fewer than so many bursts.
 
     Args:
         layout: of the bus.
@@ -106,6 +106,7 @@ def record(
         period_s: from burst to burst.
         wire: (n,) frames in order, as in a batch.
         time_ns: (n,) int64.
+        bursts: how many of them.
     """
     # with a device's own time, it would be known when frames were sent; here they must be told apart without
     layout = Layout([replace(frame, time=None) for frame in layout.frames], layout.cycle)
@@ -114,11 +115,11 @@ def record(
     own = np.flatnonzero((entry < tables.structure.n_modules) & (kind != 255))
     own = own[tables.structure.module_patch[entry[own]] == 0]
     same = np.flatnonzero((entry[own] == entry[own[:1]]) & (kind[own] == kind[own[:1]]))
-    if len(same) < BURSTS + 1:
+    if len(same) < bursts + 1:
         return None
-    own = own[: same[BURSTS]]
-    size = len(own) // BURSTS
-    own = own[: size * BURSTS]
+    own = own[: same[bursts]]
+    size = len(own) // bursts
+    own = own[: size * bursts]
     return Recording(layout, tables, period_s, size, wire[own].copy(), time_ns[own].copy())
 
 
@@ -129,25 +130,40 @@ def try_troubles(recording: Recording, with_period: bool = True) -> Outcome:
         recording: of what.
         with_period: False: as if nobody knew how often the device sends.
     """
-    layouts, tables = [recording.layout], recording.tables
-    n_sensors = tables.structure.n_sensors
-    known = _marks(_decode(Decoder(layouts, tables), recording.wire, recording.time_ns), n_sensors)
-    periods_s = [recording.period_s] if with_period else None
     outcome = Outcome()
     step = -(-recording.size // _MOST_PLACES)
     for place in range(0, recording.size, step):
         troubles = list(_troubles_at(recording, _TROUBLE * recording.size + place, step))
-        rows, time_ns = _suffer(recording, troubles)
-        updates = _decode(Decoder(layouts, tables, periods_s), recording.wire[rows], time_ns)
-        updates = updates.take(updates.whole & ~updates.status.any(axis=1))
-        torn = ~np.isin(_marks(updates, n_sensors), known)
+        fresh, torn = find_torn(recording, *_suffer(recording, troubles), with_period=with_period)
         outcome.tried += len(troubles)
-        outcome.shown += len(updates)
+        outcome.shown += len(fresh)
         outcome.torn += int(torn.sum())
         if torn.any() and outcome.first is None:
-            span_ns = _span_ns(recording)
-            outcome.first = troubles[int((updates.oldest_ns[torn][0] - recording.time_ns[0]) // span_ns)]
+            number = (fresh.oldest_ns[torn][0] - recording.time_ns[0]) // _span_ns(recording)
+            outcome.first = troubles[int(number)]
     return outcome
+
+
+def find_torn(
+    recording: Recording, rows: Indices, time_ns: Indices, *, with_period: bool = True
+) -> tuple[Updates, npt.NDArray[np.bool_]]:
+    """What is shown as fresh when these frames arrive.
+
+    Args:
+        recording: whose.
+        rows: (n,) of it, in order of arrival.
+        time_ns: (n,) when each arrives.
+        with_period: False: as if nobody knew how often the device sends.
+
+    Returns:
+        The updates; and which of them are not of one burst, (n_updates,) bool.
+    """
+    layouts, tables, n_sensors = [recording.layout], recording.tables, recording.tables.structure.n_sensors
+    known = _marks(_decode(Decoder(layouts, tables), recording.wire, recording.time_ns), n_sensors)
+    decoder = Decoder(layouts, tables, [recording.period_s] if with_period else None)
+    updates = _decode(decoder, recording.wire[rows], time_ns)
+    fresh = updates.take(np.flatnonzero(~updates.status.any(axis=1)))
+    return fresh, ~np.isin(_marks(fresh, n_sensors), known)
 
 
 def _span_ns(recording: Recording) -> int:
@@ -203,4 +219,4 @@ def _marks(updates: Updates, n_sensors: int) -> Indices:
     return marks
 
 
-__all__ = ["BURSTS", "Outcome", "Recording", "Trouble", "record", "try_troubles"]
+__all__ = ["BURSTS", "Outcome", "Recording", "Trouble", "find_torn", "record", "try_troubles"]

@@ -32,9 +32,9 @@ class TornTests(Suite):
                 await rig.until_fresh()
                 if rig.adapter.layout.cycle is None:
                     return  # a frame is all of an update
-                heard = _Heard(rig)
+                heard = Heard(rig)
                 await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
-                recording = heard.recording(rig)
+                recording = heard.recording()
             if recording is None:
                 defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
             outcome = try_troubles(recording)
@@ -73,10 +73,15 @@ def _bursts(rig: Running) -> int:
     return max(len(bursts) for bursts in rig.truth.bursts.values())
 
 
-class _Heard:
-    """What a bus delivers from now on."""
+class Heard:
+    """What a driver's bus delivers from now on.
+
+    Args:
+        rig: the driver.
+    """
 
     def __init__(self, rig: Running) -> None:
+        self._rig = rig
         self._wire: list[npt.NDArray[np.void]] = []
         self._time_ns: list[npt.NDArray[np.int64]] = []
         receive = rig.bus.receive
@@ -90,14 +95,13 @@ class _Heard:
 
         rig.bus.receive = listen  # type: ignore[method-assign]
 
-    def recording(self, rig: Running) -> Recording | None:
-        """Some bursts of it."""
-        runner = rig.runner
+    def recording(self, bursts: int = BURSTS) -> Recording | None:
+        """So many bursts of the first patch; None if there are not so many."""
+        runner, adapter = self._rig.runner, self._rig.adapter
         if runner is None or runner.generation is None or not self._wire:
             return None
-        tables = runner.generation.tables
         wire, time_ns = np.concatenate(self._wire), np.concatenate(self._time_ns)
-        return record(rig.adapter.layout, tables, rig.adapter.period_s, wire, time_ns)
+        return record(adapter.layout, runner.generation.tables, adapter.period_s, wire, time_ns, bursts)
 
 
-__all__ = ["TornTests"]
+__all__ = ["Heard", "TornTests"]

@@ -83,7 +83,7 @@ class Device:
 
 def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
     """What is to be joined, and how many frames will never be; one frame after the other, one group after the other."""
-    soon, late = set[int](), set[int]()
+    soon, late, odd = set[int](), set[int](), set[int]()
     history: dict[tuple[int, int], tuple[int, int]] = {}  # time of the last of its kind, and its distance
     reach_ns = device.maximum_age_ns * (2 if device.order == "any" else 1)
     for frame in sent:
@@ -94,13 +94,15 @@ def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
             soon.add(frame.serial)
         if distance - usual >= usual - reach_ns:
             late.add(frame.serial)
+            if abs(distance - 2 * PERIOD_NS) >= (PERIOD_NS - reach_ns) / 2:
+                odd.add(frame.serial)
         history[frame.module, frame.place] = (frame.time_ns, distance)
     found, orphans = [], 0
     for group in range(1 if device.within == "patch" else MODULES):
         line = [frame for frame in sent if device.within == "patch" or frame.module == group]
         at, taken = 0, 0
         while at + device.members <= len(line):
-            if _is_cycle(device, line[at : at + device.members], soon, late):
+            if _is_cycle(device, line[at : at + device.members], soon, late, odd):
                 found.append([f.serial for f in sorted(line[at : at + device.members], key=lambda f: f.place)])
                 orphans += at - taken
                 at = taken = at + device.members
@@ -110,7 +112,7 @@ def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
     return sorted(found), orphans
 
 
-def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[int]) -> bool:
+def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[int], odd: set[int]) -> bool:
     places = [frame.place for frame in frames]
     if sorted(places) != list(range(device.members)) or len({frame.module for frame in frames}) > 1:
         return False
@@ -122,9 +124,10 @@ def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[
         return False
     if device.modulo > 1:
         return len({frame.cycle % device.modulo for frame in frames}) == 1
-    held_up = [frame.serial in late for frame in frames]
-    caught_up = any(frame.serial in soon for frame in frames)
-    return not caught_up and not (all(held_up) if device.order == "given" else any(held_up))
+    serials = {frame.serial for frame in frames}
+    if device.order == "given":
+        return not serials & (soon | odd) and bool(serials - late)
+    return not serials & (soon | late)
 
 
 def _waiting(device: Device, rest: Sequence[Sent]) -> int:

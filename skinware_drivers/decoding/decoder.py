@@ -9,8 +9,8 @@ Nothing on the wire raises here. What cannot be used is counted.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import repeat
 from typing import Any
 
@@ -20,46 +20,24 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
+from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.device_stamps import DeviceStamps
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
-from skinware_drivers.decoding.pairing import Pairing
-from skinware_drivers.decoding.punctuality import Punctuality
-from skinware_drivers.decoding.sequences import Sequences, read_numbers
+from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
 from skinware_drivers.numbering import SequenceNumber
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 _NO_KIND = 255
-_COUNTER_BITS = 32
-_COUNTER_MASK = (1 << _COUNTER_BITS) - 1
+_MUCH_HASTE, _NEVER_AGAIN = 200, -(1 << 62)
+"""Frames that come too soon, with no whole cycle between, before somebody is told; and afterwards."""
 
 Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class _CompiledCycle:
-    """A layout's cycle.
-
-    Attributes:
-        members: numbers of its kinds of frame, in order.
-        counters: where the number is that they share, in each; empty without one.
-        sequence: of which member the sequence numbers are compared, and where they are; None: none has one.
-        punctuality: tells cycles apart that have no counter; None: nothing does.
-        pairing: finds it.
-        assembly: reads it.
-        group_of_entry: what its frames must follow each other in.
-    """
-
-    members: list[int]
-    counters: Sequence[SequenceNumber]
-    sequence: tuple[int, SequenceNumber] | None
-    punctuality: Punctuality | None
-    pairing: Pairing
-    assembly: Assembly
-    group_of_entry: npt.NDArray[np.uint16]
 
 
 class Decoder:
@@ -115,6 +93,7 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._sequences = Sequences(structure)
+        self._haste = np.zeros(self._n_patches, np.int64)
         self.device_stamps: DeviceStamps = DeviceStamps(self._frames, structure)
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
             (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
@@ -200,8 +179,7 @@ class Decoder:
         self._sequences.forget(patch)
         self.device_stamps.forget(patch)
         for cycle in self._cycles:
-            if cycle.punctuality is not None:
-                cycle.punctuality.forget(np.flatnonzero(self._module_patch == patch))
+            cycle.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""
@@ -225,35 +203,13 @@ class Decoder:
         self._alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
         self._cycles = [
-            self._compile_cycle(layout.cycle, period_s, members, next(of_cycles))
+            CompiledCycle(layout.cycle, self._frames, members, next(of_cycles), self.tables, period_s)
             for (layout, period_s, _), members in zip(layouts, members_of, strict=True)
             if layout.cycle is not None
         ]
         self._width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
         self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
-
-    def _compile_cycle(
-        self, cycle: Cycle, period_s: float | None, members: list[int], assembly: Assembly
-    ) -> _CompiledCycle:
-        structure = self.tables.structure
-        places = np.full(256, len(members), np.uint8)
-        places[members] = np.arange(len(members))
-        n_entries = self._n_modules + self._n_patches + 1
-        if cycle.within == "patch":
-            groups = np.concatenate([structure.module_patch, np.arange(self._n_patches), [self._n_patches]])
-        else:
-            groups = np.minimum(np.arange(n_entries), 0xFFFF)
-        own = [self._frames[number].sequence for number in members]
-        sequences: Sequence[SequenceNumber | None] = cycle.counters or own
-        sequence = next(((member, each) for member, each in enumerate(sequences) if each is not None), None)
-        punctuality = None
-        if period_s is not None and not cycle.counters:
-            punctuality = Punctuality(cycle, period_s, self._n_modules)
-        pairing = Pairing(cycle, places, punctuality)
-        return _CompiledCycle(
-            members, cycle.counters, sequence, punctuality, pairing, assembly, groups.astype(np.uint16)
-        )
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
@@ -327,17 +283,11 @@ class Decoder:
         return kind
 
     def _pair(
-        self, batch: FrameBatch, cycle: _CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
+        self, batch: FrameBatch, cycle: CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
     ) -> list[tuple[Updates, Indices]]:
         """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        shared = entry
-        if cycle.counters:
-            shared = entry << _COUNTER_BITS
-            for number, counter in zip(cycle.members, cycle.counters, strict=True):
-                rows = np.flatnonzero((kind == number) & is_module)
-                shared[rows] |= read_numbers(wire["payload"][rows], counter) & _COUNTER_MASK
-        pairs = cycle.pairing.find(shared, cycle.group_of_entry[entry], kind, time_ns, is_module, severed)
+        pairs = cycle.find(entry, kind, wire["payload"], time_ns, is_module, severed)
         if len(pairs.waiting):
             self._carry(batch, pairs.waiting + batch.start)
         if not len(pairs.rows):
@@ -345,10 +295,29 @@ class Decoder:
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
         self._count_patches(1, module[~whole])
         self._count_patches(2, entry[pairs.late])
+        self._tell_of_haste(entry[pairs.soon], module[whole])
         if cycle.sequence is not None:
             member, sequence = cycle.sequence
             self._compare(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
+
+    def _tell_of_haste(self, soon: Indices, whole: Indices) -> None:
+        """A patch whose frames always come too soon is not shown at all: say why, once.
+
+        Args:
+            soon: modules whose frames did.
+            whole: modules of which whole cycles came.
+        """
+        haste = self._haste
+        haste += np.bincount(self._module_patch[soon], minlength=self._n_patches)
+        haste[self._module_patch[whole]] = np.minimum(haste[self._module_patch[whole]], 0)
+        for patch in np.flatnonzero(haste > _MUCH_HASTE).tolist():
+            haste[patch] = _NEVER_AGAIN
+            log.warning(
+                "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
+                " apart and are not shown; give the driver the right period (period_ms, period_s); told once",
+                self.tables.structure.patch_name[patch].decode(),
+            )
 
     def _carry(self, batch: FrameBatch, rows: Indices) -> None:
         kept = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]

@@ -100,7 +100,7 @@ def test_the_first_driver_of_the_readme_is_one() -> None:
     names: dict[str, object] = {"__name__": "readme"}
     exec(compile(driver, "README.md", "exec"), names)
     adapter: Any = names["Fingertip"]
-    assert sum(len(module.channels) for patch in adapter.patches for module in patch.modules) == 16
+    assert sum(len(module.channels) for patch in adapter.patches for module in patch.modules) == 12
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

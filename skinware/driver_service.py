@@ -26,6 +26,7 @@ from skinware.structure import Structure
 __all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter"]
 
 KIND = "driver"
+_REQUIRED = ("values", "status", "module_time_ns", "patch_state", "bus_state")
 
 
 class DriverWriter:
@@ -59,7 +60,7 @@ class DriverWriter:
         self._names = (driver_type, tuple(bus_counters), tuple(patch_counters))
         self._service = ServiceWriter(
             name,
-            self._columns(),
+            self._frame_columns(),
             self._static(),
             namespace=namespace,
             kind=KIND,
@@ -106,6 +107,10 @@ class DriverWriter:
         """Where users' requests come in; see :class:`skinware.service.ServiceWriter`."""
         return self._service.request_server()
 
+    def keep_files(self) -> None:
+        """Make files again that somebody removed; see :class:`skinware.service.ServiceWriter`."""
+        self._service.keep_files()
+
     @property
     def closed(self) -> bool:
         """Whether ``close`` was called, or this is the child of a fork."""
@@ -135,7 +140,7 @@ class DriverWriter:
         """
         before, self.structure = self.structure, structure
         try:
-            self._service.restructure(self._columns(), self._static(), rate_hz=rate_hz)
+            self._service.restructure(self._frame_columns(), self._static(), rate_hz=rate_hz)
         except BaseException:
             self.structure = before
             raise
@@ -144,24 +149,9 @@ class DriverWriter:
         """Withdraw the driver. Idempotent."""
         self._service.close()
 
-    def _columns(self) -> Columns:
-        structure = self.structure
+    def _frame_columns(self) -> Columns:
         _, bus_counters, patch_counters = self._names
-        return {
-            "values": (structure.dtype, structure.n_sensors),
-            "status": ("u1", structure.n_sensors),
-            "module_time_ns": ("<i8", structure.n_modules),
-            "patch_state": ("u1", structure.n_patches),
-            "bus_state": ("u1", len(structure.buses)),
-            "bus_reason": ("u1", len(structure.buses)),
-            "bus_since_ns": ("<i8", len(structure.buses)),
-            "bus_load": ("<u2", len(structure.buses)),
-            "bus_samples": (f"V{SAMPLE.itemsize}", len(structure.buses) * SAMPLES),
-            "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
-            "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
-            "patch_interval_counts": ("<u8", structure.n_patches * BUCKETS),
-            "patch_age_counts": ("<u8", structure.n_patches * BUCKETS),
-        }
+        return _frame_columns(self.structure, len(bus_counters), len(patch_counters))
 
     def _static(self) -> dict[str, npt.NDArray[Any]]:
         driver_type, bus_counters, patch_counters = self._names
@@ -195,8 +185,8 @@ class DriverReader(ServiceReader[DriverFrame]):
 
     @property
     def driver_type(self) -> str:
-        """Name of the driver's class, as it told."""
-        return bytes(self.static()["driver_type"][0]).decode()
+        """Name of the driver's class, as it told; empty if it did not."""
+        return "".join(_names(self.static(), "driver_type")[:1])
 
     def bus_counters(self, frame: DriverFrame) -> list[dict[str, int]]:
         """The counters of every bus in a frame, by name."""
@@ -207,7 +197,9 @@ class DriverReader(ServiceReader[DriverFrame]):
         return self._counters(frame, "patch", self.structure.n_patches)
 
     def _counters(self, frame: DriverFrame, what: str, count: int) -> list[dict[str, int]]:
-        names = [bytes(name).decode() for name in self.static()[f"{what}_counter_name"]]
+        names = _names(self.static(), f"{what}_counter_name")
+        if not names or f"{what}_counters" not in self.schema.columns:
+            return [{} for _ in range(count)]
         rows = frame.column(f"{what}_counters").reshape(count, len(names)).tolist()
         return [dict(zip(names, row, strict=True)) for row in rows]
 
@@ -215,22 +207,45 @@ class DriverReader(ServiceReader[DriverFrame]):
         if bytes(attached.header["kind"]) != KIND.encode():
             raise BadServiceFile(f"service {self.name!r} is not a driver: it has no sensors")
         columns = {column.name: column for column in attached.layout.slot}
+        tables = attached.static_columns()
         try:
-            structure = Structure.from_columns(attached.static_columns(), columns["values"].dtype)
-            expected = {
-                "values": structure.n_sensors,
-                "status": structure.n_sensors,
-                "module_time_ns": structure.n_modules,
-                "patch_state": structure.n_patches,
-                "bus_state": len(structure.buses),
-            }
-            optional = dict.fromkeys(("bus_reason", "bus_since_ns", "bus_load"), len(structure.buses))
-            optional["bus_samples"] = len(structure.buses) * SAMPLES
-            optional |= dict.fromkeys(("patch_interval_counts", "patch_age_counts"), structure.n_patches * BUCKETS)
-            expected |= {name: count for name, count in optional.items() if name in columns}
-            for name, count in expected.items():
-                if columns[name].count != count:
-                    raise StructureError(f"{columns[name].count} {name} for {count} rows of the structure")
+            structure = Structure.from_columns(tables, columns["values"].dtype)
+            _names(tables, "driver_type")
+            counters = [len(_names(tables, f"{what}_counter_name")) for what in ("bus", "patch")]
+            for name, (dtype, count) in _frame_columns(structure, *counters).items():
+                if name not in columns and name not in _REQUIRED:
+                    continue
+                column = columns[name]
+                if column.count != count or column.dtype != dtype:
+                    found = f"{column.count} {name} of {column.dtype}"
+                    raise StructureError(f"{found} where the structure has {count} of {np.dtype(dtype)}")
         except (ValueError, TypeError, LookupError, OverflowError) as error:  # StructureError is a ValueError
             raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
         return structure
+
+
+def _frame_columns(
+    structure: Structure, n_bus_counters: int, n_patch_counters: int
+) -> dict[str, tuple[npt.DTypeLike, int]]:
+    """Of every column of a driver's frames: dtype and length."""
+    n_buses, n_patches = len(structure.buses), structure.n_patches
+    return {
+        "values": (structure.dtype, structure.n_sensors),
+        "status": ("u1", structure.n_sensors),
+        "module_time_ns": ("<i8", structure.n_modules),
+        "patch_state": ("u1", n_patches),
+        "bus_state": ("u1", n_buses),
+        "bus_reason": ("u1", n_buses),
+        "bus_since_ns": ("<i8", n_buses),
+        "bus_load": ("<u2", n_buses),
+        "bus_samples": (f"V{SAMPLE.itemsize}", n_buses * SAMPLES),
+        "bus_counters": ("<u8", n_buses * n_bus_counters),
+        "patch_counters": ("<u8", n_patches * n_patch_counters),
+        "patch_interval_counts": ("<u8", n_patches * BUCKETS),
+        "patch_age_counts": ("<u8", n_patches * BUCKETS),
+    }
+
+
+def _names(tables: Mapping[str, npt.NDArray[Any]], table: str) -> list[str]:
+    """The texts of a table that a driver need not have."""
+    return [bytes(text).decode() for text in tables.get(table, ())]

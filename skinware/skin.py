@@ -12,10 +12,11 @@ from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.freshness import age_limit_ns
+from skinware.geometry import Geometry
 from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.service._tap import Tap
+from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.structure import Structure
@@ -26,6 +27,7 @@ log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
+_REFUSED_FOR_NS, _WHATEVER_TIME_NS = 10 * NS_PER_S, 1 << 62
 
 DriverCallback = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
@@ -69,7 +71,7 @@ class Skin:
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._drivers, self._types = _names(drivers), _names(types)
         self._readers: dict[str, _Reader] = {}
-        self._unwanted: dict[str, tuple[int, int]] = {}  # drivers that have none of the types: their files
+        self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
         self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
@@ -88,6 +90,16 @@ class Skin:
         self._next_discovery_ns = 0
         self._discover()
         return self._layout
+
+    def geometry(self, type_name: str) -> Geometry:
+        """Where every sensor of a type is, as the drivers tell, in the order of snapshots of the present layout.
+
+        Positions, normals and radii are NaN where a driver has no geometry, or none for that sensor.
+
+        Raises:
+            StructureError: no driver has such sensors; before the first ``read`` no driver is known.
+        """
+        return self._layout.geometry(type_name)
 
     def reader(self, driver: str) -> DriverReader:
         """The reader behind one driver, for its counters and losses.
@@ -143,7 +155,7 @@ class Skin:
             raise Closed("this skin was closed")
         if now_ns() >= self._next_look_ns or self._moved_on():
             self._discover()
-        words = [reader.word for reader in self._readers.values()]
+        words = [wake_word_of(reader) for reader in self._readers.values()]
         is_newer = self._readers and self._is_newer(known)
         snapshot = self._snapshot(align) if is_newer else None
         if align and snapshot is not None and known is not None and _same_frames(snapshot, known):
@@ -227,24 +239,29 @@ class Skin:
                 _call(self._on_structure, name, structure)
 
     def _may_join(self, name: str) -> bool:
-        if name in self._readers or not (self._drivers is None or name in self._drivers):
-            return False
-        return name not in self._unwanted or self._unwanted[name] != _segment.current_inode(self.namespace, name)
+        return name not in self._readers and (self._drivers is None or name in self._drivers)
 
     def _attach(self, name: str) -> _Reader | None:
+        inode = _segment.living_inode(self.namespace, name)
+        refused, again_ns = self._refused.get(name, (None, 0))
+        if inode is None or (inode == refused and now_ns() < again_ns):
+            return None
         try:
             reader = _Reader(name, namespace=self.namespace)
-        except (BadServiceFile, ServiceNotFound):
-            return None  # not a driver, or just gone
+        except BadServiceFile:  # not a driver; or memory was short, so that another look is worth it
+            self._refused[name] = inode, now_ns() + _REFUSED_FOR_NS
+            return None
+        except ServiceNotFound:
+            return None  # just gone
         if self._has_wanted(reader) and reader.alive and reader.latest is not None:
             return reader
-        reader.close()
+        reader.close()  # another generation came in between
         return None
 
     def _has_wanted(self, reader: _Reader) -> bool:
         if self._types is None or any(sensor_type.name in self._types for sensor_type in reader.structure.types):
             return True
-        self._unwanted[reader.name] = reader.inode
+        self._refused[reader.name] = reader.inode, _WHATEVER_TIME_NS
         return False
 
     def _still_there(self, reader: _Reader) -> bool:
@@ -253,7 +270,10 @@ class Skin:
         if reader.structure_changed:
             try:
                 reader.reattach()
-            except (BadServiceFile, ServiceNotFound):
+            except ServiceNotFound:
+                return False
+            except BadServiceFile as error:
+                log.warning("driver %r left the skin: %s", reader.name, str(error))
                 return False
             if not self._has_wanted(reader):
                 return False

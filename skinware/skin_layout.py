@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import _names
+from skinware._columns import texts
 from skinware.errors import StructureError
-from skinware.structure import Index, Structure, texts
+from skinware.geometry import Geometry
+from skinware.structure import Index, Structure
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +134,20 @@ class SkinLayout:
         row = int(self._rows(type_name)[position]) - first
         module = self.modules[self.module_of(type_name)[position]]
         return _names.joined(module, self.structures[driver].name_in_module(row))
+
+    def geometry(self, type_name: str) -> Geometry:
+        """Where every sensor of a type is, in the same order; not known where its driver does not tell.
+
+        Raises:
+            StructureError: no driver has such sensors.
+        """
+        parts = []
+        for driver, index in self.parts(type_name):
+            structure = self.structures[driver]
+            uid = structure.sensor_uid[index]
+            known = structure.geometry
+            parts.append(Geometry.unknown([type_name] * len(uid), uid) if known is None else known[index])
+        return Geometry.joined(parts)
 
     def position(self, type_name: str, uid: int, driver: str | None = None) -> int:
         """Where a sensor is in the order of ``Snapshot.physical``.

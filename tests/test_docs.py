@@ -25,7 +25,7 @@ from tests.commands import PATIENCE_S, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-ELSEWHERE = ("c-and-cpp", "icub")
+ELSEWHERE = ("asyncio", "c-and-cpp", "icub")
 """Pages whose snippets other tests run."""
 COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
@@ -100,7 +100,7 @@ def test_the_first_driver_of_the_readme_is_one() -> None:
     names: dict[str, object] = {"__name__": "readme"}
     exec(compile(driver, "README.md", "exec"), names)
     adapter: Any = names["Fingertip"]
-    assert sum(len(module.channels) for patch in adapter.patches for module in patch.modules) == 16
+    assert sum(len(module.channels) for patch in adapter.patches for module in patch.modules) == 12
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

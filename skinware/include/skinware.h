@@ -302,6 +302,12 @@ uint64_t skinware_latest(const skinware_reader *reader);
 /* Which incarnation of the service this is; unique per creation. */
 uint64_t skinware_generation(const skinware_reader *reader);
 
+/*
+ * Frames that the generations before this one published. This number plus a frame's sequence counts through restarts,
+ * so that a gap in it is frames that you did not take.
+ */
+uint64_t skinware_published_before(const skinware_reader *reader);
+
 /* The writer's nominal period, 0 if it has none. */
 int64_t skinware_period_ns(const skinware_reader *reader);
 
@@ -391,7 +397,8 @@ typedef struct skinware__header {
     char kind[16];
     char name[48];
     unsigned char digest[32];
-    unsigned char reserved[320];
+    uint64_t published_before;
+    unsigned char reserved[312];
 } skinware__header;
 
 typedef struct skinware__row {
@@ -1176,6 +1183,10 @@ uint64_t skinware_latest(const skinware_reader *reader) {
 
 uint64_t skinware_generation(const skinware_reader *reader) {
     return reader->header.generation;
+}
+
+uint64_t skinware_published_before(const skinware_reader *reader) {
+    return reader->header.published_before;
 }
 
 int64_t skinware_period_ns(const skinware_reader *reader) {

@@ -64,8 +64,10 @@ HEADER = _packed(
     ("kind", f"S{KIND_BYTES}", 96),
     ("name", "S48", 112),
     ("digest", "V32", 160),
+    ("published_before", "<u8", 192),
 )
-"""``period_ns`` is the writer's nominal period, 0 if it has none; ``kind`` says what the columns mean."""
+"""``period_ns`` is the writer's nominal period, 0 if it has none; ``kind`` says what the columns mean;
+``published_before`` how many frames the generations before this one published."""
 
 CONTROL_OFFSET = 512
 LATEST_OFFSET = CONTROL_OFFSET

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import struct
@@ -34,7 +35,8 @@ class ForkGuard:
     """Base of what a forked child must give up, lest it keeps alive what died with its parent.
 
     Locks and connections belong to the open file description, which fork() shares: without this, the child of a
-    killed driver would make the driver look alive for as long as the child lives.
+    killed driver would make the driver look alive for as long as the child lives. A subclass calls ``__init__`` when it
+    is complete, so that ``abandon`` finds what it needs.
     """
 
     _all: ClassVar[weakref.WeakSet[ForkGuard]] = weakref.WeakSet()
@@ -48,9 +50,10 @@ class ForkGuard:
 
     @classmethod
     def abandon_all(cls) -> None:
-        """Run by fork() in the child."""
-        for guarded in list(cls._all):
-            guarded.abandon()
+        """Run by fork() in the child: all of them, whatever goes wrong with one."""
+        with contextlib.ExitStack() as stack:
+            for guarded in list(cls._all):
+                stack.callback(guarded.abandon)
 
 
 os.register_at_fork(after_in_child=ForkGuard.abandon_all)
@@ -60,8 +63,8 @@ class Descriptor(ForkGuard):
     """An open file descriptor that a forked child gives up."""
 
     def __init__(self, fd: int) -> None:
-        super().__init__()
         self._fd = fd
+        super().__init__()
 
     @property
     def fd(self) -> int:

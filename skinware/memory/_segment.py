@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import re
 import secrets
 import stat
+import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
+_COUNT = struct.Struct("<Q")
 _HEAD_BYTES = _layout.COLUMN_OFFSET + _layout.COLUMN.itemsize * _layout.MAX_COLUMNS
 
 
@@ -54,6 +57,16 @@ class Segment:
     def generation(self) -> int:
         """Unique per creation, growing."""
         return int(self.header["generation"])
+
+    @property
+    def published_before(self) -> int:
+        """Frames that the generations before this one published."""
+        return int(self.header["published_before"])
+
+    @property
+    def published(self) -> int:
+        """Frames that this generation and those before it published."""
+        return self.published_before + int(self.view(_layout.LATEST_OFFSET, np.dtype("<u8"), 1)[0])
 
     def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
         """(shape, dtype, offset in the slot) of every column of a slot, by name."""
@@ -112,6 +125,31 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
     return descriptor
 
 
+def previous(namespace: Namespace, name: str) -> Segment | None:
+    """The generation that a dead writer left, None if none is left that anybody can be attached to."""
+    try:
+        return attach(namespace, name, writable=True)
+    except (ServiceNotFound, BadServiceFile):
+        return None
+
+
+def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:
+    """Frames that were published under a name before.
+
+    A writer that is closed leaves the count in the file of the lock (:func:`note_published`), one that is killed in its
+    ring.
+    """
+    told = os.pread(name_lock.fd, _COUNT.size, 0)
+    count: int = _COUNT.unpack(told)[0] if len(told) == _COUNT.size else 0
+    return max(count, last.published if last is not None else 0)
+
+
+def note_published(name_lock: Descriptor, count: int) -> None:
+    """Leave word for the next owner of the name; see :func:`published_so_far`."""
+    with contextlib.suppress(OSError):  # shared memory is full
+        os.pwrite(name_lock.fd, _COUNT.pack(count), 0)
+
+
 def create(
     namespace: Namespace,
     name: str,
@@ -121,8 +159,9 @@ def create(
     slots: int,
     kind: str,
     period_ns: int,
+    published_before: int,
 ) -> Segment:
-    """Make a new generation and put it in the place of the old one. The caller owns the name.
+    """Make a new generation, which nobody sees before it is published. The caller owns the name.
 
     Raises:
         ConfigurationError: slots, columns or a kind that the format cannot hold.
@@ -134,9 +173,8 @@ def create(
         raise ConfigurationError(f"kind {kind!r}: at most {_layout.KIND_BYTES} bytes")
     static = {**static, **schema.for_file(static)}
     layout = _layout.plan(static, schema.for_layout(), slots)
-    final = namespace.ring_path(name)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
-    header = _header(name, layout, layout.digest(static), kind, period_ns)
+    header = _header(name, layout, layout.digest(static), kind, period_ns, published_before)
     try:
         fd = os.open(temporary, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         descriptor = Descriptor(fd)
@@ -152,18 +190,36 @@ def create(
                 contents = np.ascontiguousarray(static[column.name]).view(np.uint8)
                 data[column.offset : column.offset + contents.nbytes] = contents
             os.fchmod(fd, 0o640)
-            previous = _previous(namespace, name)
-            os.rename(temporary, final)
         except BaseException:
             os.unlink(temporary)
             descriptor.close()
             raise
     except OSError as error:
-        raise NamespaceError(f"cannot make {final} ({layout.file_size} bytes): {error.strerror}") from None
-    if previous is not None:
-        previous.mark(_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
+        where = namespace.ring_path(name)
+        raise NamespaceError(f"cannot make {where} ({layout.file_size} bytes): {error.strerror}") from None
     info = os.fstat(fd)
-    return Segment(str(final), header[0], layout, data, descriptor, (info.st_dev, info.st_ino), schema)
+    return Segment(str(temporary), header[0], layout, data, descriptor, (info.st_dev, info.st_ino), schema)
+
+
+def publish(segment: Segment, namespace: Namespace, name: str) -> None:
+    """Put a generation that was created in the place of the one before.
+
+    Raises:
+        NamespaceError: that is not possible; nothing has changed.
+    """
+    final = namespace.ring_path(name)
+    try:
+        os.rename(segment.path, final)
+    except OSError as error:
+        raise NamespaceError(f"cannot make {final}: {error.strerror}") from None
+    segment.path = str(final)
+
+
+def discard(segment: Segment) -> None:
+    """Remove a generation that was created and not published."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(segment.path)
+    segment.descriptor.close()
 
 
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
@@ -177,13 +233,6 @@ def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
         return np.frombuffer(mmap.mmap(fd, size), np.uint8)
     finally:
         os.close(fd)
-
-
-def _previous(namespace: Namespace, name: str) -> Segment | None:
-    try:
-        return attach(namespace, name, writable=True)
-    except (ServiceNotFound, BadServiceFile):
-        return None  # nobody can be attached to it
 
 
 def _remove_leftovers(namespace: Namespace, name: str) -> None:
@@ -224,7 +273,10 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
             raise BadServiceFile(f"{path}: owned by uid {info.st_uid}, its namespace by uid {owner}; not attached")
         header, layout = _layout.parse(os.pread(fd, _HEAD_BYTES, 0), str(path), info.st_size)
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
-        data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
+        try:
+            data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
+        except OSError as error:
+            raise BadServiceFile(f"{path}: cannot be mapped ({error.strerror}); not attached") from None
         inode = info.st_dev, info.st_ino
         segment = Segment(str(path), header, layout, data, descriptor, inode, Schema())
         segment.schema = from_file(layout, segment.static_columns(), str(path))
@@ -243,13 +295,31 @@ def current_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
     return info.st_dev, info.st_ino
 
 
+def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
+    """(device, inode) of a service's present file if its writer lives and has published; maps and checks nothing."""
+    try:
+        fd = os.open(namespace.ring_path(name), _OPEN_FLAGS | os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        info = os.fstat(fd)
+        has_published = any(os.pread(fd, 8, _layout.LATEST_OFFSET))
+        return (info.st_dev, info.st_ino) if has_published and is_locked(fd) else None
+    except OSError:
+        return None
+    finally:
+        os.close(fd)
+
+
 def _not_found(namespace: Namespace, name: str) -> str:
     others = namespace.services()
     there_are = f"; it has: {', '.join(others)}" if others else ", nor another; start a driver (skin-driver --bus ...)"
     return f"no service {name!r} in namespace {namespace.name!r}{there_are}"
 
 
-def _header(name: str, layout: Layout, digest: bytes, kind: str, period_ns: int) -> npt.NDArray[np.void]:
+def _header(
+    name: str, layout: Layout, digest: bytes, kind: str, period_ns: int, published_before: int
+) -> npt.NDArray[np.void]:
     header = np.zeros(1, _layout.HEADER)
     header["magic"] = _layout.MAGIC
     header["version_major"], header["version_minor"] = _layout.VERSION
@@ -263,6 +333,7 @@ def _header(name: str, layout: Layout, digest: bytes, kind: str, period_ns: int)
     header["period_ns"] = period_ns
     header["kind"], header["name"] = kind.encode(), name.encode()
     header["digest"] = np.frombuffer(digest, "V32")
+    header["published_before"] = published_before
     return header
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import mmap
 import operator
 import time
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 import numpy.typing as npt
@@ -119,10 +119,17 @@ class Frame:
         return f"<{type(self).__name__} {self.sequence} of generation {self.generation}, {age_ms:.1f} ms old>"
 
 
-F = TypeVar("F", bound=Frame)
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    FrameT = TypeVar("FrameT", bound=Frame, default=Frame)  # so that a reader of plain frames needs no annotation
+else:
+    from typing import TypeVar
+
+    FrameT = TypeVar("FrameT", bound=Frame)
 
 
-class RingReader(Generic[F]):
+class RingReader(Generic[FrameT]):
     """A reader's end of one generation: reads only, takes no lock, is not known to the writer.
 
     Args:
@@ -131,7 +138,7 @@ class RingReader(Generic[F]):
         context: what every frame carries as ``context``.
     """
 
-    def __init__(self, segment: Segment, frame_class: type[F], context: object = None) -> None:
+    def __init__(self, segment: Segment, frame_class: type[FrameT], context: object = None) -> None:
         layout = segment.layout
         self._frame_class = frame_class
         self.context = context
@@ -139,8 +146,8 @@ class RingReader(Generic[F]):
         self.segment = segment
         self.generation: int = segment.generation
         self.period_ns: int = int(segment.header["period_ns"])
-        self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
-        self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
+        self._words = segment.data.data.cast("Q")
+        self._half_words = segment.data.data.cast("I")
         self.wake_word: _futex.Word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slots = _slots(segment)
@@ -177,7 +184,7 @@ class RingReader(Generic[F]):
         self.wake_word.wait(wake_count, timeout_ns)
         return self._words[_LATEST] != latest
 
-    def copy(self, sequence: int | None = None) -> F | None:
+    def copy(self, sequence: int | None = None) -> FrameT | None:
         """A private copy of a frame.
 
         Args:
@@ -203,7 +210,7 @@ class RingReader(Generic[F]):
             f"give the service more slots (it has {self._count}) or publish less often"
         )
 
-    def _copy(self, sequence: int) -> F | None:
+    def _copy(self, sequence: int) -> FrameT | None:
         slot = sequence % self._count
         words = self._slot_words[slot]
         if words[_SEQUENCE] != sequence:
@@ -237,7 +244,7 @@ class RingReader(Generic[F]):
                 times.append((sequence, time_ns))
         return times
 
-    def view(self) -> F | None:
+    def view(self) -> FrameT | None:
         """The newest frame in place, without a copy; ask ``frame.valid`` after using it."""
         for _ in range(COPY_ATTEMPTS):
             wanted = self.latest
@@ -256,8 +263,8 @@ class RingWriter:
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout
         self.segment = segment
-        self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
-        self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
+        self._words = segment.data.data.cast("Q")
+        self._half_words = segment.data.data.cast("I")
         self._wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slot_words = _slot_headers(segment)
@@ -268,9 +275,13 @@ class RingWriter:
         self._contents = [slot[_layout.SLOT.itemsize :] for slot in _slots(segment)]
         self._statistics = self._words[_STATISTICS]
         self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
-        self.sequence: int = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
             segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
+
+    @property
+    def sequence(self) -> int:
+        """Sequence of the newest frame, 0 before the first."""
+        return self._words[_LATEST]
 
     def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
         """The columns of the next slot, to be filled; they hold an old frame.
@@ -282,18 +293,20 @@ class RingWriter:
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
-        slot = (self.sequence + 1) % self._count
+        latest = self.sequence
+        slot = (latest + 1) % self._count
         self._begun_ns = now_ns()
         self._slot_words[slot][_SEQUENCE] = 0
         fence()
-        if from_last and self.sequence:
-            self._contents[slot][:] = self._contents[self.sequence % self._count]
+        if from_last and latest:
+            self._contents[slot][:] = self._contents[latest % self._count]
         return self._columns[slot]
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish what was filled in since ``begin`` and wake all readers with one system call.
 
         If it raises, nothing has changed: the newest frame is the one before, and the one begun may be committed still.
+        An exception from outside in the middle of it (Ctrl-C) leaves the frame published, or not at all.
 
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
@@ -327,10 +340,10 @@ class RingWriter:
         words[_FLAGS] = flags
         fence()
         words[_SEQUENCE] = sequence
-        self._words[_LATEST] = sequence
-        self.sequence = sequence
+        begun_ns, self._begun_ns = self._begun_ns, 0
+        self._words[_LATEST] = sequence  # from now on it is published: this word alone says so
         self.wake()
-        self._note(published_ns, acquired_ns)
+        self._note(begun_ns, published_ns, acquired_ns)
         return sequence
 
     def wake(self) -> None:
@@ -347,7 +360,7 @@ class RingWriter:
         """Tell how late a period began."""
         self._statistics[_LATENESS + bucket_of(late_ns)] += 1
 
-    def _note(self, published_ns: int, acquired_ns: int) -> None:
+    def _note(self, begun_ns: int, published_ns: int, acquired_ns: int) -> None:
         """Statistics of one publication, after the readers have been woken."""
         words = self._statistics
         words[_AGE + bucket_of(published_ns - acquired_ns)] += 1
@@ -355,17 +368,17 @@ class RingWriter:
         cpu_ns = time.thread_time_ns()
         passed_ns = max(0, cpu_ns - self._cpu_ns)  # below 0 if another thread publishes now
         self._cpu_ns = cpu_ns
-        wall_ns, self._begun_ns = published_ns - self._begun_ns, 0
-        for first, value_ns in ((_WALL, wall_ns), (_CPU, passed_ns)):
+        for first, value_ns in ((_WALL, published_ns - begun_ns), (_CPU, passed_ns)):
             if value_ns < words[first] or timed == 1:
                 words[first] = value_ns
             if value_ns > words[first + 1]:
                 words[first + 1] = value_ns
             words[first + 2] += value_ns
 
-    def set_state(self, state: int) -> None:
-        """Replace the ``STATE_*`` bits and wake everybody."""
-        self._half_words[_STATE] = state
+    def set_state(self, bits: int, on: bool = True) -> None:
+        """Set ``STATE_*`` bits, or clear them, and wake everybody."""
+        state = self._half_words[_STATE]
+        self._half_words[_STATE] = state | bits if on else state & ~bits
         self.wake()
 
 
@@ -373,7 +386,7 @@ def _slots(segment: Segment) -> list[memoryview]:
     """The bytes of every slot, its header and its columns, in place."""
     layout = segment.layout
     starts = range(layout.slot_offset, layout.slot_offset + layout.slot_count * layout.slot_stride, layout.slot_stride)
-    return [memoryview(segment.data)[start : start + layout.slot_stride] for start in starts]  # type: ignore[arg-type]
+    return [segment.data.data[start : start + layout.slot_stride] for start in starts]
 
 
 def _slot_headers(segment: Segment) -> list[memoryview]:

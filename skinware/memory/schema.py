@@ -125,6 +125,9 @@ def from_file(layout: Layout, static: Mapping[str, npt.NDArray[Any]], path: str)
     columns = {c.name: Column(c.dtype, (c.count,)) for c in layout.slot}
     if STATIC_NAME not in static:
         return Schema(columns)
+    size = static[STATIC_NAME].nbytes
+    if size > _MAX_BYTES:
+        raise BadServiceFile(f"{path}: a schema of {size} bytes; at most {_MAX_BYTES}; not attached")
     try:
         text = msgspec.json.decode(static[STATIC_NAME].tobytes(), type=_SchemaText)
         told = {

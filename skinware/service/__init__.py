@@ -2,9 +2,10 @@
 
 from skinware.memory.schema import Column, Schema
 from skinware.service._client import PendingRequest
+from skinware.service._ownership import Columns
 from skinware.service._reader import Position, ServiceReader
 from skinware.service._server import Request, RequestServer
-from skinware.service._writer import DEFAULT_SLOTS, Columns, ServiceWriter
+from skinware.service._writer import DEFAULT_SLOTS, ServiceWriter
 
 __all__ = [
     "DEFAULT_SLOTS",

@@ -21,19 +21,19 @@ class Accounts:
 
     Args:
         namespace, service: what is read.
-        announce: let others see it.
+        announce: let others see it, from its first frame or wait on.
     """
 
     def __init__(self, namespace: Namespace, service: str, announce: bool) -> None:
         program = os.path.basename(sys.argv[0] or sys.executable)
         self._record = ReaderRecord(service, os.getpid(), program, "on demand")
-        self._announcement = Announcement(namespace, service) if announce else None
+        self._namespace, self._announce_it = namespace, announce
+        self._announcement: Announcement | None = None
         self._announced_ns = self._announced_frames = 0
         self._in_loop = False
         self._taken_ns = self._acquired_ns = 0
-        self._turns: list[tuple[int, int, int, int | None]] = []  # acquired, taken, settled; CPU time in a loop
+        self._turns: list[tuple[int, int, int, int | None]] = []  # acquired, taken, ended; CPU time in a loop
         self._cpu_ns = 0
-        self.settle()
 
     @property
     def record(self) -> ReaderRecord:
@@ -53,7 +53,7 @@ class Accounts:
         if lost:
             self._record.lost += lost
 
-    def settle(self) -> None:
+    def end_turn(self) -> None:
         """Note what was done since the last call; add up and tell everybody now and then."""
         time_ns = now_ns()
         if self._taken_ns:
@@ -67,12 +67,12 @@ class Accounts:
     def _add_up(self) -> None:
         record = self._record
         turns, self._turns = self._turns, []
-        for acquired_ns, taken_ns, settled_ns, cpu_ns in turns:
+        for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
             age_ns = taken_ns - acquired_ns
             record.age.add(age_ns)
             record.age_ms = round(age_ns / 1e6, 3)
             if cpu_ns is not None:
-                record.wall.add(settled_ns - taken_ns)
+                record.wall.add(ended_ns - taken_ns)
                 if 0 < self._cpu_ns <= cpu_ns:
                     record.cpu.add(cpu_ns - self._cpu_ns)
                 self._cpu_ns = cpu_ns
@@ -82,11 +82,14 @@ class Accounts:
         if self._announced_ns:
             passed_ns = time_ns - self._announced_ns
             record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
-        if self._announcement is not None:
+        if self._announce_it:
+            if self._announcement is None:
+                self._announcement = Announcement(self._namespace, record.service)
             self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, record.frames
 
     def close(self) -> None:
         """Take the announcement back. Idempotent."""
+        self._announce_it = False
         if self._announcement is not None:
             self._announcement.close()

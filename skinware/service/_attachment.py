@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 import numpy.typing as npt
 
-from skinware.errors import BadServiceFile, Closed, PeerGone, ServiceNotFound
+from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, ServiceNotFound
 from skinware.memory import _layout, _segment
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import Frame, RingReader
+from skinware.memory.ring import Frame, FrameT, RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.service._client import PendingRequest, RequestClient
 from skinware.service.messages import OPERATIONS
 
-MOVED_ON = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
+GENERATION_ENDED = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
 
 _TELLING_SPAN_NS = NS_PER_S // 2
 
-F = TypeVar("F", bound=Frame)
 
-
-class Attachment(Generic[F]):
+class Attachment(Generic[FrameT]):
     """Attached to one service by name; goes over to its next generation when the writer comes back.
 
     Args:
@@ -45,7 +43,7 @@ class Attachment(Generic[F]):
         self._client = RequestClient(self.namespace, name)
         self._closed = False
         self._moved = False
-        self._ring: RingReader[F] = self._attach_within(timeout_s)
+        self._ring: RingReader[FrameT] = self._attach_within(timeout_s)
 
     @property
     def writer_statistics(self) -> WriterStatistics:
@@ -134,7 +132,8 @@ class Attachment(Generic[F]):
             RequestRefused, PeerGone, Closed: as ``call``.
         """
         if not self._keep_up() and not self._successor_lives():
-            raise PeerGone(f"the writer of {self.name!r} is dead; start it again")
+            unreadable = ", or is one that this program cannot read" if self._moved else ""
+            raise PeerGone(f"the writer of {self.name!r} is dead{unreadable}; start it again")
         return self._client.send(operation, arguments)
 
     def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
@@ -145,7 +144,7 @@ class Attachment(Generic[F]):
         """
         return dict(self.call(OPERATIONS, timeout_s=timeout_s))
 
-    def _attach(self, known: RingReader[F] | None = None) -> RingReader[F]:
+    def _attach(self, known: RingReader[FrameT] | None = None) -> RingReader[FrameT]:
         segment = _segment.attach(self.namespace, self.name)
         if known is not None and _digest(segment) == _digest(known.segment):
             return RingReader(segment, self.frame_class, known.context)
@@ -155,7 +154,7 @@ class Attachment(Generic[F]):
         """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
-    def _attach_within(self, timeout_s: float | None) -> RingReader[F]:
+    def _attach_within(self, timeout_s: float | None) -> RingReader[FrameT]:
         timer = Periodic(10)
         deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
         while True:
@@ -166,7 +165,7 @@ class Attachment(Generic[F]):
                     raise
             timer.wait()
 
-    def _adopt(self, ring: RingReader[F]) -> None:
+    def _adopt(self, ring: RingReader[FrameT]) -> None:
         self._ring.segment.descriptor.close()
         self._ring = ring
         self._moved = False
@@ -179,7 +178,7 @@ class Attachment(Generic[F]):
         """Go over to a new generation if there may be one; whether the writer of the present one lives."""
         self._require_open()
         alive = self.alive
-        if (self._ring.state & MOVED_ON or not alive) and not self._moved:
+        if (self._ring.state & GENERATION_ENDED or not alive) and not self._moved:
             self._follow()
             alive = self.alive
         return alive
@@ -191,7 +190,10 @@ class Attachment(Generic[F]):
             return
         try:
             ring = self._attach(self._ring)
-        except ServiceNotFound:
+        except (ServiceNotFound, NamespaceError):
+            return
+        except BadServiceFile:  # another kind of service, or a format to come: ``reattach`` says what it is
+            self._moved = True
             return
         if _digest(ring.segment) == _digest(self._ring.segment):
             self._adopt(ring)
@@ -205,7 +207,7 @@ class Attachment(Generic[F]):
             return False
         try:
             segment = _segment.attach(self.namespace, self.name)
-        except (ServiceNotFound, BadServiceFile):
+        except (ServiceNotFound, NamespaceError, BadServiceFile):
             return False
         try:
             return segment.writer_lives()

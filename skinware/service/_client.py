@@ -22,7 +22,7 @@ from skinware.memory._locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._server import short_path
-from skinware.service.messages import CANCEL, MAX_PACKET, UNSPEAKABLE, Answer, Ask, receive
+from skinware.service.messages import CANCEL, ENCODING_ERRORS, MAX_PACKET, Answer, Ask, decode, receive
 
 _ERRORS: dict[str, type[Exception]] = {
     "refused": RequestRefused,
@@ -98,12 +98,12 @@ class RequestClient(ForkGuard):
     """
 
     def __init__(self, namespace: Namespace, name: str) -> None:
-        super().__init__()
         self.name = name
         self._namespace = namespace
         self._connection: socket.socket | None = None
         self._numbers = itertools.count(1)
         self._pending: dict[int, PendingRequest] = {}
+        super().__init__()
 
     def send(self, operation: str, arguments: dict[str, Any]) -> PendingRequest:
         """Ask for something.
@@ -112,10 +112,10 @@ class RequestClient(ForkGuard):
             RequestRefused: the service takes no requests, or the arguments cannot be sent.
             PeerGone: its writer is dead.
         """
-        ask = Ask(next(self._numbers), operation, arguments)
+        number = next(self._numbers)
         try:
-            packet = msgspec.json.encode(ask)
-        except UNSPEAKABLE as error:
+            packet = msgspec.json.encode(Ask(number, operation, msgspec.Raw(msgspec.json.encode(arguments))))
+        except ENCODING_ERRORS as error:
             raise RequestRefused(f"{self.name}: the arguments of {operation!r} cannot be sent: {error}") from None
         if len(packet) > MAX_PACKET:
             raise RequestRefused(f"{self.name}: a request of {len(packet)} bytes; at most {MAX_PACKET}")
@@ -128,8 +128,7 @@ class RequestClient(ForkGuard):
         except OSError:
             self._lose()
             raise PeerGone(f"{self.name}: its writer died or was closed") from None
-        pending = PendingRequest(self, connection, ask.id, operation)
-        self._pending[ask.id] = pending
+        pending = self._pending[number] = PendingRequest(self, connection, number, operation)
         return pending
 
     def listen(self, timeout_s: float) -> None:
@@ -142,7 +141,7 @@ class RequestClient(ForkGuard):
         while poll.poll(timeout_s * 1000):
             timeout_s = 0.0
             try:
-                answer = receive(connection, Answer)
+                answer = decode(receive(connection), Answer)
             except BlockingIOError:
                 return
             if answer is None:

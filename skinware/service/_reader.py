@@ -4,30 +4,28 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Self, TypeVar
+from typing import Self
 
 from skinware._renamed import renamed
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import COPY_ATTEMPTS, Frame, RingReader
+from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.service._accounts import Accounts
-from skinware.service._attachment import MOVED_ON, Attachment
+from skinware.service._attachment import GENERATION_ENDED, Attachment
 from skinware.service.messages import ACQUIRE
 
 Position = tuple[int, int]
 """(generation, sequence) of a frame."""
 
-F = TypeVar("F", bound=Frame)
 
-
-class ServiceReader(Attachment[F]):
+class ServiceReader(Attachment[FrameT]):
     """A reader of one service: it re-attaches by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
-    slow loses frames (``lost`` counts them exactly) and never disturbs the writer or other readers.
+    slow loses frames (``lost`` counts them exactly, over restarts too) and never disturbs the writer or other readers.
 
     Args:
         name: the service.
@@ -55,7 +53,11 @@ class ServiceReader(Attachment[F]):
 
     @property
     def lost(self) -> int:
-        """Frames that were published since the first one that was taken, and that were not taken."""
+        """Frames that were published since the first one that was taken, and that were not taken.
+
+        Those of generations that came and went meanwhile are counted too: each file tells how many were published under
+        the name before it. Only where somebody removed the namespace's files in between, that number is unknown.
+        """
         return self._accounts.record.lost
 
     @property
@@ -86,11 +88,11 @@ class ServiceReader(Attachment[F]):
         newer_than: Frame | Position | None = None,
         max_age_s: float | None = None,
         timeout_s: float | None = 5.0,
-    ) -> F:
+    ) -> FrameT:
         """The newest frame, as a private copy.
 
         Args:
-            newer_than: wait for a frame that is newer than this one; any frame of another generation is.
+            newer_than: wait for a frame that is newer than this one; any frame of a later generation is.
                 Default: take what is there, wait only if nothing was published yet.
             max_age_s: wait for a frame whose newest data (``acquired_ns``) is at most this old when it is handed out;
                 default: of any age.
@@ -98,7 +100,8 @@ class ServiceReader(Attachment[F]):
 
         Raises:
             ServiceTimeout: no such frame came in time; the message says whether the writer lives.
-            StructureChanged: the service came back with another structure (only when waiting for newer).
+            StructureChanged: the service came back with another structure, or as something that cannot be read; only
+                when waiting for newer.
             Overrun: the writer is too fast for this number of slots.
             Closed: this reader was closed, or belongs to the process before a fork.
         """
@@ -119,11 +122,13 @@ class ServiceReader(Attachment[F]):
             known = frame.position
 
     @contextlib.contextmanager
-    def view(self) -> Iterator[F]:
+    def view(self) -> Iterator[FrameT]:
         """The newest frame in place, with no copy, for as long as the block lasts.
 
         The writer may overwrite it meanwhile: ``frame.valid`` says whether it still is whole, and the end of the block
         asks once more. What was computed in the block counts only if that did not raise.
+
+        It counts as taken if it is still valid at the end.
 
         Raises:
             ServiceTimeout: nothing was published yet.
@@ -131,9 +136,15 @@ class ServiceReader(Attachment[F]):
             Closed: as ``read``.
         """
         alive = self._keep_up()  # which may replace the ring
-        frame = self._newest_now(self._ring.view, alive)
-        yield frame
-        if not frame.valid:
+        frame = self._checked(self._whole(self._ring.view), alive)
+        try:
+            yield frame
+        finally:
+            valid = frame.valid
+            if valid and (self._last is None or frame.position >= self._last):
+                self._count(frame)
+                self._accounts.end_turn()
+        if not valid:
             self._accounts.record.overruns += 1
             raise Overrun(
                 f"frame {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
@@ -142,7 +153,7 @@ class ServiceReader(Attachment[F]):
 
     def frames(
         self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
-    ) -> Iterator[F]:
+    ) -> Iterator[FrameT]:
         """Newest frames, without end.
 
         Args:
@@ -169,10 +180,10 @@ class ServiceReader(Attachment[F]):
                 raise self._structure_changed()
             yield frame
 
-    def __iter__(self) -> Iterator[F]:
+    def __iter__(self) -> Iterator[FrameT]:
         return self.frames()
 
-    def in_order(self, *, timeout_s: float | None = None) -> Iterator[F]:
+    def in_order(self, *, timeout_s: float | None = None) -> Iterator[FrameT]:
         """Every frame, one after the other, as long as this program keeps up within the ring's slots.
 
         For recorders and tests; a control loop wants the newest (``frames``). What was overwritten before its turn
@@ -186,13 +197,13 @@ class ServiceReader(Attachment[F]):
         while True:
             deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
             if self._lags():
-                self._accounts.settle()
+                self._accounts.end_turn()
                 alive = self.alive
             else:
                 alive = self._wait_for_newer(self._last, deadline_ns)
             yield self._taken(self._whole(self._next_in_order), alive)
 
-    def request(self, *, timeout_s: float = 5.0) -> F:
+    def request(self, *, timeout_s: float = 5.0) -> FrameT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
 
         Raises:
@@ -212,7 +223,8 @@ class ServiceReader(Attachment[F]):
 
         Raises:
             ServiceNotFound: there is none any more.
-            BadServiceFile: its file cannot be read safely.
+            BadServiceFile: its file cannot be read safely, or is another kind of service.
+            NamespaceError: the namespace cannot be trusted or read.
         """
         self._adopt(self._attach(self._ring))
 
@@ -227,9 +239,14 @@ class ServiceReader(Attachment[F]):
         self._client.close()
         self._ring.segment.descriptor.close()
 
-    def _adopt(self, ring: RingReader[F]) -> None:
-        if self._last is not None and self._last[0] == self._ring.generation != ring.generation:
-            self._accounts.record.lost += self._ring.latest - self._last[1]
+    def _adopt(self, ring: RingReader[FrameT]) -> None:
+        if self._last is not None and ring.generation != self._ring.generation:
+            before = self._ring.segment
+            taken = before.published_before + self._last[1]
+            published = ring.segment.published_before
+            if published < taken:  # the count began anew: somebody removed the lock's file
+                published = before.published
+            self._accounts.record.lost += published - taken
             self._last = (ring.generation, 0)
         super()._adopt(ring)
 
@@ -246,20 +263,21 @@ class ServiceReader(Attachment[F]):
             self._require_open()
             ring = self._ring
             wake_count = ring.wake_count
-            if (look_around or ring.state & MOVED_ON) and not self._moved:
+            outdated = known is not None and ring.generation < known[0]
+            if (look_around or outdated or ring.state & GENERATION_ENDED) and not self._moved:
                 self._follow()
                 ring = self._ring
                 wake_count = ring.wake_count
             latest = ring.latest
-            if latest and (ring.generation, latest) != known:
-                self._accounts.settle()
+            if latest and (known is None or (ring.generation, latest) > known):
+                self._accounts.end_turn()
                 return self.alive
             if self._moved:
                 raise self._structure_changed()
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came(max_age_s))
-            self._accounts.settle()
+            self._accounts.end_turn()
             if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
                 return True
             look_around = True
@@ -283,7 +301,7 @@ class ServiceReader(Attachment[F]):
         """Whether the generation that is being read has newer frames, though there may be another one already."""
         return not self._closed and self._last is not None and self._last < (self._ring.generation, self._ring.latest)
 
-    def _next_in_order(self) -> F | None:
+    def _next_in_order(self) -> FrameT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
         if last is None:
             return self._ring.copy()
@@ -302,39 +320,46 @@ class ServiceReader(Attachment[F]):
             " often, or start it again if it died while it filled one"
         )
 
-    def _newest_now(self, take: Callable[[], F | None], alive: bool) -> F:
+    def _newest_now(self, take: Callable[[], FrameT | None], alive: bool) -> FrameT:
         """The newest frame without a wait, so that this is the moment to count it."""
         frame = self._taken(self._whole(take), alive)
-        self._accounts.settle()
+        self._accounts.end_turn()
         return frame
 
-    def _whole(self, take: Callable[[], F | None]) -> F | None:
+    def _whole(self, take: Callable[[], FrameT | None]) -> FrameT | None:
         try:
             return take()
         except Overrun:
             self._accounts.record.overruns += 1
             raise
 
-    def _taken(self, frame: F | None, alive: bool) -> F:
+    def _taken(self, frame: FrameT | None, alive: bool) -> FrameT:
+        frame = self._checked(frame, alive)
+        self._count(frame)
+        return frame
+
+    def _checked(self, frame: FrameT | None, alive: bool) -> FrameT:
         if frame is None:
             raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
+        frame.stale = not alive
+        return frame
+
+    def _count(self, frame: FrameT) -> None:
         last = self._last
         lost = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
             lost = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
-        frame.stale = not alive
         self._accounts.taken(frame, lost)
-        return frame
 
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------
 
     def peek(self) -> Position | None:
         """Deprecated: ``latest``."""
         renamed("ServiceReader.peek()", "ServiceReader.latest")
-        return None if self._ring.state & MOVED_ON else self.latest
+        return None if self._ring.state & GENERATION_ENDED else self.latest
 
-    def take_newest(self) -> F:
+    def take_newest(self) -> FrameT:
         """Deprecated: ``read(timeout_s=0)``."""
         renamed("ServiceReader.take_newest()", "ServiceReader.read(timeout_s=0)")
         return self._newest_now(self._ring.copy, True)

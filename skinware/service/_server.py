@@ -8,6 +8,7 @@ import select
 import socket
 import struct
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -19,19 +20,35 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service.messages import (
     ACQUIRE,
     CANCEL,
+    ENCODING_ERRORS,
     MAX_PACKET,
     OPERATIONS,
-    UNSPEAKABLE,
     Answer,
     Ask,
+    decode,
+    decode_arguments,
     receive,
 )
 
 _MAX_PEERS = 64
 _MAX_PEERS_OF_A_STRANGER = 16
-_PACKETS_PER_TURN = 32
-_TURNS = 8
+_MAX_OPEN_OF_A_PEER = 64
+_MAX_BYTES_OF_A_STRANGER = 1 << 12
+_MAX_PARTS_OF_A_STRANGER = 128
+MOST_TURN_NS = 1_000_000
+"""The longest turn; one of a fast writer is a tenth of its period."""
+_TURN_BYTES = 1 << 16
 _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
+
+
+@dataclass(eq=False, slots=True)
+class _Peer:
+    """A program that is connected."""
+
+    connection: socket.socket
+    user: int
+    is_stranger: bool
+    open: dict[int, Request] = field(default_factory=dict)
 
 
 class Request:
@@ -43,9 +60,9 @@ class Request:
         cancelled: nobody waits for the answer any more.
     """
 
-    def __init__(self, server: RequestServer, peer: socket.socket, ask: Ask) -> None:
+    def __init__(self, server: RequestServer, peer: _Peer, ask: Ask) -> None:
         self.operation: str = ask.operation
-        self.arguments: dict[str, Any] = ask.arguments
+        self.arguments: dict[str, Any] = {}
         self.cancelled = False
         self._server = server
         self._peer = peer
@@ -59,11 +76,11 @@ class Request:
             position: (generation, sequence) of the frame that goes with it.
         """
         try:
-            msgspec.json.encode(result)
-        except UNSPEAKABLE as error:
+            encoded = msgspec.json.encode(result)
+        except ENCODING_ERRORS as error:
             self.fail(f"its result cannot be sent: {error}")
         else:
-            self._send(Answer(self._id, *position, result=result))
+            self._send(Answer(self._id, *position, result=msgspec.Raw(encoded)))
 
     def fail(self, error: str, why: str = "failed") -> None:
         """Answer that it went wrong (``failed``), or is not done at all (``refused``, ``paused``)."""
@@ -77,32 +94,50 @@ class Request:
 class RequestServer(ForkGuard):
     """Takes requests for one service. Nothing here blocks; a peer that does not read its answers is dropped.
 
+    What it does in one turn is bounded in time and in bytes, whatever the peers send: the writer's own work goes on.
+    Packets of other users than the writer's are small: what one costs, it costs before anybody can look at a clock.
+
     Args:
         namespace: where the service is.
         name: of the service; the caller owns it.
         operations: descriptions of the operations that the service declares.
+
+    Attributes:
+        turn_ns: how long one turn may take; at most one packet is begun before it is over and ends after it.
 
     Raises:
         NamespaceError: the socket cannot be made.
     """
 
     def __init__(self, namespace: Namespace, name: str, operations: Mapping[str, str]) -> None:
-        super().__init__()
         self.operations: dict[str, str] = dict(operations)
         self.paused = False
+        self.turn_ns = MOST_TURN_NS
         self._path = namespace.socket_path(name)
         self._inode = 0
-        self._peers: dict[int, socket.socket] = {}
-        self._users: dict[int, int] = {}  # of the peers
-        self._open: dict[tuple[int, int], Request] = {}
+        self._peers: dict[int, _Peer] = {}
         self._epoll = select.epoll()
+        self._hears_of_peers = True
         self._listener = self._listen()
+        super().__init__()
 
-    def renew(self) -> None:
-        """Make the socket's file again, after somebody removed it; connections stay."""
-        self._epoll.unregister(self._listener)
-        self._listener.close()
-        self._listener = self._listen()
+    def fit_into(self, period_ns: int) -> None:
+        """Keep turns short enough for a writer of this period."""
+        self.turn_ns = min(MOST_TURN_NS, period_ns // 10)
+
+    def keep(self) -> None:
+        """Make the socket's file again if somebody removed it, and let peers in that could not be let in before."""
+        try:
+            is_there = os.lstat(self._path).st_ino == self._inode
+        except OSError:
+            is_there = False
+        if not is_there:
+            removed, self._listener = self._listener, self._listen()  # connections stay
+            self._epoll.unregister(removed)
+            removed.close()
+        elif not self._hears_of_peers:
+            self._epoll.modify(self._listener, select.EPOLLIN)
+        self._hears_of_peers = True
 
     def _listen(self) -> socket.socket:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
@@ -126,38 +161,43 @@ class RequestServer(ForkGuard):
         """Readable when ``take`` has something to do; -1 once closed."""
         return -1 if self._epoll.closed else self._epoll.fileno()
 
-    def take(self, timeout_s: float = 0.0) -> list[Request]:
-        """The requests that have arrived.
+    def take(self, timeout_s: float = 0.0, *, at_most: int | None = None) -> list[Request]:
+        """The requests that have arrived, as many as fit into one turn.
 
         Args:
             timeout_s: longest wait for one.
+            at_most: no more than these, though the turn is not over.
         """
         found: list[Request] = []
-        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
-        for _ in range(_TURNS):  # one to accept, one to hear; then others want their turn, however busy the peers
-            if self._epoll.closed:
+        wait_until_ns = now_ns() + round(timeout_s * NS_PER_S)
+        turn = _Turn(self.turn_ns)
+        while not self._epoll.closed and len(found) != at_most:
+            wait_s = 0.0 if found else max(0, wait_until_ns - now_ns()) / NS_PER_S
+            events = self._epoll.poll(wait_s, 1)  # one at a time: every peer is heard before any is heard again
+            if not events:
                 break
-            events = self._epoll.poll(max(0, deadline_ns - now_ns()) / NS_PER_S)
-            share = max(1, _PACKETS_PER_TURN // max(1, len(events)))  # however many ask, the writer's loop goes on
-            for fd, _ in events:
-                if fd == self._listener.fileno():
-                    self._accept()
-                elif fd in self._peers:
-                    found += self._hear(self._peers[fd], share)
-            if found or not events:
+            turn.begin()
+            fd = events[0][0]
+            if fd == self._listener.fileno():
+                self._accept()
+            elif fd in self._peers:
+                request = self._hear(self._peers[fd], turn)
+                if request is not None:
+                    found.append(request)
+            if turn.is_over() and (found or now_ns() >= wait_until_ns):
                 break
         return [request for request in found if not request.cancelled]
 
-    def answer(self, peer: socket.socket, number: int, answer: Answer | None) -> None:
+    def answer(self, peer: _Peer, number: int, answer: Answer | None) -> None:
         """Send an answer, once; None: nobody waits for it."""
-        if self._open.pop((peer.fileno(), number), None) is None or answer is None:
+        if peer.open.pop(number, None) is None or answer is None:
             return
         packet = msgspec.json.encode(answer)
         if len(packet) > MAX_PACKET:
             text = f"the answer takes {len(packet)} bytes; at most {MAX_PACKET}"
             packet = msgspec.json.encode(Answer(number, error=text, why="failed"))
         try:
-            peer.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            peer.connection.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except OSError:
             self._drop(peer)
 
@@ -172,70 +212,106 @@ class RequestServer(ForkGuard):
     def abandon(self) -> None:
         """See :class:`skinware.memory._locks.ForkGuard`."""
         for peer in self._peers.values():
-            peer.close()
-        self._peers, self._users, self._open = {}, {}, {}
+            peer.connection.close()
+        self._peers = {}
         self._listener.close()
         self._epoll.close()
 
     def _accept(self) -> None:
-        for _ in range(_MAX_PEERS):
-            try:
-                peer, _ = self._listener.accept()
-            except OSError:
-                return
-            user = _user_of(peer)
-            stranger = user != os.geteuid()
-            of_this_user = sum(other == user for other in self._users.values())
-            if len(self._peers) >= _MAX_PEERS or (stranger and of_this_user >= _MAX_PEERS_OF_A_STRANGER):
-                peer.close()
-                continue
-            peer.setblocking(False)
-            self._peers[peer.fileno()], self._users[peer.fileno()] = peer, user
-            self._epoll.register(peer, select.EPOLLIN)
+        try:
+            connection, _ = self._listener.accept()
+        except BlockingIOError:
+            return  # it has hung up already
+        except OSError:  # no descriptors or no memory: asked again and again, it would only cost time
+            self._hears_of_peers = False
+            self._epoll.modify(self._listener, 0)
+            return
+        user = _user_of(connection)
+        stranger = user != os.geteuid()
+        of_this_user = sum(peer.user == user for peer in self._peers.values())
+        if len(self._peers) >= _MAX_PEERS or (stranger and of_this_user >= _MAX_PEERS_OF_A_STRANGER):
+            connection.close()
+            return
+        connection.setblocking(False)
+        self._peers[connection.fileno()] = _Peer(connection, user, stranger)
+        self._epoll.register(connection, select.EPOLLIN)
 
-    def _hear(self, peer: socket.socket, limit: int) -> list[Request]:
-        found: list[Request] = []
-        for _ in range(limit):  # one peer that never stops asking must not hold up the others
-            try:
-                ask = receive(peer, Ask)
-            except BlockingIOError:
-                return found
-            if ask is None:
-                self._drop(peer)
-                return found
-            request = self._received(peer, ask)
-            if request is not None:
-                found.append(request)
-        return found
-
-    def _received(self, peer: socket.socket, ask: Ask) -> Request | None:
-        key = peer.fileno(), ask.id
+    def _hear(self, peer: _Peer, turn: _Turn) -> Request | None:
+        try:
+            packet = receive(peer.connection)
+        except BlockingIOError:
+            return None
+        turn.bytes_left -= len(packet)
+        ask = decode(packet, Ask)
+        if ask is None:
+            self._drop(peer)
+            return None
         if ask.operation == CANCEL:
-            if key in self._open:
-                self._open[key].cancelled = True
+            if ask.id in peer.open:
+                peer.open[ask.id].cancelled = True
                 self.answer(peer, ask.id, Answer(ask.id, error="cancelled", why="cancelled"))
             return None
-        request = self._open[key] = Request(self, peer, ask)
+        is_too_much = len(peer.open) >= _MAX_OPEN_OF_A_PEER
+        request = peer.open[ask.id] = Request(self, peer, ask)
         if ask.operation == OPERATIONS:
             request.reply(self.operations)
         elif self.paused:
             request.fail("the service is paused", "paused")
-        elif ask.operation != ACQUIRE and ask.operation not in self.operations:
+        elif is_too_much:
+            request.fail(f"{_MAX_OPEN_OF_A_PEER} requests wait already", "refused")
+        elif ask.operation == ACQUIRE:
+            return request
+        elif ask.operation not in self.operations:
             there_are = ", ".join(self.operations) or "none"
             request.fail(f"no operation {ask.operation!r}; there are: {there_are}", "refused")
+        elif peer.is_stranger and (why := _too_costly(ask.arguments)):
+            request.fail(f"{ask.operation}: {why}", "refused")
+        elif (arguments := decode_arguments(ask.arguments)) is None:
+            self._drop(peer)
         else:
+            request.arguments = arguments
             return request
         return None
 
-    def _drop(self, peer: socket.socket) -> None:
-        fd = peer.fileno()
+    def _drop(self, peer: _Peer) -> None:
+        fd = peer.connection.fileno()
         if self._peers.pop(fd, None) is None:
             return
-        del self._users[fd]
-        for key in [key for key in self._open if key[0] == fd]:
-            self._open.pop(key).cancelled = True
+        for request in peer.open.values():
+            request.cancelled = True
+        peer.open.clear()
         self._epoll.unregister(fd)
-        peer.close()
+        peer.connection.close()
+
+
+class _Turn:
+    """What may still be done in one turn."""
+
+    def __init__(self, turn_ns: int) -> None:
+        self.bytes_left = _TURN_BYTES
+        self._turn_ns = turn_ns
+        self._end_ns: int | None = None
+
+    def begin(self) -> None:
+        if self._end_ns is None:
+            self._end_ns = now_ns() + self._turn_ns
+
+    def is_over(self) -> bool:
+        return self.bytes_left <= 0 or (self._end_ns is not None and now_ns() >= self._end_ns)
+
+
+def _too_costly(arguments: msgspec.Raw) -> str:
+    """Why arguments are not decoded for another user; empty if they are.
+
+    Python's garbage collector wakes up after some 700 new lists and objects, and may then take milliseconds.
+    """
+    text = bytes(arguments)
+    if len(text) > _MAX_BYTES_OF_A_STRANGER:
+        return f"arguments of {len(text)} bytes; at most {_MAX_BYTES_OF_A_STRANGER} from other users than the writer's"
+    parts = text.count(b"[") + text.count(b"{")
+    if parts > _MAX_PARTS_OF_A_STRANGER:
+        return f"arguments with {parts} brackets; at most {_MAX_PARTS_OF_A_STRANGER} from other users than the writer's"
+    return ""
 
 
 def _user_of(peer: socket.socket) -> int:

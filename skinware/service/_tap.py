@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from skinware.errors import Overrun
 from skinware.memory._futex import Word
-from skinware.service._attachment import MOVED_ON
-from skinware.service._reader import F, ServiceReader
+from skinware.memory.ring import FrameT
+from skinware.service._attachment import GENERATION_ENDED
+from skinware.service._reader import ServiceReader
 
 
-class Tap(ServiceReader[F]):
+def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
+    """The futex that every publication wakes, and its present value; take it before looking for what is new."""
+    ring = reader._ring  # noqa: SLF001
+    return ring.wake_word, ring.wake_count
+
+
+class Tap(ServiceReader[FrameT]):
     """A reader whose owner looks for new generations and for the dead, and waits for many readers at once."""
 
     @property
     def moved_on(self) -> bool:
         """Whether the writer closed the generation at hand or went over to another; who was killed tells nothing."""
-        return bool(self._ring.state & MOVED_ON)
+        return bool(self._ring.state & GENERATION_ENDED)
 
     @property
     def inode(self) -> tuple[int, int]:
@@ -22,16 +31,11 @@ class Tap(ServiceReader[F]):
         return self._ring.segment.inode
 
     @property
-    def word(self) -> tuple[Word, int]:
-        """The futex that every publication wakes, and its present value; take it before ``latest``."""
-        return self._ring.wake_word, self._ring.wake_count
-
-    @property
     def period_ns(self) -> int:
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
 
-    def newest(self) -> F:
+    def newest(self) -> FrameT:
         """A copy of the newest frame of the generation at hand.
 
         Raises:
@@ -48,7 +52,7 @@ class Tap(ServiceReader[F]):
         """
         return self._acquisitions()[-1][1]
 
-    def nearest(self, time_ns: int) -> F:
+    def nearest(self, time_ns: int) -> FrameT:
         """A copy of the frame, among those that the ring still holds, whose ``acquired_ns`` is nearest to a time.
 
         Raises:

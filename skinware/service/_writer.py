@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
-import os
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Self
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, NameInUse, Paused
-from skinware.memory import _layout, _segment
-from skinware.memory.announcement import sweep
-from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import RingWriter
-from skinware.memory.schema import Column, Schema
+from skinware.errors import Closed, Paused
+from skinware.memory import _layout
+from skinware.memory.namespace import Namespace
+from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.service._server import Request, RequestServer
+from skinware.service._ownership import Columns, Ownership
+from skinware.service._server import Request
 from skinware.service.messages import ACQUIRE
 
 DEFAULT_SLOTS = _layout.DEFAULT_SLOTS
-_FILE_CHECK_NS = NS_PER_S
-
-Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
-"""Of every array of a frame, by name: dtype and length, or dtype and shape, or all that is known of it."""
+_LONGEST_WAIT_S = 1.0
 
 
-class ServiceWriter:
+class ServiceWriter(Ownership):
     """The one writer of a service. It never waits for a reader.
 
     Args:
@@ -64,58 +58,19 @@ class ServiceWriter:
         description: str = "",
         operations: Mapping[str, Callable[..., object]] | None = None,
     ) -> None:
-        self.name: str = check_name(name, "service")
-        self.namespace: Namespace = Namespace.of(namespace)
+        super().__init__(
+            name,
+            namespace,
+            schema=Schema.of(columns, description),
+            static=static or {},
+            kind=kind,
+            slots=slots,
+            period_ns=round(NS_PER_S / rate_hz) if rate_hz else 0,
+            group=group,
+            operations=operations or {},
+        )
         self.missed_periods: int = 0
-        self._paused = self._stopping = False
-        self._kind = kind
-        self._slots = slots
-        self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
-        self._schema = Schema.of(columns, description)
-        self._static = dict(static or {})
-        self._operations = dict(operations or {})
-        self._group = group
-        self._server: RequestServer | None = None
-        self.namespace.create(group)
-        self._name_lock = _segment.take_name(self.namespace, name)
-        try:
-            sweep(self.namespace)
-            self.namespace.socket_path(name).unlink(missing_ok=True)  # of a predecessor that was killed
-            self._ring = self._new_generation()
-        except BaseException:
-            self._name_lock.close()
-            raise
-
-    @property
-    def generation(self) -> int:
-        """Number of the present generation."""
-        return self._ring.segment.generation
-
-    @property
-    def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
-        return self._ring.sequence
-
-    @property
-    def paused(self) -> bool:
-        """Whether ``pause`` was called last."""
-        return self._paused
-
-    def pause(self) -> None:
-        """Publish nothing until ``resume``; readers and requesters are told. From any thread.
-
-        Raises:
-            Closed: this writer was closed, or belongs to the process before a fork.
-        """
-        self._set_paused(True)
-
-    def resume(self) -> None:
-        """Go on after ``pause``. From any thread.
-
-        Raises:
-            Closed: this writer was closed, or belongs to the process before a fork.
-        """
-        self._set_paused(False)
+        self._stopping = False
 
     def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
         """Arrays of the next frame, to be filled in place; then ``commit``.
@@ -129,8 +84,7 @@ class ServiceWriter:
             Paused: it is paused.
             NameInUse: somebody removed the lock of the name, and another writer has it now; this one is closed then.
         """
-        if now_ns() >= self._next_file_check_ns:
-            self._keep_files()
+        self.keep_files()
         if self._paused:
             self._require_open()
             raise Paused(f"service {self.name!r} is paused; call resume() first")
@@ -168,12 +122,13 @@ class ServiceWriter:
             from_last: as for ``begin``.
         """
         timer = Periodic(rate_hz)
+        self.request_server().fit_into(timer.period_ns)
         with self._closing_ends_the_loop():
             while timer.wait(self._must_end):
                 if timer.missed > self.missed_periods:
                     self._ring.count_missed_periods(timer.missed - self.missed_periods)
                     self.missed_periods = timer.missed
-                waiting = self._carry_out(self.requests())
+                waiting = self._answer_requests()
                 if self._paused:
                     continue
                 self._ring.count_lateness(now_ns() - (timer.deadline_ns - timer.period_ns))
@@ -189,7 +144,7 @@ class ServiceWriter:
         """
         with self._closing_ends_the_loop():
             while not self._must_end():
-                waiting = self._carry_out(self.requests(WAIT_SLICE_NS / NS_PER_S))
+                waiting = self._answer_requests(WAIT_SLICE_NS / NS_PER_S)
                 if waiting and not self._paused:
                     yield from self._one_frame(waiting, from_last)
 
@@ -201,59 +156,19 @@ class ServiceWriter:
 
         Args:
             timeout_s: longest wait for one.
-        """
-        return self.request_server().take(timeout_s)
-
-    def request_server(self) -> RequestServer:
-        """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
             NamespaceError: the socket cannot be made.
+            NameInUse: as ``keep_files``.
         """
-        self._require_open()
-        if self._server is None:
-            described = {name: _first_line(function) for name, function in self._operations.items()}
-            self._server = RequestServer(self.namespace, self.name, described)
-            self._server.paused = self._paused
-        return self._server
-
-    @property
-    def position(self) -> tuple[int, int]:
-        """(generation, sequence) of the newest frame."""
-        return self.generation, self.sequence
-
-    def restructure(
-        self,
-        columns: Columns,
-        static: Mapping[str, npt.NDArray[Any]] | None = None,
-        *,
-        rate_hz: float | None = None,
-    ) -> None:
-        """Go on under the same name with other columns, as a new generation; readers are told.
-
-        Args:
-            columns: as for a new writer.
-            static: as for a new writer.
-            rate_hz: the nominal rate from now on; None: as before.
-
-        Raises:
-            ConfigurationError: columns that the format cannot hold; the old generation then goes on.
-            NamespaceError: shared memory is full; the old generation then goes on.
-            Closed: this writer was closed, or belongs to the process before a fork.
-        """
-        self._require_open()
-        before = self._schema, self._static, self._period_ns
-        try:
-            if rate_hz is not None:
-                self._period_ns = round(NS_PER_S / rate_hz)
-            self._schema, self._static = Schema.of(columns, self._schema.description), dict(static or {})
-            ring = self._new_generation()
-        except BaseException:
-            self._schema, self._static, self._period_ns = before
-            raise
-        self._ring.segment.descriptor.close()
-        self._ring = ring
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        while True:
+            self.keep_files()
+            left_s = max(0.0, (deadline_ns - now_ns()) / NS_PER_S)
+            found = self.request_server().take(min(left_s, _LONGEST_WAIT_S))
+            if found or left_s <= _LONGEST_WAIT_S:
+                return found
 
     def stop(self) -> None:
         """End ``periodic`` or ``on_request`` in another thread, within 50 ms; that thread then closes this writer."""
@@ -270,47 +185,6 @@ class ServiceWriter:
         except Closed:
             if not self.closed:
                 raise
-
-    @property
-    def closed(self) -> bool:
-        """Whether ``close`` was called, or this is the child of a fork."""
-        return self._name_lock.fd < 0
-
-    def close(self) -> None:
-        """Withdraw the service and give the name back. Idempotent; in the child of a fork it does nothing."""
-        if self.closed:
-            return
-        path = self.namespace.ring_path(self.name)
-        if _segment.current_inode(self.namespace, self.name) == self._ring.segment.inode:
-            path.unlink()
-        if self._server is not None:
-            self._server.close()
-        self._ring.set_state(_layout.STATE_CLOSED)
-        self._ring.segment.descriptor.close()
-        self._name_lock.close()
-
-    def _new_generation(self) -> RingWriter:
-        segment = _segment.create(
-            self.namespace,
-            self.name,
-            self._schema,
-            self._static,
-            slots=self._slots,
-            kind=self._kind,
-            period_ns=self._period_ns,
-        )
-        self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
-        ring = RingWriter(segment)
-        if self._paused:
-            ring.set_state(_layout.STATE_PAUSED)
-        return ring
-
-    def _set_paused(self, paused: bool) -> None:
-        self._require_open()
-        self._paused = paused
-        self._ring.set_state(_layout.STATE_PAUSED if paused else 0)
-        if self._server is not None:
-            self._server.paused = paused
 
     def _one_frame(self, waiting: list[Request], from_last: bool) -> Iterator[dict[str, npt.NDArray[Any]]]:
         """A frame of a loop, which may be paused or closed from another thread at any moment."""
@@ -339,52 +213,31 @@ class ServiceWriter:
         for request in waiting:
             request.fail("the service is paused", "paused")
 
-    def _carry_out(self, requests: list[Request]) -> list[Request]:
-        """Do what is asked for; returns those that want a frame."""
-        waiting = []
-        for request in requests:
+    def _answer_requests(self, timeout_s: float = 0.0) -> list[Request]:
+        """Do what is asked for, within the time of one turn; returns those that want a frame."""
+        self.keep_files()
+        server = self.request_server()
+        waiting: list[Request] = []
+        found = server.take(timeout_s, at_most=1)
+        end_ns = now_ns() + server.turn_ns
+        while found:
+            (request,) = found
             if request.operation == ACQUIRE:
                 waiting.append(request)
-                continue
-            try:
-                result = self._operations[request.operation](**request.arguments)
-            except Exception as error:  # noqa: BLE001
-                request.fail(f"{request.operation}: {error}")
             else:
-                request.reply(result, self.position)
+                self._carry_out(request)
+            found = server.take(at_most=1) if now_ns() < end_ns else []
         if self._paused:
             self._refuse(waiting)
         return waiting
 
-    def _require_open(self) -> None:
-        if self.closed:
-            raise Closed(f"the writer of {self.name!r} was closed, or belongs to the process before a fork")
-
-    def _keep_files(self) -> None:
-        """Notice, once a second, that somebody removed our files, and make them again."""
-        self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
-        if self.closed:
-            return  # ``begin`` says so
-        if _removed(self._name_lock.fd):
-            self.namespace.create(self._group)
-            try:
-                name_lock = _segment.take_name(self.namespace, self.name)
-            except NameInUse:
-                self.close()
-                raise
-            self._name_lock.close()
-            self._name_lock = name_lock
-            self._renew_server()
-        if _removed(self._ring.segment.descriptor.fd):
-            ring = self._new_generation()
-            self._ring.set_state(_layout.STATE_SUPERSEDED)
-            self._ring.segment.descriptor.close()
-            self._ring = ring
-            self._renew_server()
-
-    def _renew_server(self) -> None:
-        if self._server is not None:
-            self._server.renew()
+    def _carry_out(self, request: Request) -> None:
+        try:
+            result = self._operations[request.operation](**request.arguments)
+        except Exception as error:  # noqa: BLE001
+            request.fail(f"{request.operation}: {error}")
+        else:
+            request.reply(result, self.position)
 
     def __enter__(self) -> Self:
         return self
@@ -394,11 +247,3 @@ class ServiceWriter:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name!r} in {self.namespace.name!r}, sequence {self.sequence}>"
-
-
-def _removed(fd: int) -> bool:
-    return os.fstat(fd).st_nlink == 0
-
-
-def _first_line(function: Callable[..., object]) -> str:
-    return (inspect.getdoc(function) or "").partition("\n")[0]

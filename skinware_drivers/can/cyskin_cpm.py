@@ -5,8 +5,8 @@ Mbit/s. Identifiers 0x405, 0x407, 0x409, 0x40B in this order, eight bytes each: 
 value of a set belongs to taxel ``ORDER[i]``. (Other programs of that author use the same table so; only a calibration
 script of his uses it the other way round.) A set is complete with 0x40B.
 
-Nothing numbers the sets and nothing is checked above CAN, so one lost frame loses the set: it is not shown. There is
-no command: the finger sends by itself. [INF]
+Nothing numbers the sets and nothing is checked above CAN, so one lost frame loses the set: it is not shown, and sets
+are told apart by time alone. There is no command: the finger sends by itself. [INF]
 """
 
 from __future__ import annotations

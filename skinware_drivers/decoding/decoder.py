@@ -9,8 +9,8 @@ Nothing on the wire raises here. What cannot be used is counted.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import repeat
 from typing import Any
 
@@ -21,49 +21,27 @@ from skinware.errors import ConfigurationError
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
+from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.device_stamps import DeviceStamps
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
-from skinware_drivers.decoding.pairing import Pairing
-from skinware_drivers.decoding.punctuality import Punctuality
-from skinware_drivers.decoding.sequences import Sequences, read_numbers
+from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
+from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
 from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.samples import Samples
+
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 _NO_KIND = 255
 _EARLIEST_NS = 1
 """CLOCK_MONOTONIC begins with the machine, and 0 means never."""
-_COUNTER_BITS = 32
-_COUNTER_MASK = (1 << _COUNTER_BITS) - 1
+_MUCH_HASTE, _NEVER_AGAIN = 200, -(1 << 62)
+"""Frames that come too soon, with no whole cycle between, before somebody is told; and afterwards."""
 
 Indices = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
-class _CompiledCycle:
-    """A layout's cycle.
-
-    Attributes:
-        members: numbers of its kinds of frame, in order.
-        counters: where the number is that they share, in each; empty without one.
-        sequence: of which member the sequence numbers are compared, and where they are; None: none has one.
-        punctuality: tells cycles apart that have no counter; None: nothing does.
-        pairing: finds it.
-        assembly: reads it.
-        group_of_entry: what its frames must follow each other in.
-    """
-
-    members: list[int]
-    counters: Sequence[SequenceNumber]
-    sequence: tuple[int, SequenceNumber] | None
-    punctuality: Punctuality | None
-    pairing: Pairing
-    assembly: Assembly
-    group_of_entry: npt.NDArray[np.uint16]
 
 
 class Decoder:
@@ -123,6 +101,7 @@ class Decoder:
         self._header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self._sequences = Sequences(structure)
+        self._haste = np.zeros(self._n_patches, np.int64)
         self.device_stamps: DeviceStamps = DeviceStamps(self._frames, structure)
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
             (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
@@ -157,15 +136,8 @@ class Decoder:
             whoever knows that nobody waits for them has them counted (``count_unknown``).
         """
         first, last = batch.start, batch.stop
-        wire, bus = batch.wire[first:last], batch.bus[first:last]
-        payload = wire["payload"]
-        slots = self._addresses.slots(bus, wire["identifier"])
-        entry = self._addresses.entry[slots]
-        kind, wrong = self._tell_kinds(slots, entry, wire, bus)
-        for number, compiled in enumerate(self._kinds):
-            if compiled.module_by_byte is not None:
-                rows = np.flatnonzero(kind == number)
-                entry[rows] = compiled.name_modules(entry[rows], payload[rows])
+        bus, payload = batch.bus[first:last], batch.wire["payload"][first:last]
+        entry, kind, wrong = self.name(batch)
         new = slice(max(0, batch.headroom - first), None)  # those before were told their time in the batch before
         time_ns = batch.time_ns[first:last][new]
         self.device_stamps.tell(kind[new], entry[new], payload[new], time_ns)
@@ -195,13 +167,29 @@ class Decoder:
             updates = updates.take(np.argsort(newest_ns, kind="stable"))
         return updates, foreign + first
 
+    def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:
+        """Tell whose the frames of a batch are, and what; count those of our modules that are wrong.
+
+        Returns:
+            (n,) module of each, ``n_modules`` or more: of none; (n,) number of its kind, 255: none; and the wrong rows.
+        """
+        wire, bus = batch.wire[batch.start : batch.stop], batch.bus[batch.start : batch.stop]
+        payload = wire["payload"]
+        slots = self._addresses.slots(bus, wire["identifier"])
+        entry = self._addresses.entry[slots]
+        kind, wrong = self._tell_kinds(slots, entry, wire, bus)
+        for number, compiled in enumerate(self._kinds):
+            if compiled.module_by_byte is not None:
+                rows = np.flatnonzero(kind == number)
+                entry[rows] = compiled.name_modules(entry[rows], payload[rows])
+        return entry, kind, wrong
+
     def forget(self, patch: int) -> None:
         """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""
         self._sequences.forget(patch)
         self.device_stamps.forget(patch)
         for cycle in self._cycles:
-            if cycle.punctuality is not None:
-                cycle.punctuality.forget(np.flatnonzero(self._module_patch == patch))
+            cycle.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""
@@ -241,35 +229,13 @@ class Decoder:
         self._alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
         self._cycles = [
-            self._compile_cycle(layout.cycle, period_s, members, next(of_cycles))
+            CompiledCycle(layout.cycle, self._frames, members, next(of_cycles), self.tables, period_s)
             for (layout, period_s, _), members in zip(layouts, members_of, strict=True)
             if layout.cycle is not None
         ]
         self._width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
         self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
-
-    def _compile_cycle(
-        self, cycle: Cycle, period_s: float | None, members: list[int], assembly: Assembly
-    ) -> _CompiledCycle:
-        structure = self.tables.structure
-        places = np.full(256, len(members), np.uint8)
-        places[members] = np.arange(len(members))
-        n_entries = self._n_modules + self._n_patches + 1
-        if cycle.within == "patch":
-            groups = np.concatenate([structure.module_patch, np.arange(self._n_patches), [self._n_patches]])
-        else:
-            groups = np.minimum(np.arange(n_entries), 0xFFFF)
-        own = [self._frames[number].sequence for number in members]
-        sequences: Sequence[SequenceNumber | None] = cycle.counters or own
-        sequence = next(((member, each) for member, each in enumerate(sequences) if each is not None), None)
-        punctuality = None
-        if period_s is not None and not cycle.counters:
-            punctuality = Punctuality(cycle, period_s, self._n_modules)
-        pairing = Pairing(cycle, places, punctuality)
-        return _CompiledCycle(
-            members, cycle.counters, sequence, punctuality, pairing, assembly, groups.astype(np.uint16)
-        )
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
@@ -345,17 +311,11 @@ class Decoder:
         return kind
 
     def _pair(
-        self, batch: FrameBatch, cycle: _CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
+        self, batch: FrameBatch, cycle: CompiledCycle, entry: Indices, is_module: Flags, kind: Bytes, severed: Flags
     ) -> list[tuple[Updates, Indices]]:
         """The whole cycles of a batch, and the orphans; what may still become whole is kept for the next batch."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        shared = entry
-        if cycle.counters:
-            shared = entry << _COUNTER_BITS
-            for number, counter in zip(cycle.members, cycle.counters, strict=True):
-                rows = np.flatnonzero((kind == number) & is_module)
-                shared[rows] |= read_numbers(wire["payload"][rows], counter) & _COUNTER_MASK
-        pairs = cycle.pairing.find(shared, cycle.group_of_entry[entry], kind, time_ns, is_module, severed)
+        pairs = cycle.find(entry, kind, wire["payload"], time_ns, is_module, severed)
         if len(pairs.waiting):
             self._carry(batch, pairs.waiting + batch.start)
         if not len(pairs.rows):
@@ -363,10 +323,29 @@ class Decoder:
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
         self._count_patches(1, module[~whole])
         self._count_patches(2, entry[pairs.late])
+        self._tell_of_haste(entry[pairs.soon], module[whole])
         if cycle.sequence is not None:
             member, sequence = cycle.sequence
             self._compare(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
+
+    def _tell_of_haste(self, soon: Indices, whole: Indices) -> None:
+        """A patch whose frames always come too soon is not shown at all: say why, once.
+
+        Args:
+            soon: modules whose frames did.
+            whole: modules of which whole cycles came.
+        """
+        haste = self._haste
+        haste += np.bincount(self._module_patch[soon], minlength=self._n_patches)
+        haste[self._module_patch[whole]] = np.minimum(haste[self._module_patch[whole]], 0)
+        for patch in np.flatnonzero(haste > _MUCH_HASTE).tolist():
+            haste[patch] = _NEVER_AGAIN
+            log.warning(
+                "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
+                " apart and are not shown; give the driver the right period (period_ms, period_s); told once",
+                self.tables.structure.patch_name[patch].decode(),
+            )
 
     def _carry(self, batch: FrameBatch, rows: Indices) -> None:
         kept = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]

@@ -75,8 +75,8 @@ class Pairing:
         place[~is_module[order]] = n
         is_member = place < n
         place[severed[order]] = n
-        soon, late = self._judge(shared, place, time_ns)
-        starts = self._find_cycles(shared, place, soon, late)
+        soon, held_up, doubtful = self._judge(shared, place, time_ns)
+        starts = self._find_cycles(shared, place, soon | held_up, doubtful)
         in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._maximum_age_ns
         used = np.zeros(len(order), bool)
         too_late, starts = starts[~in_time], self._apart(starts[in_time])
@@ -99,36 +99,35 @@ class Pairing:
         rows = np.concatenate([rows, np.repeat(orphans[:, None], n, axis=1)])[by_arrival]
         return Pairs(rows, by_arrival < len(last), order[too_late], np.sort(order[waiting]), order[soon & is_orphan])
 
-    def _judge(self, shared: Indices, place: Places, time_ns: Indices) -> tuple[Flags, Flags]:
-        """(m,) bool each: frames that came too soon or too late to tell their cycle from others."""
-        soon, late = np.zeros(len(place), bool), np.zeros(len(place), bool)
+    def _judge(self, shared: Indices, place: Places, time_ns: Indices) -> tuple[Flags, Flags, Flags]:
+        """(m,) bool each: see ``Punctuality.judge``."""
+        judged = np.zeros((3, len(place)), bool)
         if self._punctuality is not None:
             members = np.flatnonzero(place < self._n)
             kind = shared[members] * self._n + place[members]
-            soon[members], late[members] = self._punctuality.judge(kind, time_ns[members])
-        return soon, late
+            judged[:, members] = self._punctuality.judge(kind, time_ns[members])
+        soon, held_up, doubtful = judged
+        return soon, held_up, doubtful
 
-    def _find_cycles(self, shared: Indices, place: Places, soon: Flags, late: Flags) -> Indices:
+    def _find_cycles(self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags) -> Indices:
         """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap."""
         n = self._n
         m = max(0, len(shared) - n + 1)
-        whole = np.ones(m, bool)
-        all_late = np.ones(m, bool)
+        whole, all_doubtful = np.ones(m, bool), np.ones(m, bool)
         seen = np.zeros(m, np.uint32)
         for j in range(n):
             whole &= shared[j : m + j] == shared[:m]
-            whole &= ~soon[j : m + j]
-            all_late &= late[j : m + j]
+            whole &= ~out_of_time[j : m + j]
+            all_doubtful &= doubtful[j : m + j]
             if self._order == "given":
                 whole &= place[j : m + j] == j
             else:
-                whole &= ~late[j : m + j]
                 seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
         if self._order != "given":
             whole &= seen == (1 << n) - 1
         if self._order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
-        return np.flatnonzero(whole & ~all_late)
+        return np.flatnonzero(whole & ~all_doubtful)
 
     def _apart(self, starts: Indices) -> Indices:
         """Of runs that overlap, the first."""

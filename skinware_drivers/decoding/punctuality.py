@@ -1,10 +1,15 @@
 """Whether frames come when they should: what tells cycles apart where no counter does.
 
-Two halves of different cycles come within the maximum age of each other only if the first was held up by a period less
-that age, or longer. So a frame that comes *late* (so much later after the frame of its kind before) may be such a half;
-and one that comes *soon* (within the maximum age of that frame) is of a sender that catches up: two of its cycles fit
-into that age. A cycle of frames that come soon is not joined, nor one of which all come late: what was lost between
-cannot be known. (In an order that is not given, it is not joined if one of them is late.)
+Two halves of different cycles come within the maximum age of each other only if the first was held up, by a period less
+that age or longer. So it matters how long after the frame of its kind before each frame of a cycle comes:
+
+* within the maximum age: the sender catches up, and two of its cycles fit into that age;
+* about a period: as it should be, as long as it is less than that half would need;
+* about two periods: the one before was lost, or this one was held up;
+* anything else: it was held up.
+
+A cycle is one if none of its frames comes soon or was held up, and at least one comes as it should. (In an order that
+is not given, all of them must: there, the end of a cycle and the beginning of the next look like one.)
 """
 
 from __future__ import annotations
@@ -32,28 +37,31 @@ class Punctuality:
 
     def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
         self._n = len(cycle.members)
+        self._all_as_they_should = cycle.order != "given"
         self._period_ns = round(period_s * NS_PER_S)
         self._soon_ns = round(cycle.maximum_age_s * NS_PER_S)
         self._reach_ns = round(cycle.reach_s * NS_PER_S)
         self._last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
         self._spacing_ns = np.full(n_modules * self._n, self._period_ns, np.int64)
 
-    def judge(self, kind: Indices, time_ns: Indices) -> tuple[Flags, Flags]:
-        """Tell which frames come soon and which late.
+    def judge(self, kind: Indices, time_ns: Indices) -> tuple[Flags, Flags, Flags]:
+        """Tell how frames come.
 
         Args:
             kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
             time_ns: (m,) stamps.
 
         Returns:
-            (m,) bool: soon; (m,) bool: late.
+            (m,) bool each: it comes soon; it was held up; it may have been, for it does not come as it should.
         """
         order, follows, spacing_ns = self._spacings(kind, time_ns)
         usual_ns = np.where(follows, np.roll(spacing_ns, 1), self._spacing_ns[kind[order]])
-        soon, late = np.empty(len(kind), bool), np.empty(len(kind), bool)
-        soon[order] = spacing_ns <= self._soon_ns
-        late[order] = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns
-        return soon, late
+        late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns
+        about_two = 2 * np.abs(spacing_ns - 2 * self._period_ns) < self._period_ns - self._reach_ns
+        judged = np.empty((3, len(kind)), bool)
+        judged[:, order] = spacing_ns <= self._soon_ns, late if self._all_as_they_should else late & ~about_two, late
+        soon, held_up, doubtful = judged
+        return soon, held_up, doubtful
 
     def remember(self, kind: Indices, time_ns: Indices) -> None:
         """These frames have come, in this order, and will not be judged again."""

@@ -163,6 +163,12 @@ class BusLine:
         """Whether it delivered frames, and had nothing wrong, when it was last looked at."""
         return self.state is BusState.LIVE and not self.reason
 
+    @property
+    def losses(self) -> tuple[int, ...]:
+        """Changes whenever it is known that frames were lost: dropped, not received by the controller, or not heard."""
+        counters = self.bus.counters
+        return counters.lost, counters.overflows, counters.bus_offs, self.opened_ns
+
     def look(self, silence_ns: int) -> None:
         """Tell a living bus from one that says nothing, is off the wire, or is gone."""
         if self.bus.fileno() < 0:

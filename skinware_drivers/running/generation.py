@@ -56,6 +56,7 @@ class Generation:
     batch: FrameBatch = field(init=False)
     begun_ns: int = field(init=False)
     _known_state: npt.NDArray[np.uint8] = field(init=False)
+    _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
 
     def __post_init__(self) -> None:
@@ -87,12 +88,18 @@ class Generation:
             new = np.arange(max(batch.start, batch.headroom), batch.stop)
             for line, own in zip(self.lines, split_by_bus(batch, new, len(self.lines)), strict=True):
                 line.link.hear(batch, own)
-        found, foreign = self.decoder.decode(batch)
+        found, foreign = self.decoder.decode(batch, self._interrupted())
         if len(foreign):
             for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
                 self.decoder.count_unknown(batch, line.link.offer(batch, own))
         self.update_bus_states(settled=now_ns() >= self._look_ns)
         self.publisher.take(found)
+
+    def _interrupted(self) -> list[int]:
+        """Buses that are known to have lost frames since the last batch."""
+        losses = {line.ordinal: line.losses for line in self.lines}
+        before, self._known_losses = self._known_losses, losses
+        return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]
 
     def update_bus_states(self, settled: bool = True) -> None:
         """Tell the publisher what the buses do.

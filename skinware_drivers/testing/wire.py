@@ -20,6 +20,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.testing.clock import HandClock, HandTimer
 from skinware_drivers.testing.defect import defect
+from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 
@@ -99,6 +100,7 @@ class Interference:
         silent: nothing comes through, in either direction.
         foreign: identifiers of frames of other devices that come beside the data.
         keep: which frames come through.
+        stumbling: what holds frames back and loses some in a row; None: nothing.
         damages: what was done.
         frames: frames that came through, since the devices have power.
         foreign_sent: frames of other devices among them.
@@ -113,6 +115,7 @@ class Interference:
     silent: bool = False
     foreign: Sequence[int] = ()
     keep: Callable[[int, bytes], bool] = lambda _identifier, _payload: True
+    stumbling: Stumbling | None = None
     damages: list[Damage] = field(default_factory=list)
     frames: int = 0
     foreign_sent: int = 0
@@ -132,16 +135,18 @@ class Interference:
 
     def next_due_ns(self) -> int | None:
         """When the next frame may come."""
-        due_ns = self.hardware.next_due_ns()
-        if not self.foreign:
-            return due_ns
-        return self._next_foreign_ns if due_ns is None else min(due_ns, self._next_foreign_ns)
+        moments = [self.hardware.next_due_ns(), self.stumbling.due_ns if self.stumbling is not None else None]
+        if self.foreign:
+            moments.append(self._next_foreign_ns)
+        return min((moment for moment in moments if moment is not None), default=None)
 
     def emit(self, now_ns: int) -> list[WireFrame]:
         """What comes through."""
         frames = [frame for frame in self.hardware.emit(now_ns) if self.keep(frame.identifier, frame.payload)]
         if self.silent:
             return []
+        if self.stumbling is not None:
+            frames = self.stumbling.pass_on(frames, now_ns)
         if self.fault is not None:
             frames = [damaged for frame in frames for damaged in self._damage(frame)]
         if self.foreign:

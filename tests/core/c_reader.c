@@ -140,10 +140,10 @@ static int describe(const char *service) {
     printf("{\"event\": \"described\", \"kind\": \"%s\", \"generation\": %" PRIu64 ", \"sequence\": %" PRIu64
            ", \"acquired_ns\": %" PRId64 ", \"published_ns\": %" PRId64 ", \"flags\": %" PRIu64
            ", \"stale\": %d, \"alive\": %d, \"pid\": %" PRIu64 ", \"period_ns\": %" PRId64 ", \"slots\": %" PRIu32
-           ", \"digest\": \"",
+           ", \"published_before\": %" PRIu64 ", \"digest\": \"",
            skinware_kind(reader), skinware_generation(reader), frame.sequence, frame.acquired_ns, frame.published_ns,
            frame.flags, frame.stale, skinware_is_alive(reader), skinware_writer_pid(reader), skinware_period_ns(reader),
-           skinware_slot_count(reader));
+           skinware_slot_count(reader), skinware_published_before(reader));
     for (i = 0; i < 32; i++)
         printf("%02x", skinware_digest(reader)[i]);
     printf("\"");

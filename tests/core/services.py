@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from skinware import ServiceWriter
+from skinware import DriverWriter, ServiceWriter
 
 SMALL = {"values": ("<u8", 512)}
 
 
-def publish(writer: ServiceWriter, value: int) -> None:
+def publish(writer: ServiceWriter | DriverWriter, value: int) -> None:
     """A frame whose every value is this."""
     writer.begin()["values"][:] = value
     writer.commit(time.monotonic_ns())

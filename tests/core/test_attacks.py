@@ -25,6 +25,7 @@ from skinware.service._server import short_path
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.users import (
     ANSWERS,
+    CONTROL,
     FRAMES,
     GROUP,
     MEMBER,
@@ -85,7 +86,7 @@ def turns_of_an_attack(board: Path, at_least: int = 0) -> Iterator[int]:
         yield turn
         passed_s = time.monotonic() - begin
         done = rows - before
-        published, missed = done[0, FRAMES], done[0, MISSED]  # more missed would be a driver that was brought down
+        published, missed = done[0, FRAMES], done[0, MISSED] - done[CONTROL, MISSED]  # more: it was brought down
         go_on = done[2, FRAMES] > 5 and done[2, ANSWERS] > 0 and published > 3 * missed
         if go_on and passed_s > 2.0 and turn >= at_least:
             return

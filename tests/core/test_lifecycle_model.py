@@ -44,6 +44,7 @@ class Life:
     """The model of one generation: what was published, and what everybody may know of it."""
 
     shape: int
+    before: int  # published by the generations before it
     sent: int = 0
     ended: bool = False
 
@@ -56,11 +57,12 @@ class Service:
     paused: bool = False
     lives: list[Life] = field(default_factory=list)
     found: Life | None = None
+    published: int = 0
 
     def begin_life(self, shape: int) -> None:
         if self.found is not None:
             self.found.ended = True
-        self.found = Life(shape)
+        self.found = Life(shape, self.published)
 
 
 @dataclass
@@ -78,7 +80,7 @@ class Reading:
 
     def go_over(self, to: Life) -> None:
         if self.begun:
-            self.lost += self.life.sent - self.taken
+            self.lost += to.before - self.life.before - self.taken
         self.life, self.taken = to, 0
 
     def follow(self, service: Service) -> bool:
@@ -154,6 +156,7 @@ class Lifecycle(RuleBasedStateMachine):
             return
         for _ in range(count):
             service.found.sent += 1
+            service.published += 1
             service.writer.begin()["values"][:] = service.found.sent
             assert service.writer.commit(service.found.sent) == service.found.sent
 
@@ -252,8 +255,8 @@ class Lifecycle(RuleBasedStateMachine):
         reading.follow(self.services[reading.name])
         if reading.life.sent:
             with reading.reader.view() as frame:
-                reading.take(reading.life.sent, frame)
                 assert frame.valid
+            reading.take(reading.life.sent, frame)
         else:
             with pytest.raises(ServiceTimeout), reading.reader.view():
                 pass

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.errors import Closed, ConfigurationError, NameInUse, PeerGone, ServiceTimeout
+from skinware.errors import Closed, ConfigurationError, NameInUse, NamespaceError, PeerGone, ServiceTimeout
+from skinware.memory._locks import ForkGuard
 from skinware.memory.announcement import living_readers
+from skinware.service import RequestServer
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
 from tests.core.workers import PATIENCE_S, Board, Bomb, Crew
@@ -146,6 +148,52 @@ def test_a_forked_child_changes_nothing(namespace: Namespace) -> None:
         assert len(list(living_readers(namespace))) == 1
         writer.commit(2)
         assert reader.read().sequence == 2
+
+
+class HalfBuilt(ForkGuard):
+    """Lacks what it should close."""
+
+    def abandon(self) -> None:
+        raise AttributeError("it was never built")
+
+
+def test_a_forked_child_gives_up_everything_though_something_cannot_be(namespace: Namespace) -> None:
+    """One such guard must not keep all others alive in the child."""
+    broken = [HalfBuilt() for _ in range(20)]  # in whatever order they are asked
+    with ServiceWriter("x", COLUMNS) as writer, ServiceWriter("y", COLUMNS) as other:
+        writer.request_server()
+        answer, end = os.pipe(), os.pipe()
+        errors = os.open(os.devnull, os.O_WRONLY)  # for what Python says of such a guard
+        own = os.dup(2)
+        os.dup2(errors, 2)
+        child = os.fork()
+        if child == 0:
+            try:
+                os.write(answer[1], bytes([writer.closed, other.closed]))
+                os.read(end[0], 1)
+            finally:
+                os._exit(0)
+        os.dup2(own, 2)
+        try:
+            assert os.read(answer[0], 2) == b"\x01\x01"
+            writer.close()
+            ServiceWriter("x", COLUMNS).close()  # the child does not hold its locks
+        finally:
+            os.write(end[1], b"x")
+            os.waitpid(child, 0)
+            for fd in (*answer, *end, errors, own):
+                os.close(fd)
+    del broken
+
+
+def test_a_server_that_could_not_be_made_harms_no_fork(namespace: Namespace) -> None:
+    with ServiceWriter("x", COLUMNS) as writer:
+        (namespace.path / ".x.sock").mkdir()
+        with pytest.raises(NamespaceError) as kept:  # and with it the half-built server
+            writer.request_server()
+        assert not [guard for guard in ForkGuard._all if isinstance(guard, RequestServer)]
+        (namespace.path / ".x.sock").rmdir()
+        del kept
 
 
 def test_a_namespace_that_is_there_is_not_given_to_another_group(namespace: Namespace) -> None:

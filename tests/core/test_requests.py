@@ -143,8 +143,9 @@ def test_no_answer_in_time_and_never_an_old_one_for_a_new_request() -> None:
         writer.request_server()
         with pytest.raises(RequestTimeout, match=r"no answer to 'add' within 0\.05 s"):
             reader.call("add", timeout_s=0.05, a=1, b=2)
-        late = writer.requests(1.0)
-        assert late == []  # it was cancelled before it was seen
+        late = writer.requests(1.0)  # on a busy machine it is seen a turn before what takes it back
+        writer.requests()
+        assert all(request.cancelled for request in late)
         slow = reader.ask("add", a=3, b=4)
         (request,) = writer.requests(1.0)
         with pytest.raises(RequestTimeout):

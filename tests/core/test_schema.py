@@ -180,3 +180,11 @@ def test_part_of_a_frame_can_be_changed() -> None:
             assert got.column("a")[number % 3] == 100 + number
         assert reader.read().column("a").tolist() == [109, 107, 108]
         assert reader.read().acquired_ns == 11
+
+
+def test_a_schema_that_is_too_long_is_not_read() -> None:
+    layout = plan({}, {"values": ("u1", 1)})
+    text = np.frombuffer(b'{"columns": {}}'.ljust((1 << 16) + 1), np.uint8)
+    with pytest.raises(BadServiceFile, match="a schema of 65537 bytes; at most 65536"):
+        from_file(layout, {"schema": text}, "x.ring")
+    assert from_file(layout, {"schema": text[:-1]}, "x.ring").columns["values"].shape == (1,)

@@ -219,8 +219,10 @@ def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.create()
     lock = _segment.take_name(namespace, "x")
-    segment = _segment.create(namespace, "x", Schema.of(SMALL, ""), {}, slots=2, kind="data", period_ns=0)
+    schema = Schema.of(SMALL, "")
+    segment = _segment.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
     writer = RingWriter(segment)
+    _segment.publish(segment, namespace, "x")
     reader = RingReader(_segment.attach(namespace, "x"), Frame)
     writer._half_words[_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1

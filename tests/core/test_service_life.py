@@ -191,3 +191,13 @@ def test_a_dead_readers_announcement_is_swept(namespace: Namespace) -> None:
         assert list(living_readers(namespace)) == []
     with ServiceWriter("x", SMALL):
         assert not dead.exists()
+
+
+def test_however_many_dead_announcements_delay_no_start(namespace: Namespace) -> None:
+    """So many are looked at by each start: whoever may announce may put any number there."""
+    namespace.create()
+    for number in range(2500):
+        (namespace.readers_path / f"x.{number}.fake").touch()
+    for left in (1500, 500, 0):
+        ServiceWriter("x", SMALL).close()
+        assert len(list(namespace.reader_files())) == left

@@ -21,6 +21,8 @@ OWNER, MEMBER, STRANGER = 61001, 61002, 61003
 GROUP = "games"
 COLUMNS = {"values": ("<u4", 100)}
 READY, STOP, FRAMES, MISSED, STALE, ANSWERS = range(6)
+CONTROL = 4
+"""Row of a driver like ``x`` that nobody attacks: what the machine does to one, it does to the other."""
 
 
 def become(user: int, groups: list[int]) -> None:
@@ -46,10 +48,11 @@ class Users:
         folder.chmod(0o755)
         self.crew, self.folder = crew, folder
         self.numbers = itertools.count()
-        self.board = Board(folder / "board", 4)
+        self.board = Board(folder / "board", 5)
         self.board.path.chmod(0o666)
         self.driver = crew.start(own, self.board.path)
-        wait_until(lambda: bool(self.board.rows[0, FRAMES] > 3), PATIENCE_S)
+        self._control = crew.start(own, self.board.path, "control", CONTROL)
+        wait_until(lambda: bool((self.board.rows[[0, CONTROL], FRAMES] > 3).all()), PATIENCE_S)
 
     def ask(self, user: int, work: Callable[..., Any], *arguments: Any) -> Any:
         """What a function returns as another user."""
@@ -60,9 +63,10 @@ class Users:
     def stop(self) -> None:
         self.board.rows[1, STOP] = 1
         self.crew.finish(self.driver)
+        self.crew.finish(self._control)
 
 
-def own(board: Path) -> None:
+def own(board: Path, name: str = "x", row: int = 0) -> None:
     """The owner's driver: 100 Hz, a socket, and an operation."""
     rows = Board(board).rows
     become(OWNER, [grp.getgrnam(GROUP).gr_gid])
@@ -71,10 +75,10 @@ def own(board: Path) -> None:
         """Say it again."""
         return value
 
-    with ServiceWriter("x", COLUMNS, group=GROUP, operations={"echo": echo}) as writer:
+    with ServiceWriter(name, COLUMNS, group=GROUP, operations={"echo": echo}) as writer:
         for columns in writer.periodic(100):
             columns["values"][:] = writer.sequence + 1
-            rows[0, FRAMES], rows[0, MISSED] = writer.sequence, writer.missed_periods
+            rows[row, FRAMES], rows[row, MISSED] = writer.sequence, writer.missed_periods
             if rows[1, STOP]:
                 break
 

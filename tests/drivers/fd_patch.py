@@ -34,7 +34,6 @@ def half(number: int) -> Frame:
         length=(64,),
         values=Values(4, "<u2", 30, to=range(30 * number, 30 * number + 30)),
         patch=Bits(shift=8, width=8),
-        sequence=SequenceNumber(0, "<u2"),
     )
 
 
@@ -42,7 +41,10 @@ class FdPatchDriver(CanAdapter[NoOptions]):
     types = (PRESSURE.measured(unit="counts", maximum=0xFFFF),)
     dtype = np.uint16
     patches = tuple(Patch(f"node {n}", [Module(taxels(60, first_uid=n << 8))], key=n) for n in NODES)
-    layout = Layout((half(0), half(1)), Cycle(("half 0", "half 1"), maximum_age_s=PERIOD_S / 2))
+    layout = Layout(
+        (half(0), half(1)),
+        Cycle(("half 0", "half 1"), maximum_age_s=PERIOD_S / 2, counter=SequenceNumber(0, "<u2")),
+    )
 
     async def start(self, link: Link) -> None:
         await self._tell(link, NODES, 1)

@@ -41,7 +41,7 @@ def frame_of(stranger: Stranger, driver: str) -> dict[str, list[float]]:
     raise AssertionError("no fresh frame")
 
 
-@pytest.mark.parametrize(("transport", "sensors"), [("can", 16), ("serial", 24), ("virtual", 100)])
+@pytest.mark.parametrize(("transport", "sensors"), [("can", 12), ("serial", 24), ("virtual", 100)])
 def test_a_new_driver_passes_its_tests_and_runs_at_once(
     stranger: Stranger, transport: str, sensors: int, tmp_path: Path
 ) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -83,7 +84,7 @@ class Device:
 
 def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
     """What is to be joined, and how many frames will never be; one frame after the other, one group after the other."""
-    soon, late = set[int](), set[int]()
+    soon, late, odd = set[int](), set[int](), set[int]()
     history: dict[tuple[int, int], tuple[int, int]] = {}  # time of the last of its kind, and its distance
     reach_ns = device.maximum_age_ns * (2 if device.order == "any" else 1)
     for frame in sent:
@@ -94,13 +95,15 @@ def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
             soon.add(frame.serial)
         if distance - usual >= usual - reach_ns:
             late.add(frame.serial)
+            if abs(distance - 2 * PERIOD_NS) >= (PERIOD_NS - reach_ns) / 2:
+                odd.add(frame.serial)
         history[frame.module, frame.place] = (frame.time_ns, distance)
     found, orphans = [], 0
     for group in range(1 if device.within == "patch" else MODULES):
         line = [frame for frame in sent if device.within == "patch" or frame.module == group]
         at, taken = 0, 0
         while at + device.members <= len(line):
-            if _is_cycle(device, line[at : at + device.members], soon, late):
+            if _is_cycle(device, line[at : at + device.members], soon, late, odd):
                 found.append([f.serial for f in sorted(line[at : at + device.members], key=lambda f: f.place)])
                 orphans += at - taken
                 at = taken = at + device.members
@@ -110,7 +113,7 @@ def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
     return sorted(found), orphans
 
 
-def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[int]) -> bool:
+def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[int], odd: set[int]) -> bool:
     places = [frame.place for frame in frames]
     if sorted(places) != list(range(device.members)) or len({frame.module for frame in frames}) > 1:
         return False
@@ -122,9 +125,10 @@ def _is_cycle(device: Device, frames: Sequence[Sent], soon: set[int], late: set[
         return False
     if device.modulo > 1:
         return len({frame.cycle % device.modulo for frame in frames}) == 1
-    held_up = [frame.serial in late for frame in frames]
-    caught_up = any(frame.serial in soon for frame in frames)
-    return not caught_up and not (all(held_up) if device.order == "given" else any(held_up))
+    serials = {frame.serial for frame in frames}
+    if device.order == "given":
+        return not serials & (soon | odd) and bool(serials - late)
+    return not serials & (soon | late)
 
 
 def _waiting(device: Device, rest: Sequence[Sent]) -> int:
@@ -278,3 +282,64 @@ def test_without_a_counter_no_lost_run_joins_halves_whether_the_sender_catches_u
             for stall_begin, stall_cycles in ((0, 0), (1, 2), (2, 1), (2, 2), (2, 3)):
                 held = held_up(sent, stall_begin * PERIOD_NS, (stall_begin + stall_cycles) * PERIOD_NS + MS // 8)
                 assert torn(device, held[:begin] + held[end:]) == 0, (order, begin, end, stall_begin, stall_cycles)
+
+
+def test_a_patch_that_sends_faster_than_it_should_is_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    device = Device(2, "given", "module", 1, PERIOD_NS // 2)
+    sent = [frame._replace(time_ns=frame.time_ns // 4, serial=n) for n, frame in enumerate(regular(device, 200))]
+    joined, _ = device.joined(sent, cuts=[100, 400])
+    assert len(joined) == MODULES  # the first cycle of each
+    (told,) = caplog.records
+    assert told.getMessage().startswith("p sends its cycles so fast that several fit into the layout's maximum_age_s")
+
+
+def test_a_patch_that_is_slower_than_it_should_be_is_shown() -> None:
+    device = Device(2, "given", "module", 1, PERIOD_NS // 2)
+    sent = [frame._replace(time_ns=frame.time_ns * 3, serial=n) for n, frame in enumerate(regular(device, 20))]
+    assert len(device.joined(sent)[0]) >= MODULES * (20 - 2)
+
+
+# What no program can tell from good data, where there is no counter: docs/explanation/layout.md names each
+
+
+def two_halves(*cycles: tuple[int, float, float]) -> list[Sent]:
+    """Cycles of one module of two members: number, and when its halves come, in periods; NaN: lost."""
+    sent = [
+        Sent(round(when * PERIOD_NS) + MS, 0, place, cycle, 0)
+        for cycle, *times in cycles
+        for place, when in enumerate(times)
+        if when == when
+    ]
+    return sorted(sent, key=lambda frame: frame.time_ns)
+
+
+LOST = float("nan")
+UNCOUNTED = Device(2, "given", "module", 1, PERIOD_NS // 2)
+COUNTED = Device(2, "given", "module", 16, PERIOD_NS // 2)
+
+
+@pytest.mark.parametrize(
+    "cycles",
+    [
+        pytest.param([(0, 0.9, LOST), (1, LOST, 1.1)], id="the first cycle that is heard"),
+        pytest.param(
+            [(0, 0, 0.1), (1, 1.2, 1.3), (2, 2.6, 2.65), (3, 3.95, LOST), (4, LOST, 4.1)],
+            id="a sender that falls behind little by little, and loses frames as it catches up",
+        ),
+        pytest.param(
+            [(0, 0, 0.1), (1, LOST, LOST), (2, 2, 2.1), (3, 4.9, LOST), (4, LOST, LOST), (5, LOST, 5.1)],
+            id="a sender that stands still in the cycle after one that was lost",
+        ),
+    ],
+)
+def test_without_a_counter_these_cannot_be_told_from_good_data(cycles: list[tuple[int, float, float]]) -> None:
+    sent = two_halves(*cycles)
+    assert torn(UNCOUNTED, sent) == 1
+    assert torn(COUNTED, sent) == 0
+
+
+def test_after_a_cycle_that_was_lost_whole_the_next_is_not_trusted_and_the_one_after_it_is() -> None:
+    sent = [frame for frame in two_halves(*((c, c, c + 0.1) for c in range(6))) if frame.cycle != 2]
+    numbered = [frame._replace(serial=number) for number, frame in enumerate(sent)]
+    shown = [numbered[first].cycle for first, _ in UNCOUNTED.joined(numbered)[0]]
+    assert shown == [0, 1, 4, 5]

@@ -1,0 +1,269 @@
+"""Owning a service's name: its generations, its files, and what readers are told of its state."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import os
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy.typing as npt
+
+from skinware.errors import Closed, NameInUse, NamespaceError
+from skinware.memory import _layout, _segment
+from skinware.memory.announcement import sweep
+from skinware.memory.namespace import Namespace, check_name
+from skinware.memory.ring import RingWriter
+from skinware.memory.schema import Column, Schema
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.service._server import RequestServer
+
+log = logging.getLogger("skinware.service")
+
+_FILE_CHECK_NS = NS_PER_S
+
+Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
+"""Of every array of a frame, by name: dtype and length, or dtype and shape, or all that is known of it."""
+
+
+class Ownership:
+    """Holds a name from its construction to ``close``, and publishes one generation after the other under it.
+
+    Args:
+        name: the service.
+        namespace: where it is.
+        schema, static, kind, slots, period_ns: of the first generation.
+        group: who may read.
+        operations: what programs may ask for.
+
+    Raises:
+        NameInUse: a living writer has this name.
+        NamespaceError: the namespace cannot be used, or shared memory is full.
+        ConfigurationError: a bad name, slot count or column.
+    """
+
+    _ring: RingWriter
+
+    def __init__(
+        self,
+        name: str,
+        namespace: Namespace | str | None,
+        *,
+        schema: Schema,
+        static: Mapping[str, npt.NDArray[Any]],
+        kind: str,
+        slots: int,
+        period_ns: int,
+        group: str | None,
+        operations: Mapping[str, Callable[..., object]],
+    ) -> None:
+        self.name: str = check_name(name, "service")
+        self.namespace: Namespace = Namespace.of(namespace)
+        self._kind, self._slots, self._group = kind, slots, group
+        self._operations = dict(operations)
+        self._paused = False
+        self._changing = threading.RLock()  # pausing and a new generation exclude each other
+        self._server: RequestServer | None = None
+        self._next_file_check_ns = 0
+        self._file_trouble = ""
+        self.namespace.create(group)
+        self._name_lock = _segment.take_name(self.namespace, name)
+        try:
+            sweep(self.namespace)
+            previous = _segment.previous(self.namespace, name)
+            published = _segment.published_so_far(self._name_lock, previous)
+            self._begin_generation(schema, static, period_ns, previous, published)
+        except BaseException:
+            self._name_lock.close()
+            raise
+
+    @property
+    def generation(self) -> int:
+        """Number of the present generation."""
+        return self._ring.segment.generation
+
+    @property
+    def sequence(self) -> int:
+        """Sequence of the newest frame, 0 before the first."""
+        return self._ring.sequence
+
+    @property
+    def position(self) -> tuple[int, int]:
+        """(generation, sequence) of the newest frame."""
+        return self.generation, self.sequence
+
+    @property
+    def paused(self) -> bool:
+        """Whether ``pause`` was called last."""
+        return self._paused
+
+    def pause(self) -> None:
+        """Publish nothing until ``resume``; readers and requesters are told. From any thread.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
+        self._set_paused(True)
+
+    def resume(self) -> None:
+        """Go on after ``pause``. From any thread.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
+        self._set_paused(False)
+
+    def restructure(
+        self,
+        columns: Columns,
+        static: Mapping[str, npt.NDArray[Any]] | None = None,
+        *,
+        rate_hz: float | None = None,
+    ) -> None:
+        """Go on under the same name with other columns, as a new generation; readers are told.
+
+        Args:
+            columns: as for a new writer.
+            static: as for a new writer.
+            rate_hz: the nominal rate from now on; None: as before.
+
+        Raises:
+            ConfigurationError: columns that the format cannot hold; the old generation then goes on.
+            NamespaceError: shared memory is full; the old generation then goes on.
+            Closed: this writer was closed, or belongs to the process before a fork.
+        """
+        self._require_open()
+        schema = Schema.of(columns, self._schema.description)
+        period_ns = self._period_ns if rate_hz is None else round(NS_PER_S / rate_hz)
+        self._succeed(schema, static or {}, period_ns)
+
+    def request_server(self) -> RequestServer:
+        """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
+
+        Raises:
+            Closed: this writer was closed, or belongs to the process before a fork.
+            NamespaceError: the socket cannot be made.
+        """
+        self._require_open()
+        if self._server is None:
+            described = {name: _first_line(function) for name, function in self._operations.items()}
+            self._server = RequestServer(self.namespace, self.name, described)
+            self._server.paused = self._paused
+            if self._period_ns:
+                self._server.fit_into(self._period_ns)
+        return self._server
+
+    def keep_files(self) -> None:
+        """Make files again that somebody removed; looks once a second, however often it is called.
+
+        ``begin``, ``requests`` and the loops call it. A loop of your own that does neither for seconds must.
+
+        Raises:
+            NameInUse: somebody removed the lock of the name, and another writer has it now; this one is closed then.
+        """
+        if now_ns() < self._next_file_check_ns or self.closed:
+            return
+        self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
+        try:
+            self._make_removed_files()
+        except NamespaceError as error:
+            if str(error) != self._file_trouble:
+                log.warning("%s; readers cannot find %r until it can be made", str(error), self.name)
+            self._file_trouble = str(error)
+        else:
+            self._file_trouble = ""
+
+    @property
+    def closed(self) -> bool:
+        """Whether ``close`` was called, or this is the child of a fork."""
+        return self._name_lock.fd < 0
+
+    def close(self) -> None:
+        """Withdraw the service and give the name back. Idempotent; in the child of a fork it does nothing."""
+        if self.closed:
+            return
+        with self._changing:
+            segment = self._ring.segment
+            _segment.note_published(self._name_lock, segment.published)
+            if _segment.current_inode(self.namespace, self.name) == segment.inode:
+                self.namespace.ring_path(self.name).unlink()
+            if self._server is not None:
+                self._server.close()
+            self._ring.set_state(_layout.STATE_CLOSED)
+            segment.descriptor.close()
+            self._name_lock.close()
+
+    def _begin_generation(
+        self,
+        schema: Schema,
+        static: Mapping[str, npt.NDArray[Any]],
+        period_ns: int,
+        previous: _segment.Segment | None,
+        published_before: int,
+    ) -> None:
+        """All that can fail comes before the file takes its place; until then the generation before goes on."""
+        with self._changing:
+            segment = _segment.create(
+                self.namespace,
+                self.name,
+                schema,
+                static,
+                slots=self._slots,
+                kind=self._kind,
+                period_ns=period_ns,
+                published_before=published_before,
+            )
+            try:
+                ring = RingWriter(segment)
+                ring.set_state(_layout.STATE_PAUSED, self._paused)
+                _segment.publish(segment, self.namespace, self.name)
+            except BaseException:
+                _segment.discard(segment)
+                raise
+            self._ring, self._schema, self._static, self._period_ns = ring, schema, dict(static), period_ns
+            self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
+            if previous is not None:
+                previous.mark(_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
+                previous.descriptor.close()
+
+    def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int) -> None:
+        """A new generation in the place of our own."""
+        own = self._ring.segment
+        self._begin_generation(schema, static, period_ns, own, own.published)
+
+    def _set_paused(self, paused: bool) -> None:
+        self._require_open()
+        with self._changing:
+            self._paused = paused
+            self._ring.set_state(_layout.STATE_PAUSED, paused)
+        if self._server is not None:
+            self._server.paused = paused
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise Closed(f"the writer of {self.name!r} was closed, or belongs to the process before a fork")
+
+    def _make_removed_files(self) -> None:
+        if _removed(self._name_lock.fd):
+            self.namespace.create(self._group)
+            try:
+                name_lock = _segment.take_name(self.namespace, self.name)
+            except NameInUse:
+                self.close()
+                raise
+            self._name_lock.close()
+            self._name_lock = name_lock
+        if _removed(self._ring.segment.descriptor.fd):
+            self._succeed(self._schema, self._static, self._period_ns)
+        if self._server is not None:
+            self._server.keep()
+
+
+def _removed(fd: int) -> bool:
+    return os.fstat(fd).st_nlink == 0
+
+
+def _first_line(function: Callable[..., object]) -> str:
+    return (inspect.getdoc(function) or "").partition("\n")[0]

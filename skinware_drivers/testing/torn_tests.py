@@ -1,0 +1,107 @@
+"""That halves of different bursts are never shown as one, whatever is lost, late or caught up."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.testing.comparison import Comparison
+from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.testing.replaying import BURSTS, Recording, record, try_troubles
+from skinware_drivers.testing.rig import Running, play
+from skinware_drivers.testing.stumbling import Stumbling
+from skinware_drivers.testing.suite import Suite
+
+_STUMBLING_PERIODS = 80
+_WHAT_TO_DO = (
+    "say in the layout's Cycle where its frames have a `counter`; where they have none, make `maximum_age_s` half a"
+    " period or shorter"
+)
+
+
+class TornTests(Suite):
+    """Runs of lost frames, and senders that stand still and catch up."""
+
+    def test_no_run_of_lost_frames_tears_a_burst(self) -> None:
+        """Every run up to two bursts long, from every frame on; the frames round it in time, late, or caught up."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                if rig.adapter.layout.cycle is None:
+                    return  # a frame is all of an update
+                heard = Heard(rig)
+                await rig.sleep((BURSTS + 4) * rig.adapter.period_s)
+                recording = heard.recording()
+            if recording is None:
+                defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
+            outcome = try_troubles(recording)
+            require(outcome.shown >= 2 * outcome.tried, "hardly anything is shown when frames are lost now and then")
+            if outcome.first is not None:
+                defect(
+                    f"{outcome.torn} of {outcome.shown} updates show values of two bursts as if they were fresh:"
+                    f" {outcome.first.in_words(recording)}; {_WHAT_TO_DO}"
+                )
+
+        play(scenario)
+
+    def test_nothing_torn_is_shown_while_a_sender_stumbles(self) -> None:
+        """The driver runs while its devices lose runs of frames, stand still and catch up; then all is fresh again."""
+
+        async def scenario(clock: HandClock) -> None:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                before, bursts = rig.wire.frames, _bursts(rig)
+                await rig.sleep(8 * rig.adapter.period_s)
+                size = round((rig.wire.frames - before) / max(1, _bursts(rig) - bursts))
+                rig.wire.stumbling = Stumbling(rig.period_ns, max(1, size))
+                await rig.sleep(_STUMBLING_PERIODS * rig.adapter.period_s)
+                require(rig.wire.stumbling.stumbles > 3, "the emulated devices send too little to test faults with")
+                rig.wire.stumbling = None
+                end_ns = clock.now_ns
+                await rig.sleep(4 * rig.adapter.period_s)
+                Comparison(rig).require_right("runs of frames were lost, and the sender stood still and caught up")
+                shown_ns = rig.record.frames[-1].module_time_ns
+                require((shown_ns > end_ns).all(), "the sender is in order again, but not all modules are shown anew")
+
+        play(scenario)
+
+
+def _bursts(rig: Running) -> int:
+    return max(len(bursts) for bursts in rig.truth.bursts.values())
+
+
+class Heard:
+    """What a driver's bus delivers from now on.
+
+    Args:
+        rig: the driver.
+    """
+
+    def __init__(self, rig: Running) -> None:
+        self._rig = rig
+        self._wire: list[npt.NDArray[np.void]] = []
+        self._time_ns: list[npt.NDArray[np.int64]] = []
+        receive = rig.bus.receive
+
+        def listen(batch: FrameBatch, ordinal: int) -> int:
+            first = batch.stop
+            count = receive(batch, ordinal)
+            self._wire.append(batch.wire[first : batch.stop].copy())
+            self._time_ns.append(batch.time_ns[first : batch.stop].copy())
+            return count
+
+        rig.bus.receive = listen  # type: ignore[method-assign]
+
+    def recording(self, bursts: int = BURSTS) -> Recording | None:
+        """So many bursts of the first patch; None if there are not so many."""
+        runner, adapter = self._rig.runner, self._rig.adapter
+        if runner is None or runner.generation is None or not self._wire:
+            return None
+        wire, time_ns = np.concatenate(self._wire), np.concatenate(self._time_ns)
+        return record(adapter.layout, runner.generation.tables, adapter.period_s, wire, time_ns, bursts)
+
+
+__all__ = ["Heard", "TornTests"]

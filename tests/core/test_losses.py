@@ -1,0 +1,121 @@
+"""What a reader has lost is counted exactly, whatever became of the writer in between."""
+
+from __future__ import annotations
+
+import pytest
+
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.errors import StructureChanged
+from tests.core.services import publish
+from tests.core.workers import seeded
+
+COLUMNS = {"values": ("<u8", 4)}
+
+
+def die(writer: ServiceWriter) -> None:
+    """What the kernel does with a killed writer: its locks go, its files stay."""
+    writer._ring.segment.descriptor.close()
+    writer._name_lock.close()
+
+
+def test_generations_that_came_and_went_between_two_reads_are_counted() -> None:
+    with ServiceWriter("x", COLUMNS) as writer:
+        for _ in range(10):
+            publish(writer, 0)
+        reader = ServiceReader[Frame]("x")
+        reader.read()
+    for count in (100, 5):
+        with ServiceWriter("x", COLUMNS) as writer:
+            for _ in range(count):
+                publish(writer, 0)
+            if count == 5:
+                assert reader.read().sequence == 5
+    assert reader.lost == 104
+    reader.close()
+
+
+def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequest) -> None:
+    """Each frame carries its number among all that were ever published; the reader's own count must agree."""
+    dice = seeded(request)
+    published = 0
+    writer = ServiceWriter("x", COLUMNS)
+    publish(writer, published := published + 1)
+    with ServiceReader[Frame]("x") as reader:
+        taken, first = 1, int(reader.read().column("values")[0])
+        for _ in range(300):
+            match dice.randrange(6):
+                case 0:
+                    writer.close()
+                    writer = ServiceWriter("x", COLUMNS)
+                case 1:
+                    die(writer)
+                    writer = ServiceWriter("x", COLUMNS)
+                case 2:
+                    writer.restructure(COLUMNS)
+                case 3:
+                    writer.namespace.ring_path("x").unlink()
+                    writer._next_file_check_ns = 0
+                    writer.keep_files()
+                case _:
+                    for _ in range(dice.randrange(1, 20)):
+                        publish(writer, published := published + 1)
+            if dice.random() < 0.5 and reader.latest is not None and reader.latest != reader._last:
+                newest = int(reader.read().column("values")[0])
+                taken += 1
+                assert reader.lost == newest - first + 1 - taken
+        writer.close()
+    assert taken > 20
+
+
+def test_frames_of_another_structure_are_counted_too() -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        frame = reader.read()
+        for n in (3, 7):
+            writer.restructure({"values": ("<u8", n)})
+            for _ in range(n):
+                publish(writer, n)
+        with pytest.raises(StructureChanged):
+            reader.read(newer_than=frame)
+        reader.reattach()
+        assert reader.read().sequence == 7
+        assert reader.lost == 3 + 6
+
+
+def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namespace) -> None:
+    with ServiceWriter("x", COLUMNS) as writer:
+        for _ in range(10):
+            publish(writer, 0)
+        reader = ServiceReader[Frame]("x")
+        reader.read()
+    namespace.lock_path("x").unlink()
+    with ServiceWriter("x", COLUMNS) as writer:
+        for _ in range(3):
+            publish(writer, 0)
+        reader.read()
+    assert reader.lost == 2
+    reader.close()
+
+
+def test_a_view_that_became_invalid_was_not_taken() -> None:
+    with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        with reader.view() as frame:
+            for _ in range(3):
+                publish(writer, 2)
+            assert not frame.valid
+        assert (reader.statistics.frames, reader.lost) == (0, 0)
+        with reader.view() as frame:
+            assert frame.sequence == 4
+        assert (reader.statistics.frames, reader.lost) == (1, 0)
+        publish(writer, 3)
+        with reader.view() as frame:
+            for _ in range(3):
+                publish(writer, 4)
+        with reader.view() as frame:
+            assert frame.sequence == 8
+        assert (reader.statistics.frames, reader.lost) == (2, 3)
+        with reader.view():
+            publish(writer, 5)
+            reader.read()  # counted before the older one's view ends
+        assert (reader.statistics.frames, reader.lost) == (3, 3)

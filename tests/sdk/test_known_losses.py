@@ -1,0 +1,41 @@
+"""What waits for its partner is given up when it is known that frames were lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.testing.patterns import lively
+from skinware_drivers.testing.rig import Case, Running, play
+from tests.testing.fingertips import EmulatedFingertips, Fingertips
+
+
+@pytest.mark.parametrize("counter", ["lost", "overflows", "bus_offs"])
+def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, namespace: object) -> None:
+    case = Case(Fingertips, EmulatedFingertips, {}, {}, lambda felt: felt)
+
+    async def scenario(clock: HandClock) -> list[list[int]]:
+        told: list[list[int]] = []
+        async with Running(case, clock, lively(EmulatedFingertips)) as rig:
+            await rig.until_fresh()
+            assert rig.runner is not None
+            assert rig.runner.generation is not None
+            decoder: Any = rig.runner.generation.decoder
+            decode = decoder.decode
+
+            def listen(batch: Any, interrupted: list[int]) -> Any:
+                told.append(list(interrupted))
+                return decode(batch, interrupted)
+
+            decoder.decode = listen
+            await rig.sleep(0.1)
+            assert told
+            assert not any(told)
+            counters = rig.bus.counters
+            setattr(counters, counter, getattr(counters, counter) + 1)
+            await rig.sleep(0.1)
+            return [interrupted for interrupted in told if interrupted]
+
+    assert play(scenario) == [[0]]

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import EXTENDED_FLAG, LARGEST_IDENTIFIER, Bus, Filter, FrameBatch, identifier_text
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, Bus, Filter, FrameBatch, identifier_text
 from skinware_drivers.decoding.filters import fewest, filters_of
 from skinware_drivers.layout import Layout
 
@@ -42,7 +42,7 @@ class Match(NamedTuple):
     """
 
     value: int
-    mask: int = LARGEST_IDENTIFIER
+    mask: int = IDENTIFIER_MASK
     prefix: bytes = b""
 
     @property

@@ -26,7 +26,7 @@ from skinware_drivers.testing.defect import defect
 
 T = TypeVar("T")
 
-_AUTHORS_LOGS = [logging.getLogger(f"skinware.driver.{hook}") for hook in ("expand", "polls")]
+_EXPAND_LOG = logging.getLogger("skinware.driver.expand")
 """Where exceptions are told that the package caught from a driver's code."""
 _BEGINNING_NS = 5_000_000_000_000
 _TURNS_AT_ONE_MOMENT = 20_000
@@ -227,14 +227,12 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
 
     thread = threading.Thread(target=work, name="driver under test", daemon=True)  # one that hangs must not hang pytest
     told = _Told(unseen)
-    for log in _AUTHORS_LOGS:
-        log.addHandler(told)
+    _EXPAND_LOG.addHandler(told)
     try:
         thread.start()
         _watch(thread, clock)
     finally:
-        for log in _AUTHORS_LOGS:
-            log.removeHandler(told)
+        _EXPAND_LOG.removeHandler(told)
     if unseen:
         defect(unseen[0])
     if failures:

@@ -13,7 +13,11 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running.bus_line import BusLine
 
 _TURNS = 8  # full batches per wake-up before handshakes and timers get their turn
-_REST, _REST_WHILE_ASKING = 16, 4  # after a take: so many times its duration, while more arrives (decision 0006)
+_REST, _REST_WHILE_ASKING, _REST_IN_STEP = (
+    16,
+    4,
+    1,
+)  # after a take: so many times its duration, while more arrives (decision 0006)
 DEFAULT_LATENCY_S = 0.005
 """What the longest rest is if nobody says."""
 
@@ -77,7 +81,10 @@ class Intake:
             self.start()
         else:
             loop.remove_reader(self._epoll.fileno())
-            factor = _REST_WHILE_ASKING if any(line.link.is_awaiting for line in self._lines) else _REST
+            links = [line.link for line in self._lines]
+            factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
+            if any(link.expects_data for link in links):
+                factor = _REST_IN_STEP  # the answer alone is what comes, and then the next question
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self._latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._on_readable)
 

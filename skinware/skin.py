@@ -21,7 +21,7 @@ from skinware.errors import (
     ServiceTimeout,
     StructureError,
 )
-from skinware.memory import _futex, _segment
+from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.structure import Index, Structure
@@ -315,7 +315,7 @@ class Skin:
                 _call(self._on_structure, name, structure)
 
     def _attach(self, name: str) -> DriverReader | None:
-        inode = _segment.living_inode(self.namespace, name)
+        inode = segments.living_inode(self.namespace, name)
         refused, again_ns = self._refused.get(name, (None, 0))
         if inode is None or (inode == refused and now_ns() < again_ns):
             return None
@@ -384,7 +384,7 @@ def _call(told: Told | None, name: str, structure: Structure) -> None:
         log.exception("what was to be called about driver %r failed; the skin goes on", name)
 
 
-def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
+def _sleep_on(words: list[tuple[futex.Word, int]], until_ns: int) -> None:
     """Sleep until any of the futex words changes or the time comes; may return early."""
     remaining_ns = max(0, until_ns - now_ns())
     if len(words) == 1:
@@ -392,5 +392,5 @@ def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
         word.wait(expected, remaining_ns)
     elif not words:
         time.sleep(remaining_ns / NS_PER_S)
-    elif not _futex.wait_any(words[: _futex.MAX_WORDS], until_ns):
+    elif not futex.wait_any(words[: futex.MAX_WORDS], until_ns):
         time.sleep(min(remaining_ns, _POLL_NS) / NS_PER_S)

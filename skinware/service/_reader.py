@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from typing import Self
 
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
-from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns

@@ -8,8 +8,8 @@ from typing import Self
 
 from skinware._renamed import renamed
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
-from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns

@@ -15,7 +15,7 @@ import skinware.aio
 from skinware import DriverReader, Frame, ServiceReader, ServiceWriter, Skin
 from skinware.aio import _wakeups
 from skinware.errors import RequestFailed, RequestTimeout, ServiceTimeout, StructureChanged
-from skinware.memory import _futex
+from skinware.memory import futex
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.core.services import SMALL, on_request, publish
 
@@ -75,7 +75,7 @@ def test_many_readers_wait_in_one_thread() -> None:
     async def main() -> None:
         with ServiceWriter("x", SMALL) as writer:
             publish(writer, 1)
-            readers = [Reader(ServiceReader("x", announce=False)) for _ in range(_futex.MAX_WORDS + 10)]
+            readers = [Reader(ServiceReader("x", announce=False)) for _ in range(futex.MAX_WORDS + 10)]
             first = [await reader.read() for reader in readers]
             tasks = [
                 asyncio.create_task(reader.read(newer_than=frame, timeout_s=60))

@@ -77,7 +77,9 @@ class ServiceReader(Attachment[F]):
         Raises:
             Closed: this reader was closed, or belongs to the process before a fork.
         """
-        self._keep_up()
+        self._require_open()
+        if not self._moved:
+            self._follow()
         return self.latest
 
     def read(

@@ -79,7 +79,9 @@ class ServiceReader(Attachment[FrameT]):
         Raises:
             Closed: this reader was closed, or belongs to the process before a fork.
         """
-        self._keep_up()
+        self._require_open()
+        if not self._moved:
+            self._follow()
         return self.latest
 
     def read(

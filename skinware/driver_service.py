@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from skinware.driver_frame import DriverFrame
 from skinware.errors import BadServiceFile, StructureError
-from skinware.memory import _segment
+from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
 from skinware.samples import SAMPLE, SAMPLES
@@ -203,7 +203,7 @@ class DriverReader(ServiceReader[DriverFrame]):
         rows = frame.column(f"{what}_counters").reshape(count, len(names)).tolist()
         return [dict(zip(names, row, strict=True)) for row in rows]
 
-    def _describe(self, attached: _segment.Segment) -> Structure:
+    def _describe(self, attached: segments.Segment) -> Structure:
         if bytes(attached.header["kind"]) != KIND.encode():
             raise BadServiceFile(f"service {self.name!r} is not a driver: it has no sensors")
         columns = {column.name: column for column in attached.layout.slot}

@@ -13,7 +13,7 @@ from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.freshness import age_limit_ns
 from skinware.geometry import Geometry
-from skinware.memory import _futex, _segment
+from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
 from skinware.service._tap import Tap, wake_word_of
@@ -149,7 +149,7 @@ class Skin:
             until_ns = time_ns + WAIT_SLICE_NS
             _sleep_on(words, until_ns if deadline_ns is None else min(until_ns, deadline_ns))
 
-    def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[_futex.Word, int]], Snapshot | None]:
+    def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[futex.Word, int]], Snapshot | None]:
         """What to sleep on if that is not enough, and a snapshot if there is one that is newer."""
         if self._closed:
             raise Closed("this skin was closed")
@@ -242,7 +242,7 @@ class Skin:
         return name not in self._readers and (self._drivers is None or name in self._drivers)
 
     def _attach(self, name: str) -> _Reader | None:
-        inode = _segment.living_inode(self.namespace, name)
+        inode = segments.living_inode(self.namespace, name)
         refused, again_ns = self._refused.get(name, (None, 0))
         if inode is None or (inode == refused and now_ns() < again_ns):
             return None
@@ -357,7 +357,7 @@ def _call(callback: DriverCallback | None, name: str, structure: Structure) -> N
         log.exception("what was to be called about driver %r failed; the skin goes on", name)
 
 
-def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
+def _sleep_on(words: list[tuple[futex.Word, int]], until_ns: int) -> None:
     """Sleep until any of the futex words changes or the time comes; may return early."""
     remaining_ns = max(0, until_ns - now_ns())
     if len(words) == 1:
@@ -365,7 +365,7 @@ def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
         word.wait(expected, remaining_ns)
     elif not words:
         time.sleep(remaining_ns / NS_PER_S)
-    elif not _futex.wait_any(words[: _futex.MAX_WORDS], until_ns):
+    elif not futex.wait_any(words[: futex.MAX_WORDS], until_ns):
         time.sleep(min(remaining_ns, _POLL_NS) / NS_PER_S)
 
 

@@ -85,9 +85,8 @@ class SkinLayout:
             StructureError: no driver has such sensors, or several have them in different units; the message says how
                 to choose.
         """
-        units = {
-            self.drivers[driver]: self.structures[driver].type(type_name).unit for driver, _ in self.parts(type_name)
-        }
+        parts = self.parts(type_name)
+        units = {self.drivers[driver]: self.structures[driver].type(type_name).unit for driver, _ in parts}
         if len(set(units.values())) > 1:
             told = ", ".join(f"{unit} of {driver}" for driver, unit in units.items())
             raise StructureError(

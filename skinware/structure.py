@@ -135,6 +135,11 @@ class Structure:
         return {t.name: as_index(np.flatnonzero(self.sensor_type == t.id)) for t in self.types}
 
     @cached_property
+    def _module_by_type(self) -> dict[str, npt.NDArray[np.int64]]:
+        modules = self.sensor_module.astype(np.int64)
+        return {name: frozen(modules[index]) for name, index in self._index_by_type.items()}
+
+    @cached_property
     def _index_by_module(self) -> list[Index]:
         return group(self.sensor_module, self.n_modules)
 
@@ -231,17 +236,17 @@ class Structure:
         except KeyError:
             raise StructureError(f"no {type_name} sensor with uid {uid:#x} in this skin") from None
 
-    def module_of(self, type_name: str) -> npt.NDArray[np.uint32]:
-        """(n,) uint32, index of the module of each sensor of a type, in the order of ``index(type_name)``.
+    def module_of(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64, index of the module of each sensor of a type, in the order of ``index(type_name)``.
 
         Raises:
             StructureError: no such type here.
         """
-        return self.sensor_module[self.index(type_name)]
+        return self._module_by_type[self.type(type_name).name]
 
-    def patch_of(self, type_name: str) -> npt.NDArray[np.uint32]:
-        """(n,) uint32, index of the patch of each sensor of a type, likewise."""
-        return self.sensor_patch[self.index(type_name)]
+    def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64, index of the patch of each sensor of a type, likewise."""
+        return self.module_patch[self.module_of(type_name)].astype(np.int64)
 
     def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Physical values of all sensors of a type.

@@ -25,8 +25,10 @@ EXTENDED_FLAG = 0x8000_0000
 Wherever an identifier is a number, one of 29 bits has this bit set: ``EXTENDED_FLAG | 0x18DA00F1``. As text it is what
 candump writes (:func:`identifier_text`).
 """
-LARGEST_STANDARD, LARGEST_IDENTIFIER = 0x7FF, 0x1FFF_FFFF
-"""The largest identifiers of 11 and of 29 bits, without the flag."""
+IDENTIFIER_MASK = 0x1FFF_FFFF
+"""Identifier bits of a frame, without the flags."""
+LARGEST_STANDARD = 0x7FF
+"""The largest identifier of 11 bits."""
 REMOTE_FLAG = 0x4000_0000
 """Identifier bit of a remote frame (``CAN_RTR_FLAG``)."""
 ERROR_FLAG = 0x2000_0000
@@ -49,7 +51,7 @@ _WayT = TypeVar("_WayT")
 def identifier_text(identifier: int) -> str:
     """An identifier as candump writes it: three digits for one of 11 bits, eight for one of 29."""
     if identifier & EXTENDED_FLAG:
-        return f"{identifier & LARGEST_IDENTIFIER:08X}"
+        return f"{identifier & IDENTIFIER_MASK:08X}"
     return f"{identifier:03X}"
 
 
@@ -59,12 +61,12 @@ def check_identifier(identifier: int) -> None:
     Raises:
         ConfigurationError: it has more than 11 bits without ``EXTENDED_FLAG``, or more than 29 with it.
     """
-    largest = LARGEST_IDENTIFIER if identifier & EXTENDED_FLAG else LARGEST_STANDARD
+    largest = IDENTIFIER_MASK if identifier & EXTENDED_FLAG else LARGEST_STANDARD
     if not 0 <= identifier & ~EXTENDED_FLAG <= largest:
         raise ConfigurationError(
             f"identifier {identifier:X} has more than 11 bits; one of 29 bits is written EXTENDED_FLAG |"
             f" 0x{identifier:X}"
-            if 0 <= identifier <= LARGEST_IDENTIFIER
+            if 0 <= identifier <= IDENTIFIER_MASK
             else f"identifier {identifier:X} cannot be: it has 11 bits, or 29 and EXTENDED_FLAG"
         )
 
@@ -311,7 +313,7 @@ class Bus(ABC):
 __all__ = [
     "ERROR_FLAG",
     "EXTENDED_FLAG",
-    "LARGEST_IDENTIFIER",
+    "IDENTIFIER_MASK",
     "LARGEST_STANDARD",
     "REMOTE_FLAG",
     "Bus",

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
-from skinware_drivers.bus import EXTENDED_FLAG, LARGEST_IDENTIFIER, LARGEST_STANDARD, check_identifier
+from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD, check_identifier
 from skinware_drivers.numbering import DeviceTime, SequenceNumber
 
 MOST_FRAMES = 200
@@ -48,7 +48,7 @@ class Identifier:
             object.__setattr__(self, "value", self.value | EXTENDED_FLAG)
             is_extended = True
         object.__setattr__(self, "extended", is_extended)
-        every = EXTENDED_FLAG | LARGEST_IDENTIFIER if is_extended else LARGEST_STANDARD
+        every = EXTENDED_FLAG | IDENTIFIER_MASK if is_extended else LARGEST_STANDARD
         mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)
         object.__setattr__(self, "mask", mask)
 

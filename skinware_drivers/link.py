@@ -17,7 +17,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import (
     ERROR_FLAG,
     EXTENDED_FLAG,
-    LARGEST_IDENTIFIER,
+    IDENTIFIER_MASK,
     LARGEST_STANDARD,
     REMOTE_FLAG,
     Bus,
@@ -53,7 +53,7 @@ class Match(NamedTuple):
     """
 
     value: int
-    mask: int = LARGEST_IDENTIFIER
+    mask: int = IDENTIFIER_MASK
     prefix: bytes = b""
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,10 +12,7 @@ from skinware_drivers.bus import identifier_text
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.link import Link, Match
 
-log: logging.Logger = logging.getLogger("skinware.driver.polls")
-
 _LOOK_AGAIN_S = 0.05
-_AFTER_A_FAILURE_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -75,12 +71,9 @@ class Poller:
         self._link = link
         self._counters = counters
         self._timers: list[_Timer] = []
-        self._told = ""
 
     async def run(self, polls: Callable[[], Sequence[Poll]], is_away: Callable[[], bool]) -> None:
-        """Ask what ``polls`` names, the first of each at once, until it is cancelled.
-
-        Whatever ``polls`` raises is told once, and it is called again a second later.
+        """Ask what ``polls`` names, the first of each at once, until it is cancelled. What ``polls`` raises, it raises.
 
         Args:
             polls: called once before each question: what is to be asked may change. None: a pause, it is called again
@@ -89,18 +82,12 @@ class Poller:
         """
         while True:
             await self._until_first_deadline()
-            try:
-                asked = list(polls())
-                self._keep_time(asked)
-                if asked:
-                    await self._ask_first(asked, is_away())
-            except Exception as error:  # noqa: BLE001 - whatever an author's code raises
-                self._tell(error)
-                await asyncio.sleep(_AFTER_A_FAILURE_S)
+            asked = polls()
+            self._keep_time(asked)
+            if asked:
+                await self._ask_first(asked, is_away())
             else:
-                self._told = ""
-                if not asked:
-                    await asyncio.sleep(_LOOK_AGAIN_S)
+                await asyncio.sleep(_LOOK_AGAIN_S)
 
     async def _until_first_deadline(self) -> None:
         await asyncio.sleep(0)  # if it is late, others have their turn all the same
@@ -145,9 +132,3 @@ class Poller:
                 counters.polls_unanswered += 1
         except BusSendError:
             counters.polls_missed += 1
-
-    def _tell(self, error: Exception) -> None:
-        text = f"{type(error).__name__}: {error}"
-        if text != self._told:
-            self._told = text
-            log.error("%s: `polls` failed, trying again: %s", self._link.bus_name, text, exc_info=error)

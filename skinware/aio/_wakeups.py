@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from skinware.memory import _futex
+from skinware.memory import futex
 from skinware.realtime import NS_PER_S, now_ns
 
-WakeWord = tuple[_futex.Word, int]
+WakeWord = tuple[futex.Word, int]
 """A futex word, and the value that it had."""
 
 _POLL_NS = 1_000_000
@@ -59,7 +59,7 @@ class Wakeups:
         self._watched: set[tuple[int, int]] = set()  # address and value of the words that the thread sleeps on
         memory = np.zeros(4, np.uint8)
         self._changes = memory.view(np.uint32)  # how often there was something new for the thread
-        self._changed = _futex.Word(memory, 0)
+        self._changed = futex.Word(memory, 0)
         self._thread: threading.Thread | None = None
 
     def enter(self) -> None:
@@ -108,8 +108,8 @@ class Wakeups:
             if not words:
                 self._changed.wait(changes, _LONG_NS)
                 continue
-            until_ns = now_ns() + (_POLL_NS if len(words) >= _futex.MAX_WORDS else _LOOK_NS)
-            if not _futex.wait_any([(self._changed, changes), *words[: _futex.MAX_WORDS - 1]], until_ns):
+            until_ns = now_ns() + (_POLL_NS if len(words) >= futex.MAX_WORDS else _LOOK_NS)
+            if not futex.wait_any([(self._changed, changes), *words[: futex.MAX_WORDS - 1]], until_ns):
                 time.sleep(_POLL_NS / NS_PER_S)
 
     def _look(self) -> list[WakeWord]:

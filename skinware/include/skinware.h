@@ -288,6 +288,19 @@ size_t skinware_sensors(const skinware_reader *reader, const skinware_type *type
 size_t skinware_physical(const skinware_frame *frame, const skinware_column *values, const skinware_type *type,
                          const uint32_t *positions, size_t count, float *out);
 
+/*
+ * Which of a driver's sensors can be trusted now: out[i] is 1 if the sensor at positions[i] has the status 0, data that is
+ * not too old, and a driver that lived when the frame was taken; else 0. A status alone is as of the frame: a driver that
+ * hangs leaves it at 0.
+ *
+ * max_age_ns: the age beyond which nothing is fresh; 0: three of the driver's periods and at least 0.2 s, or 1 s if it has no
+ * period.
+ *
+ * Returns how many are fresh; 0 also if this is no driver's frame, or a position lies outside it.
+ */
+size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame, int64_t max_age_ns,
+                      const uint32_t *positions, size_t count, unsigned char *out);
+
 /* -- the state of things ------------------------------------------------------------------------------------------ */
 
 /* Whether the writer of this generation lives; it may still be silent. One system call. */
@@ -1165,6 +1178,32 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
             out[i] = (float)raw * (float)type->scale + (float)type->offset;
     }
     return count;
+}
+
+size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame, int64_t max_age_ns,
+                      const uint32_t *positions, size_t count, unsigned char *out) {
+    const skinware_column *status = skinware_find_column(reader, "status");
+    const skinware_column *times = skinware_find_column(reader, "module_time_ns");
+    const skinware_column *modules = skinware_find_table(reader, "sensor_module");
+    const unsigned char *bits = status == NULL ? NULL : (const unsigned char *)skinware_data(frame, status);
+    const int64_t *time_ns = times == NULL ? NULL : (const int64_t *)skinware_data(frame, times);
+    const uint32_t *module = modules == NULL ? NULL : (const uint32_t *)skinware_table_data(reader, modules);
+    const int64_t period_ns = skinware_period_ns(reader);
+    const int64_t now_ns = skinware_now_ns();
+    size_t i, fresh = 0;
+    if (!skinware_is_driver(reader) || bits == NULL || time_ns == NULL || module == NULL)
+        return 0;
+    if (max_age_ns == 0)
+        max_age_ns = period_ns <= 0 ? 1000000000 : period_ns < 200000000 / 3 ? 200000000 : 3 * period_ns;
+    for (i = 0; i < count; i++)
+        if (positions[i] >= status->count || positions[i] >= modules->count || module[positions[i]] >= times->count)
+            return 0;
+    for (i = 0; i < count; i++) {
+        const int64_t acquired_ns = time_ns[module[positions[i]]];
+        out[i] = !frame->stale && bits[positions[i]] == 0 && acquired_ns > 0 && acquired_ns >= now_ns - max_age_ns;
+        fresh += out[i];
+    }
+    return fresh;
 }
 
 /* -- the state of things ------------------------------------------------------------------------------------------ */

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from skinware.memory._locks import Descriptor, is_locked, try_lock
+from skinware.memory.locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread
 

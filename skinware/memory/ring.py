@@ -16,24 +16,24 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import Closed, Overrun, ServiceError
-from skinware.memory import _futex, _layout
+from skinware.memory import file_layout, futex
 from skinware.memory._fences import fence
-from skinware.memory._segment import Segment
+from skinware.memory.segments import Segment
 from skinware.memory.statistics import bucket_of
 from skinware.realtime import now_ns
 
 COPY_ATTEMPTS = 64
 """How often a reader tries again while the writer overwrites what it copies."""
-_LATEST = _layout.LATEST_OFFSET // 8
-_MISSED_PERIODS = _layout.MISSED_PERIODS_OFFSET // 8
-_WAKE_WORD = _layout.WAKE_WORD_OFFSET // 4
-_STATE = _layout.STATE_OFFSET // 4
+_LATEST = file_layout.LATEST_OFFSET // 8
+_MISSED_PERIODS = file_layout.MISSED_PERIODS_OFFSET // 8
+_WAKE_WORD = file_layout.WAKE_WORD_OFFSET // 4
+_STATE = file_layout.STATE_OFFSET // 4
 _SEQUENCE, _ACQUIRED, _PUBLISHED, _FLAGS = range(4)  # 8-byte words of a slot's header
-_HEADER_WORDS = _layout.SLOT.itemsize // 8
-_STATISTICS = slice(_layout.STATISTICS_OFFSET // 8, _layout.COLUMN_OFFSET // 8)
+_HEADER_WORDS = file_layout.SLOT.itemsize // 8
+_STATISTICS = slice(file_layout.STATISTICS_OFFSET // 8, file_layout.COLUMN_OFFSET // 8)
 # words of the statistics: a count, two times (best, worst, total), another count, histograms
 _TIMED, _WALL, _CPU, _BEFORE_BOOT, _AGE = 0, 1, 4, 7, 8
-_LATENESS = _AGE + _layout.HISTOGRAM_BUCKETS
+_LATENESS = _AGE + file_layout.HISTOGRAM_BUCKETS
 _MOST_NS, _ALL_FLAGS = (1 << 63) - 1, (1 << 64) - 1
 
 
@@ -148,7 +148,7 @@ class RingReader(Generic[FrameT]):
         self.period_ns: int = int(segment.header["period_ns"])
         self._words = segment.data.data.cast("Q")
         self._half_words = segment.data.data.cast("I")
-        self.wake_word: _futex.Word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
+        self.wake_word: futex.Word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slots = _slots(segment)
         self._slot_words = _slot_headers(segment)
@@ -265,14 +265,14 @@ class RingWriter:
         self.segment = segment
         self._words = segment.data.data.cast("Q")
         self._half_words = segment.data.data.cast("I")
-        self._wake_word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
+        self._wake_word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
         self._slot_words = _slot_headers(segment)
         self._columns = [
             {name: np.ndarray(*where[:2], slot, where[2]) for name, where in segment.slot_formats().items()}
             for slot in _slots(segment)
         ]
-        self._contents = [slot[_layout.SLOT.itemsize :] for slot in _slots(segment)]
+        self._contents = [slot[file_layout.SLOT.itemsize :] for slot in _slots(segment)]
         self._statistics = self._words[_STATISTICS]
         self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
         for page in range(0, layout.file_size, mmap.PAGESIZE):

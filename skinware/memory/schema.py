@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.memory._layout import Layout
+from skinware.memory.file_layout import Layout
 
 STATIC_NAME = "schema"
 _MAX_BYTES = 1 << 16

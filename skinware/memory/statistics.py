@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.memory import _layout
+from skinware.memory import file_layout
 
-BUCKETS = _layout.HISTOGRAM_BUCKETS
+BUCKETS = file_layout.HISTOGRAM_BUCKETS
 
 
 def bucket_of(value_ns: int) -> int:
@@ -97,8 +97,10 @@ class WriterStatistics(msgspec.Struct):
 
 def read_statistics(data: npt.NDArray[np.uint8]) -> WriterStatistics:
     """The statistics in a mapped service file."""
-    words = data[_layout.STATISTICS_OFFSET :][: _layout.STATISTICS.itemsize].view(_layout.STATISTICS)[0].copy()
-    control = data[_layout.CONTROL_OFFSET :][: _layout.CONTROL.itemsize].view(_layout.CONTROL)[0]
+    words = (
+        data[file_layout.STATISTICS_OFFSET :][: file_layout.STATISTICS.itemsize].view(file_layout.STATISTICS)[0].copy()
+    )
+    control = data[file_layout.CONTROL_OFFSET :][: file_layout.CONTROL.itemsize].view(file_layout.CONTROL)[0]
     timed = int(words["timed"])
 
     def spread(what: str) -> Spread:

@@ -7,7 +7,7 @@ from typing import Any, Generic
 import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, ServiceNotFound
-from skinware.memory import _layout, _segment
+from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import Frame, FrameT, RingReader
 from skinware.memory.schema import Schema
@@ -16,7 +16,7 @@ from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.service._client import PendingRequest, RequestClient
 from skinware.service.messages import OPERATIONS
 
-GENERATION_ENDED = _layout.STATE_SUPERSEDED | _layout.STATE_CLOSED
+GENERATION_ENDED = file_layout.STATE_SUPERSEDED | file_layout.STATE_CLOSED
 
 _TELLING_SPAN_NS = NS_PER_S // 2
 
@@ -68,7 +68,7 @@ class Attachment(Generic[FrameT]):
     @property
     def paused(self) -> bool:
         """Whether the writer says that it publishes nothing for now."""
-        return bool(self._ring.state & _layout.STATE_PAUSED)
+        return bool(self._ring.state & file_layout.STATE_PAUSED)
 
     @property
     def structure_changed(self) -> bool:
@@ -145,12 +145,12 @@ class Attachment(Generic[FrameT]):
         return dict(self.call(OPERATIONS, timeout_s=timeout_s))
 
     def _attach(self, known: RingReader[FrameT] | None = None) -> RingReader[FrameT]:
-        segment = _segment.attach(self.namespace, self.name)
+        segment = segments.attach(self.namespace, self.name)
         if known is not None and _digest(segment) == _digest(known.segment):
             return RingReader(segment, self.frame_class, known.context)
         return RingReader(segment, self.frame_class, self._describe(segment))
 
-    def _describe(self, _attached: _segment.Segment) -> object:
+    def _describe(self, _attached: segments.Segment) -> object:
         """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""
         return None
 
@@ -185,7 +185,7 @@ class Attachment(Generic[FrameT]):
 
     def _follow(self) -> None:
         """Go over to a newer generation if there is one of the same structure; remember if it has another."""
-        inode = _segment.current_inode(self.namespace, self.name)
+        inode = segments.current_inode(self.namespace, self.name)
         if inode is None or inode == self._ring.segment.inode:
             return
         try:
@@ -206,7 +206,7 @@ class Attachment(Generic[FrameT]):
         if not self._moved:
             return False
         try:
-            segment = _segment.attach(self.namespace, self.name)
+            segment = segments.attach(self.namespace, self.name)
         except (ServiceNotFound, NamespaceError, BadServiceFile):
             return False
         try:
@@ -215,5 +215,5 @@ class Attachment(Generic[FrameT]):
             segment.descriptor.close()
 
 
-def _digest(segment: _segment.Segment) -> bytes:
+def _digest(segment: segments.Segment) -> bytes:
     return bytes(segment.header["digest"])

@@ -18,7 +18,7 @@ from skinware.errors import (
     RequestRefused,
     RequestTimeout,
 )
-from skinware.memory._locks import ForkGuard
+from skinware.memory.locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._server import short_path
@@ -168,7 +168,7 @@ class RequestClient(ForkGuard):
         self._lose()
 
     def abandon(self) -> None:
-        """See :class:`skinware.memory._locks.ForkGuard`."""
+        """See :class:`skinware.memory.locks.ForkGuard`."""
         self._lose()
 
     def _connect(self) -> socket.socket:

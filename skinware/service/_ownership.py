@@ -12,7 +12,7 @@ from typing import Any
 import numpy.typing as npt
 
 from skinware.errors import Closed, NameInUse, NamespaceError
-from skinware.memory import _layout, _segment
+from skinware.memory import file_layout, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import RingWriter
@@ -69,11 +69,11 @@ class Ownership:
         self._next_file_check_ns = 0
         self._file_trouble = ""
         self.namespace.create(group)
-        self._name_lock = _segment.take_name(self.namespace, name)
+        self._name_lock = segments.take_name(self.namespace, name)
         try:
             sweep(self.namespace)
-            previous = _segment.previous(self.namespace, name)
-            published = _segment.published_so_far(self._name_lock, previous)
+            previous = segments.previous(self.namespace, name)
+            published = segments.published_so_far(self._name_lock, previous)
             self._begin_generation(schema, static, period_ns, previous, published)
         except BaseException:
             self._name_lock.close()
@@ -186,12 +186,12 @@ class Ownership:
             return
         with self._changing:
             segment = self._ring.segment
-            _segment.note_published(self._name_lock, segment.published)
-            if _segment.current_inode(self.namespace, self.name) == segment.inode:
+            segments.note_published(self._name_lock, segment.published)
+            if segments.current_inode(self.namespace, self.name) == segment.inode:
                 self.namespace.ring_path(self.name).unlink()
             if self._server is not None:
                 self._server.close()
-            self._ring.set_state(_layout.STATE_CLOSED)
+            self._ring.set_state(file_layout.STATE_CLOSED)
             segment.descriptor.close()
             self._name_lock.close()
 
@@ -200,12 +200,12 @@ class Ownership:
         schema: Schema,
         static: Mapping[str, npt.NDArray[Any]],
         period_ns: int,
-        previous: _segment.Segment | None,
+        previous: segments.Segment | None,
         published_before: int,
     ) -> None:
         """All that can fail comes before the file takes its place; until then the generation before goes on."""
         with self._changing:
-            segment = _segment.create(
+            segment = segments.create(
                 self.namespace,
                 self.name,
                 schema,
@@ -217,15 +217,15 @@ class Ownership:
             )
             try:
                 ring = RingWriter(segment)
-                ring.set_state(_layout.STATE_PAUSED, self._paused)
-                _segment.publish(segment, self.namespace, self.name)
+                ring.set_state(file_layout.STATE_PAUSED, self._paused)
+                segments.publish(segment, self.namespace, self.name)
             except BaseException:
-                _segment.discard(segment)
+                segments.discard(segment)
                 raise
             self._ring, self._schema, self._static, self._period_ns = ring, schema, dict(static), period_ns
             self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
             if previous is not None:
-                previous.mark(_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
+                previous.mark(file_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
                 previous.descriptor.close()
 
     def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int) -> None:
@@ -237,7 +237,7 @@ class Ownership:
         self._require_open()
         with self._changing:
             self._paused = paused
-            self._ring.set_state(_layout.STATE_PAUSED, paused)
+            self._ring.set_state(file_layout.STATE_PAUSED, paused)
         if self._server is not None:
             self._server.paused = paused
 
@@ -249,7 +249,7 @@ class Ownership:
         if _removed(self._name_lock.fd):
             self.namespace.create(self._group)
             try:
-                name_lock = _segment.take_name(self.namespace, self.name)
+                name_lock = segments.take_name(self.namespace, self.name)
             except NameInUse:
                 self.close()
                 raise

@@ -8,8 +8,8 @@ from typing import Self
 
 from skinware._renamed import renamed
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
-from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
@@ -79,7 +79,9 @@ class ServiceReader(Attachment[FrameT]):
         Raises:
             Closed: this reader was closed, or belongs to the process before a fork.
         """
-        self._keep_up()
+        self._require_open()
+        if not self._moved:
+            self._follow()
         return self.latest
 
     def read(

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from skinware.errors import NamespaceError
-from skinware.memory._locks import ForkGuard
+from skinware.memory.locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service.messages import (
@@ -210,7 +210,7 @@ class RequestServer(ForkGuard):
         self.abandon()
 
     def abandon(self) -> None:
-        """See :class:`skinware.memory._locks.ForkGuard`."""
+        """See :class:`skinware.memory.locks.ForkGuard`."""
         for peer in self._peers.values():
             peer.connection.close()
         self._peers = {}

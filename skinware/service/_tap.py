@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from skinware.errors import Overrun
-from skinware.memory._futex import Word
+from skinware.memory.futex import Word
 from skinware.memory.ring import FrameT
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy.typing as npt
 
 from skinware.errors import Closed, Paused
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
@@ -17,7 +17,7 @@ from skinware.service._ownership import Columns, Ownership
 from skinware.service._server import Request
 from skinware.service.messages import ACQUIRE
 
-DEFAULT_SLOTS = _layout.DEFAULT_SLOTS
+DEFAULT_SLOTS = file_layout.DEFAULT_SLOTS
 _LONGEST_WAIT_S = 1.0
 
 

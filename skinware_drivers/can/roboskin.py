@@ -18,7 +18,6 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
-from skinware.status import Status
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.roboskin_boards import BoardOperations
 from skinware_drivers.can.roboskin_layout import (
@@ -47,8 +46,8 @@ from skinware_drivers.can.roboskin_options import (
     SpecialBoards,
     runs_text,
 )
-from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp
-from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp, tell_what_fits
+from skinware_drivers.can.roboskin_watch import BaselineWatch
 from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
@@ -63,41 +62,9 @@ _AFTER_CONFIGURATION_S = 0.5
 _BETWEEN_SPECIALS_S = 0.01
 _OLD_CALIBRATION_PERIODS = 4
 """For so long an MTB3 that was set up the old way sends nothing, at the most."""
-_RECALIBRATION_CYCLES = 5
-"""A board re-calibrates all its triangles after this many cycles with a channel that does not acknowledge though it
-is connected (embot_app_application_theSkin.cpp)."""
 _MTB3_TYPE = 5
 _SKIN_BOARD_TYPES = (_MTB3_TYPE, 11, 16, 20)
 """Board types in answers: mtb (MTB3), mtb4, mtb4w, mtb4c (icub-firmware embot_prot_can.h)."""
-
-
-class BaselineWatch(Watch):
-    """Marks boards that will have moved their baseline without a word.
-
-    After five cycles with a channel that does not acknowledge though it is connected (several such triangles count
-    together), the firmware re-calibrates every triangle of the board, and the flag goes away. What the board sends
-    from then on is measured from an unknown baseline, until it is set up again.
-    """
-
-    def __init__(self, tables: SkinTables) -> None:
-        super().__init__(tables)
-        self._not_acknowledged = np.zeros(tables.structure.n_patches, np.int64)
-
-    def look(self, updates: Updates) -> None:
-        """Count what was not acknowledged, per board; see :class:`skinware_drivers.adapter.Watch`."""
-        status = updates.status[:, 0]  # these flags are of all sensors of a triangle
-        silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
-        if not silent.any():
-            return
-        module_patch = self.tables.structure.module_patch
-        np.add.at(self._not_acknowledged, module_patch[updates.module[silent]], 1)
-        moved = self._not_acknowledged >= _RECALIBRATION_CYCLES
-        self.module_status[moved[module_patch]] |= np.uint8(Status.SUSPECT)
-
-    def forget(self, patch: int) -> None:
-        """The board was set up anew, so its baseline is known again."""
-        super().forget(patch)
-        self._not_acknowledged[patch] = 0
 
 
 class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
@@ -143,6 +110,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             self._take_found(link, {a.identifier >> 4 & 0xF: a.payload[1] for a in answers if len(a.payload) >= 5})
         if not self._told:
             self._tell_what_is_odd(link)
+            tell_what_fits(link.bus_name, self._set_ups(self._boards))
         self._told = bool(self._boards)
         self._fit_boards()
         return self.patches_set_up(self._boards)

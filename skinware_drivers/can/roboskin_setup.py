@@ -10,15 +10,22 @@ from them: it sends all triangles every 40 ms, in message class 4.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 
 from skinware_drivers.can.roboskin_options import TRIANGLES, Inertial, Kind, RoboskinOptions, runs
+
+log: logging.Logger = logging.getLogger("skinware.driver")
 
 OLD_MTB4_PERIOD_MS = 40
 START, STOP = b"\x07\x00", b"\x07\x01"
 """SET_TXMODE; the polarity is as odd as it looks."""
 
 _TICKS_PER_MS = 312.5
+_FRAMES_OF_A_TRIANGLE, _FRAME_MS = 2, 0.13
+"""In a period; each of 8 bytes under 11 bits, at 1 Mbit/s with an ordinary number of stuff bits."""
 _OWN_TIMER = 3
 _COMPENSATED = 0x08
 _NOT_COMPENSATED_TYPE = 2
@@ -174,3 +181,23 @@ class BoardSetUp:
         if is_mtb4:
             self._on.update(range(TRIANGLES))
             self.period_ms = OLD_MTB4_PERIOD_MS
+
+
+def tell_what_fits(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
+    """Warn if the boards send more than their wire can carry: the lowest address wins, the highest starves."""
+    shares = [_FRAMES_OF_A_TRIANGLE * len(board.enabled) * _FRAME_MS / board.period_ms for board in set_ups]
+    needed = sum(shares)
+    if needed <= 1:
+        return
+    fitting = sum(share <= 1 for share in accumulate(shares))
+    period_ms = max(board.period_ms for board in set_ups)
+    log.warning(
+        "%s: %d boards every %d ms need %.0f %% of a CAN bus of 1 Mbit/s: those of the highest addresses will be silent"
+        " now and then, or always; the first %d fit, or all of them with period_ms = %d",
+        bus_name,
+        len(shares),
+        period_ms,
+        100 * needed,
+        fitting,
+        math.ceil(period_ms * needed),
+    )

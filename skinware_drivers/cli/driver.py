@@ -190,7 +190,7 @@ def command(
     file = _read(config)
     settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
-    is_named = bool(driver_name or settings.driver)
+    is_of_file, is_named = not driver_name, bool(driver_name or settings.driver)
     driver_name = driver_name or settings.driver or DEFAULT_DRIVER
     driver_type = short_name(driver_name)
     driver = load_driver(driver_name)
@@ -224,6 +224,11 @@ def command(
     async def read_buses_again() -> None:
         if config is not None and not buses:  # what the command line names is not the file's to change
             new = _read(config)
+            wanted_driver = new.settings.driver or DEFAULT_DRIVER
+            if is_of_file and wanted_driver != driver_name:
+                raise ConfigurationError(
+                    f"{config}: driver = {wanted_driver!r}, and {driver_name!r} is running: stop it and start it again"
+                )
             _refuse_twice([bus.name for bus in new.settings.bus])
             wanted = {bus.name: adapter_of(bus.name, new) for bus in new.settings.bus}
             await runner.buses.change_to(wanted, lambda name, adapter: bus_of(name, adapter, new))

@@ -75,8 +75,15 @@ class Pairing:
         place[~is_module[order]] = n
         is_member = place < n
         place[severed[order]] = n
-        soon, held_up, doubtful = self._judge(shared, place, time_ns)
-        starts = self._find_cycles(shared, place, soon | held_up, doubtful)
+        out_of_time, doubtful, soon = np.zeros((3, len(place)), bool)
+        judged = None
+        if self._punctuality is not None:
+            members = np.flatnonzero(place < n)
+            kinds = shared[members] * n + place[members]
+            judged = self._punctuality.judge(kinds, time_ns[members])
+            soon[members], doubtful[members] = judged.soon, judged.doubtful
+            out_of_time[members] = judged.soon | judged.held_up
+        starts = self._find_cycles(shared, place, out_of_time, doubtful)
         in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._maximum_age_ns
         used = np.zeros(len(order), bool)
         too_late, starts = starts[~in_time], self._apart(starts[in_time])
@@ -86,10 +93,11 @@ class Pairing:
         waiting = self._still_hoping(shared, place, group, used)
         is_orphan = is_member & ~used
         is_orphan[waiting] = False
-        if self._punctuality is not None:
-            over = place < n
-            over[waiting] = False
-            self._punctuality.remember(shared[over] * n + place[over], time_ns[over])
+        if self._punctuality is not None and judged is not None:
+            is_waiting = np.zeros(len(place), bool)
+            is_waiting[waiting] = True
+            over = ~is_waiting[members]
+            self._punctuality.remember(kinds[over], time_ns[members][over], judged.spacing_ns[over])
         rows = order[windows]
         last = rows[:, -1]
         if self._order != "given":
@@ -98,16 +106,6 @@ class Pairing:
         by_arrival = np.argsort(np.concatenate([last, orphans]), kind="stable")
         rows = np.concatenate([rows, np.repeat(orphans[:, None], n, axis=1)])[by_arrival]
         return Pairs(rows, by_arrival < len(last), order[too_late], np.sort(order[waiting]), order[soon & is_orphan])
-
-    def _judge(self, shared: Indices, place: Places, time_ns: Indices) -> tuple[Flags, Flags, Flags]:
-        """(m,) bool each: see ``Punctuality.judge``."""
-        judged = np.zeros((3, len(place)), bool)
-        if self._punctuality is not None:
-            members = np.flatnonzero(place < self._n)
-            kind = shared[members] * self._n + place[members]
-            judged[:, members] = self._punctuality.judge(kind, time_ns[members])
-        soon, held_up, doubtful = judged
-        return soon, held_up, doubtful
 
     def _find_cycles(self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags) -> Indices:
         """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap."""

@@ -14,6 +14,8 @@ is not given, all of them must: there, the end of a cycle and the beginning of t
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
@@ -24,6 +26,22 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 _NEVER_NS = -(1 << 62)
+
+
+class Judgement(NamedTuple):
+    """How frames come.
+
+    Attributes:
+        soon: (m,) bool: within the maximum age of the one before.
+        held_up: (m,) bool: too late for that.
+        doubtful: (m,) bool: held up, or after one that was lost.
+        spacing_ns: (m,) int64, time since the frame of the same kind before.
+    """
+
+    soon: Flags
+    held_up: Flags
+    doubtful: Flags
+    spacing_ns: Indices
 
 
 class Punctuality:
@@ -44,42 +62,37 @@ class Punctuality:
         self._last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
         self._spacing_ns = np.full(n_modules * self._n, self._period_ns, np.int64)
 
-    def judge(self, kind: Indices, time_ns: Indices) -> tuple[Flags, Flags, Flags]:
+    def judge(self, kind: Indices, time_ns: Indices) -> Judgement:
         """Tell how frames come.
 
         Args:
             kind: (m,) module * members + place in the cycle, of each frame, in order of arrival.
             time_ns: (m,) stamps.
-
-        Returns:
-            (m,) bool each: it comes soon; it was held up; it may have been, for it does not come as it should.
         """
-        order, follows, spacing_ns = self._spacings(kind, time_ns)
-        usual_ns = np.where(follows, np.roll(spacing_ns, 1), self._spacing_ns[kind[order]])
+        order = np.argsort(kind, kind="stable")
+        kind, time_ns = kind[order], time_ns[order]
+        follows = np.flatnonzero(kind[1:] == kind[:-1]) + 1
+        before_ns, usual_ns = self._last_ns[kind], self._spacing_ns[kind]
+        before_ns[follows] = time_ns[follows - 1]
+        spacing_ns = time_ns - before_ns
+        spacing_ns[before_ns == _NEVER_NS] = self._period_ns
+        usual_ns[follows] = spacing_ns[follows - 1]
+        soon = spacing_ns <= self._soon_ns
         late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns
-        about_two = 2 * np.abs(spacing_ns - 2 * self._period_ns) < self._period_ns - self._reach_ns
-        judged = np.empty((3, len(kind)), bool)
-        judged[:, order] = spacing_ns <= self._soon_ns, late if self._all_as_they_should else late & ~about_two, late
-        soon, held_up, doubtful = judged
-        return soon, held_up, doubtful
+        held_up = late
+        if not self._all_as_they_should and late.any():
+            held_up = late & (2 * np.abs(spacing_ns - 2 * self._period_ns) >= self._period_ns - self._reach_ns)
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
 
-    def remember(self, kind: Indices, time_ns: Indices) -> None:
+    def remember(self, kind: Indices, time_ns: Indices, spacing_ns: Indices) -> None:
         """These frames have come, in this order, and will not be judged again."""
-        order, _, spacing_ns = self._spacings(kind, time_ns)
-        self._spacing_ns[kind[order]] = spacing_ns
-        self._last_ns[kind[order]] = time_ns[order]
+        self._spacing_ns[kind] = spacing_ns
+        self._last_ns[kind] = time_ns
 
     def forget(self, modules: Indices) -> None:
         """These modules have restarted, and their time with them."""
         kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
         self._last_ns[kinds] = _NEVER_NS
         self._spacing_ns[kinds] = self._period_ns
-
-    def _spacings(self, kind: Indices, time_ns: Indices) -> tuple[Indices, Flags, Indices]:
-        """The frames kind by kind, which of them follow one of the same kind, and the time since that, ns."""
-        order = np.argsort(kind, kind="stable")
-        kind, time_ns = kind[order], time_ns[order]
-        follows = np.zeros(len(kind), bool)
-        follows[1:] = kind[1:] == kind[:-1]
-        before_ns = np.where(follows, np.roll(time_ns, 1), self._last_ns[kind])
-        return order, follows, np.where(before_ns == _NEVER_NS, self._period_ns, time_ns - before_ns)

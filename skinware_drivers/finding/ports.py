@@ -5,12 +5,12 @@ Sources: Documentation/ABI/testing/sysfs-tty and sysfs-bus-usb; drivers/usb/seri
 
 from __future__ import annotations
 
-import grp
 import os
 import pwd
-import stat
 from dataclasses import dataclass
 from pathlib import Path
+
+from skinware_drivers.serial.opening import group_that_may
 
 SLOW_LATENCY_MS = 1
 """A latency timer above this holds back what a device has sent: FTDI's default is 16 ms."""
@@ -147,7 +147,7 @@ def pseudo_terminal(path: str, machine: Machine | None = None) -> SerialPort | N
 
 def _port(path: Path, device: Path, links: tuple[str, ...], users: tuple[User, ...], all_seen: bool) -> SerialPort:
     info = path.stat()
-    group = _group_that_may(info)
+    group = group_that_may(info)
     latency = _text(device / "latency_timer")
     return SerialPort(
         path=str(path),
@@ -193,16 +193,6 @@ def _interface_number(device: Path, usb_device: Path) -> str:
         if (folder / "bInterfaceNumber").exists():
             return _text(folder / "bInterfaceNumber")
     return ""
-
-
-def _group_that_may(info: os.stat_result) -> grp.struct_group | None:
-    """The group whose members may read and write."""
-    if info.st_mode & (stat.S_IRGRP | stat.S_IWGRP) != stat.S_IRGRP | stat.S_IWGRP or info.st_gid == 0:
-        return None
-    try:
-        return grp.getgrgid(info.st_gid)
-    except KeyError:
-        return None
 
 
 def _user_name() -> str:

@@ -54,6 +54,7 @@ class BusLine:
         lost: set while it is away.
         suspects: keys of the patches that report errors.
         revived_ns: when one of its patches was last set up anew.
+        set_up_ns: when all of it was last set up.
         busy: held while its devices are being set up or asked to do something, and may be silent for it.
     """
 
@@ -77,6 +78,7 @@ class BusLine:
         self.busy: asyncio.Lock = asyncio.Lock()
         self.suspects: set[int] = set()
         self.revived_ns = 0
+        self.set_up_ns = 0
         self._epoll = epoll
         self.limits: BusLimits = BusLimits(name, bus)
         self._news = BusNews()
@@ -265,7 +267,7 @@ class BusLine:
                 self._news.tell(f"{self.name}: set-up failed: {error}; trying again")
                 self._check(now_ns())
             else:
-                self._speaks_from_ns = now_ns()
+                self.set_up_ns = self._speaks_from_ns = now_ns()
                 return
 
     def begin_lost(self, error: BusNotAvailable | None = None) -> None:

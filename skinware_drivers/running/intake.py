@@ -13,7 +13,8 @@ from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import bus_failure
 
 _TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
-_REST, _REST_WHILE_ASKING = 16, 4  # after a take: so many times its duration, while more arrives (decision 0006)
+_REST, _REST_WHILE_ASKING, _REST_IN_STEP = 16, 4, 1
+"""After a take: so many times its duration, while more arrives (decision 0006)."""
 DEFAULT_LATENCY_S = 0.005
 """What the longest rest is if nobody says."""
 
@@ -83,7 +84,10 @@ class Intake:
             self.start()
         else:
             loop.remove_reader(self._epoll.fileno())
-            factor = _REST_WHILE_ASKING if any(line.link.is_awaiting for line in self._lines) else _REST
+            links = [line.link for line in self._lines]
+            factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
+            if any(link.expects_data for link in links):
+                factor = _REST_IN_STEP  # the answer alone is what comes, and then the next question
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self._latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 

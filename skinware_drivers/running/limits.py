@@ -14,8 +14,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 HIGH_LOAD = 0.8
 """Of what the wire can carry. Beyond it, frames of low priority wait for long."""
-FULL = 0.95
-"""From here on they may wait indefinitely: what the wire takes is an estimate."""
+FULL = 0.9
+"""From here on they may wait indefinitely: how many bits a frame takes is an estimate."""
 HIGH_FILL = 0.5
 """Of the receive buffer."""
 SOFTNET = Path("/proc/net/softnet_stat")
@@ -43,6 +43,7 @@ class BusLimits:
 
     Attributes:
         load: share of the wire's time in use, over the last second; None where that is not known.
+        load_from_ns: when that second began.
     """
 
     def __init__(self, name: str, bus: Bus, clock: Callable[[], int] = now_ns) -> None:
@@ -54,6 +55,7 @@ class BusLimits:
         self._lost = bus.counters.lost
         self._told: set[str] = set()
         self.load: float | None = None
+        self.load_from_ns = 0
 
     def look(self) -> None:
         """Look at the bus, if the last look was a second ago."""
@@ -61,7 +63,7 @@ class BusLimits:
         passed_ns = time_ns - self._looked_ns
         if passed_ns < _LOOK_PAUSE_NS:
             return
-        bus, self._looked_ns = self._bus, time_ns
+        bus, self.load_from_ns, self._looked_ns = self._bus, self._looked_ns, time_ns
         bits, self._bits = bus.wire_bits - self._bits, bus.wire_bits
         self.load = share_of_time(bus, bits, passed_ns)
         fill, bus.fullest = bus.fullest, 0.0
@@ -77,6 +79,10 @@ class BusLimits:
     def is_full(self) -> bool:
         """Whether frames of low priority may find no room at all."""
         return self.load is not None and self.load > FULL
+
+    def knows_load_since(self, time_ns: int) -> bool:
+        """Whether the load is that of a time after this, as far as it will ever be known."""
+        return not self._bus.bit_rate or self.load_from_ns >= time_ns
 
     @property
     def permille(self) -> int:

@@ -116,7 +116,7 @@ class PatchCare:
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         """Whether a silent patch answers, and has not been set up in vain a moment ago."""
         line, set_ups = self._line, self._set_ups.get(patch.key)
-        if set_ups is not None and not set_ups.are_due:
+        if (set_ups is not None and not set_ups.are_due) or not line.limits.knows_load_since(line.set_up_ns):
             return False
         try:
             with hook("probe", line.name):

@@ -300,7 +300,8 @@ class Runner:
 
     @property
     def _period_s(self) -> float:
-        return max(line.adapter.period_s for line in self.lines)
+        present = [line for line in self.lines if line.reason != BusReason.REMOVED] or self.lines
+        return max(line.adapter.period_s for line in present)
 
     def _after_operation(self, line: BusLine, patches: Sequence[Patch], set_up: bool) -> None:
         generation = self.generation

@@ -112,7 +112,7 @@ class Serving:
                 if not self._listen_only:
                     await line.set_up()
                     beside.create_task(self._poll(line))
-                async with self._built:  # other buses may still be asked what hangs on them
+                async with self._built:  # others may still be asked what is there
                     await self._built.wait_for(lambda: self._generation() is not None)
                 await care.check_data()
                 self._tell_ready()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import grp
 import os
+import stat
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -127,11 +129,11 @@ def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | Co
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO):
         return BusNotAvailable(f"no serial port {path}; {_known_ports(list(list_ports.comports()))}")
     if number in (errno.EACCES, errno.EPERM):
-        group = _group_of(path)
-        return BusNotAvailable(
-            f"{path}: permission denied; for good: sudo usermod -aG {group} $USER, and log in again",
-            reason=BusReason.REFUSED,
-        )
+        advice = "give it a group or uaccess by a udev rule (skin-find --udev)"
+        with contextlib.suppress(OSError):
+            if group := group_that_may(os.stat(path)):
+                advice = f"sudo usermod -aG {group.gr_name} $USER, and log in again"
+        return BusNotAvailable(f"{path}: permission denied; for good: {advice}", reason=BusReason.REFUSED)
     if number in (errno.EAGAIN, errno.EBUSY):
         return BusNotAvailable(
             f"{path}: another program has it open; which one: fuser -v {path}", reason=BusReason.REFUSED
@@ -141,11 +143,14 @@ def _refusal(path: str, error: Exception, baudrate: int) -> BusNotAvailable | Co
     return BusNotAvailable(f"{path} cannot be opened as a serial port: {error}", reason=BusReason.FAILED)
 
 
-def _group_of(path: str) -> str:
+def group_that_may(info: os.stat_result) -> grp.struct_group | None:
+    """The group whose members may read and write."""
+    if info.st_mode & (stat.S_IRGRP | stat.S_IWGRP) != stat.S_IRGRP | stat.S_IWGRP or info.st_gid == 0:
+        return None
     try:
-        return grp.getgrgid(os.stat(path).st_gid).gr_name
-    except (OSError, KeyError):
-        return "dialout"
+        return grp.getgrgid(info.st_gid)
+    except KeyError:
+        return None
 
 
 def _known_ports(ports: list[Any]) -> str:
@@ -153,4 +158,4 @@ def _known_ports(ports: list[Any]) -> str:
     return f"there are: {', '.join(known)}" if known else "there is none at all"
 
 
-__all__ = ["DEFAULT_BAUDRATE", "SerialOptions", "find_port", "open_port"]
+__all__ = ["DEFAULT_BAUDRATE", "SerialOptions", "find_port", "group_that_may", "open_port"]

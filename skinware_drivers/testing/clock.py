@@ -26,7 +26,7 @@ from skinware_drivers.testing.defect import defect
 
 T = TypeVar("T")
 
-_AUTHORS_LOGS = [logging.getLogger(f"skinware.driver.{hook}") for hook in ("expand", "polls")]
+_EXPAND_LOG = logging.getLogger("skinware.driver.expand")
 """Where exceptions are told that the package caught from a driver's code."""
 _BEGINNING_NS = 5_000_000_000_000
 _TURNS_AT_ONE_MOMENT = 20_000
@@ -35,7 +35,8 @@ _NAP_S = 0.05
 _LOOKS_A_SECOND = 50
 _ASLEEP_LOOKS = 40
 """So often in a row the loop's thread must be found asleep in the same turn to be called blocked."""
-_LONGEST_TURN_S = 30.0
+_LONGEST_TURN_S = 10.0
+"""Of processor time."""
 
 
 class HandClock:
@@ -227,14 +228,12 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
 
     thread = threading.Thread(target=work, name="driver under test", daemon=True)  # one that hangs must not hang pytest
     told = _Told(unseen)
-    for log in _AUTHORS_LOGS:
-        log.addHandler(told)
+    _EXPAND_LOG.addHandler(told)
     try:
         thread.start()
         _watch(thread, clock)
     finally:
-        for log in _AUTHORS_LOGS:
-            log.removeHandler(told)
+        _EXPAND_LOG.removeHandler(told)
     if unseen:
         defect(unseen[0])
     if failures:
@@ -259,29 +258,30 @@ class _Told(logging.Handler):
 
 def _watch(thread: threading.Thread, clock: HandClock) -> None:
     """Wait for a thread whose loop should never block."""
-    turn, asleep, since_s = -1, 0, time.monotonic()
+    turn, asleep, since_s = -1, 0, 0.0
     while True:
         thread.join(1 / _LOOKS_A_SECOND)
         if not thread.is_alive():
             return
         if clock.turns != turn:
-            turn, asleep, since_s = clock.turns, 0, time.monotonic()
+            turn, asleep, since_s = clock.turns, 0, _look_at(thread)[1]
             continue
-        asleep = asleep + 1 if _is_asleep(thread) else 0
+        is_asleep, used_s = _look_at(thread)
+        asleep = asleep + 1 if is_asleep else 0
         if asleep > _ASLEEP_LOOKS:
             defect(f"the driver blocks, nothing is read from any bus meanwhile; it hangs here:\n{_where(thread)}")
-        if time.monotonic() - since_s > _LONGEST_TURN_S:
+        if used_s - since_s > _LONGEST_TURN_S:
             defect(f"the driver is busy for ever, here:\n{_where(thread)}")
 
 
-def _is_asleep(thread: threading.Thread) -> bool:
-    """Whether the kernel says that it waits for something, rather than for a processor."""
+def _look_at(thread: threading.Thread) -> tuple[bool, float]:
+    """Whether the kernel says that it waits for something, rather than for a processor; and what it used of one, s."""
     try:
         with open(f"/proc/self/task/{thread.native_id}/stat") as file:
-            status = file.read()
+            state, *numbers = file.read().rpartition(")")[2].split()
     except OSError:
-        return False
-    return status.rpartition(")")[2].split()[0] == "S"
+        return False, 0.0
+    return state == "S", (int(numbers[10]) + int(numbers[11])) / os.sysconf("SC_CLK_TCK")
 
 
 def _where(thread: threading.Thread) -> str:

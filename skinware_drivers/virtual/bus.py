@@ -15,6 +15,7 @@ from skinware.samples import Unused
 from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, emulators_instead, load_emulator
+from skinware_drivers.virtual.stage import Stage
 from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 DEFAULT_EMULATOR = "roboskin"
@@ -68,6 +69,8 @@ class VirtualCanBus(Bus):
             emulator = load_emulator(self._emulated)
             hardware = emulator(options_from_strings(emulator.Options, self.options))
         self.hardware = hardware
+        self._wire = hardware.wire if isinstance(hardware, Stage) else None
+        self.bit_rate: int = self._wire.bit_rate if self._wire else 0
         self._clock = clock
         self._make_timer = make_timer
         self._timer: Timer | None = None
@@ -143,6 +146,8 @@ class VirtualCanBus(Bus):
         now_ns = self._clock()
         if len(self._pending) < batch.free:
             self._fetch(now_ns)
+        if self._wire is not None:
+            self.wire_bits = self._wire.bits
         frames, self._pending = self._pending[: batch.free], self._pending[batch.free :]
         if frames:
             self._append(batch, ordinal, frames)

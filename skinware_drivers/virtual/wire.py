@@ -15,7 +15,7 @@ from skinware_drivers.virtual.events import Half
 from skinware_drivers.virtual.hardware import WireFrame
 
 _EXTENDED_FLAG = 0x8000_0000
-_BIT_NS = 1000
+_BIT_NS, _NS_PER_S = 1000, 1_000_000_000
 """1 Mbit/s (icub-main:src/libraries/icubmod/canBusSkin/CanBusSkin.cpp)."""
 
 _wire_frame = partial(tuple.__new__, WireFrame)
@@ -92,6 +92,17 @@ class Wire:
         self.transmitters: list[Transmitter] = []
         self.heard: list[WireFrame] = []
         self._free_ns = 0
+        self._busy_ns = 0
+
+    @property
+    def bit_rate(self) -> int:
+        """Bit/s."""
+        return self.speed * _NS_PER_S // _BIT_NS
+
+    @property
+    def bits(self) -> float:
+        """That went over it so far."""
+        return self._busy_ns * self.speed / _BIT_NS
 
     def attach(self) -> Transmitter:
         """A new device on the wire."""
@@ -136,6 +147,7 @@ class Wire:
                 at = first + len(starts)
                 starts.append(end_ns)
                 end_ns += frame_time_ns(identifiers[at], len(payloads[at])) // self.speed
+        self._busy_ns += end_ns - start_ns
         self._free_ns = end_ns
         transmission.sent = last = first + len(starts)
         frames = list(map(_wire_frame, zip(starts, identifiers[first:last], payloads[first:last], strict=True)))

@@ -116,6 +116,13 @@ static void print_types(const skinware_reader *reader, const skinware_frame *fra
             printf("%s", k ? ", " : "");
             print_number((double)physical[k]);
         }
+        unsigned char *fresh = (unsigned char *)malloc(count + 1);
+        if (fresh == NULL || skinware_fresh(reader, frame, 3600 * INT64_C(1000000000), positions, count, fresh) > count)
+            abort();
+        printf("], \"fresh\": [");
+        for (k = 0; k < count; k++)
+            printf("%s%d", k ? ", " : "", fresh[k]);
+        free(fresh);
         printf("], \"range\": [");
         print_number(type->minimum);
         printf(", ");

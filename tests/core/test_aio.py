@@ -15,7 +15,7 @@ import skinware.aio
 from skinware import DriverReader, Frame, ServiceReader, ServiceWriter, Skin
 from skinware.aio import _wakeups
 from skinware.errors import RequestFailed, RequestTimeout, ServiceTimeout, StructureChanged
-from skinware.memory import _futex
+from skinware.memory import futex
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.core.services import SMALL, on_request, publish
 
@@ -75,7 +75,7 @@ def test_many_readers_wait_in_one_thread() -> None:
     async def main() -> None:
         with ServiceWriter("x", SMALL) as writer:
             publish(writer, 1)
-            readers = [Reader(ServiceReader("x", announce=False)) for _ in range(_futex.MAX_WORDS + 10)]
+            readers = [Reader(ServiceReader("x", announce=False)) for _ in range(futex.MAX_WORDS + 10)]
             first = [await reader.read() for reader in readers]
             tasks = [
                 asyncio.create_task(reader.read(newer_than=frame, timeout_s=60))
@@ -200,6 +200,25 @@ async def _all(frames: AsyncIterator[object]) -> None:
         pass
 
 
+def test_a_successor_of_which_nobody_tells_is_found() -> None:
+    """Somebody removed the file: the old one is not marked, and nobody is woken."""
+
+    async def main() -> None:
+        with ServiceWriter("x", SMALL) as writer:
+            publish(writer, 1)
+            async with Reader(ServiceReader("x")) as reader:
+                frame = await reader.read()
+                task = asyncio.create_task(reader.read(newer_than=frame, timeout_s=60))
+                await until_asleep()
+                for path in (writer.namespace.ring_path("x"), writer.namespace.path / "x.lock"):
+                    path.unlink()
+                with ServiceWriter("x", SMALL) as successor:
+                    publish(successor, 2)
+                    assert (await soon(task)).generation == successor.generation
+
+    asyncio.run(main())
+
+
 def test_requests_are_awaited() -> None:
     async def main() -> None:
         async with Reader(ServiceReader("x")) as reader:
@@ -226,24 +245,32 @@ def test_a_writer_that_does_not_answer_is_not_waited_for_too_long() -> None:
 
 
 def test_the_child_of_a_fork_waits_in_a_thread_of_its_own() -> None:
-    async def wait_once() -> None:
-        with ServiceWriter(f"of-{os.getpid()}", SMALL) as writer:
+    async def wait_once(name: str, between: Callable[[], None]) -> None:
+        with ServiceWriter(name, SMALL) as writer:
             publish(writer, 1)
-            async with Reader(ServiceReader(writer.name)) as reader:
-                frame = await reader.read()
-                task = asyncio.create_task(reader.read(newer_than=frame, timeout_s=60))
+            async with Reader(ServiceReader(name)) as reader:
+                task = asyncio.create_task(reader.read(newer_than=await reader.read(), timeout_s=60))
                 await until_asleep()
+                thread = _wakeups._of_process._thread
+                assert thread is not None
+                assert thread.is_alive()
+                await asyncio.to_thread(between)
                 publish(writer, 2)
                 await soon(task)
 
-    asyncio.run(wait_once())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of Python itself, about threads and forks
-        child = os.fork()
-    if not child:
-        asyncio.run(wait_once())
-        os._exit(0)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    def fork() -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of Python itself, about threads and forks
+            child = os.fork()
+        if not child:
+            try:
+                asyncio.run(wait_once("child", lambda: None))
+                os._exit(0)
+            finally:
+                os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+    asyncio.run(wait_once("parent", fork))
 
 
 def test_a_skin_of_no_driver_waits_for_one() -> None:

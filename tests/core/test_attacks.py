@@ -18,9 +18,9 @@ from typing import Any
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader
-from skinware.memory import _layout
-from skinware.memory._locks import _FLOCK
+from skinware.memory import file_layout
 from skinware.memory.announcement import _SIZE, living_readers, sweep
+from skinware.memory.locks import _FLOCK
 from skinware.service._server import short_path
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.users import (
@@ -169,7 +169,7 @@ def wake_ups(board: Path) -> int:
     """Wake all readers without an end, and move them to a futex that nobody wakes."""
     with ServiceReader[Frame]("x", announce=False) as reader:
         start = reader._ring.segment.data.ctypes.data
-        address, elsewhere = start + _layout.WAKE_WORD_OFFSET, start + _layout.STATISTICS_OFFSET
+        address, elsewhere = start + file_layout.WAKE_WORD_OFFSET, start + file_layout.STATISTICS_OFFSET
         libc = ctypes.CDLL(None)
         moved = 0
         for _ in turns_of_an_attack(board):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from skinware import BusState, DriverReader, DriverWriter, PatchState
+from skinware.realtime import now_ns
 from tests.compiling import compiled
 from tests.core.c_programs import structure
 
@@ -43,6 +44,7 @@ def publish(writer: DriverWriter, value: int) -> None:
     columns["values"][:] = value
     columns["status"][:] = 0
     columns["status"][0] = 2  # the first pressure sensor is stale
+    columns["module_time_ns"][:] = now_ns()
     writer.commit(1)
 
 
@@ -52,14 +54,14 @@ def test_the_reading_program(language: str, tmp_path: Path, tmp_path_factory: py
     source.write_text(program_text("c", "/* touch.c"))
     program = compiled(source, language, tmp_path_factory)
     assert subprocess.run([program, "torso"], capture_output=True).returncode == 1
-    writer = DriverWriter("torso", structure())
+    writer = DriverWriter("torso", structure(), rate_hz=0.1)
     publish(writer, 10)
     with lines_of(program, "torso") as lines:
         assert next(lines) == "frame 1: 2.0 Pa over 17 of 18 taxels\n"
         publish(writer, 20)
         assert next(lines) == "frame 2: 7.0 Pa over 17 of 18 taxels\n"
         writer.close()
-        with DriverWriter("torso", structure()) as writer:
+        with DriverWriter("torso", structure(), rate_hz=0.1) as writer:
             publish(writer, 30)
             assert next(lines) == "frame 1: 12.0 Pa over 17 of 18 taxels\n"
             writer.restructure(structure(n_modules=2))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from skinware import DriverReader, Namespace
 from skinware.errors import BadServiceFile
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from skinware.memory.namespace import ROOT
 from tests.compiling import compiled
 from tests.core.c_programs import SOURCE, STRAIN, ring_file, run, talking
@@ -124,7 +124,7 @@ def test_names_that_cannot_be_are_refused(program: Path, name: str) -> None:
         assert json.loads(result.stdout)["text"] == "not the name of a service or namespace"
 
 
-HEAD_BITS = 8 * (_layout.COLUMN_OFFSET + 30 * _layout.COLUMN.itemsize)
+HEAD_BITS = 8 * (file_layout.COLUMN_OFFSET + 30 * file_layout.COLUMN.itemsize)
 FLIPS = st.one_of(st.integers(0, HEAD_BITS - 1), st.integers(0, 8 * 4096 * 4))
 WORDS = st.tuples(
     st.integers(0, HEAD_BITS // 32 - 1),
@@ -155,7 +155,7 @@ def test_damage_of_any_kind_does_no_harm(
             talk.tell("x")
             if talk.next()["event"] == "attached":
                 attached += 1
-                _layout.parse(bytes(damaged), "x", len(damaged))  # what C takes, Python takes
+                file_layout.parse(bytes(damaged), "x", len(damaged))  # what C takes, Python takes
             else:
                 refused += 1
 

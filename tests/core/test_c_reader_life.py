@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skinware import ServiceWriter
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from tests.core.c_programs import lone_writer, run, talking
 from tests.core.workers import kill
 
@@ -78,7 +78,7 @@ def test_pause_resume_restructure_and_close_are_told_at_once(any_program: Path) 
         assert talk.next()["event"] == "frame"
         writer.pause()
         seen = talk.next()
-        assert (seen["event"], seen["state"], seen["value"]) == ("paused", _layout.STATE_PAUSED, 1)
+        assert (seen["event"], seen["state"], seen["value"]) == ("paused", file_layout.STATE_PAUSED, 1)
         talk.stop()  # so that it sees the end of the pause and the frame at the same moment
         writer.resume()
         publish(2)
@@ -105,5 +105,5 @@ def test_pause_resume_restructure_and_close_are_told_at_once(any_program: Path) 
         seen = talk.next()
         while seen["event"] == "interrupted":
             seen = talk.next()
-        assert (seen["event"], seen["state"], seen["stale"], seen["value"]) == ("gone", _layout.STATE_CLOSED, 1, 4)
+        assert (seen["event"], seen["state"], seen["stale"], seen["value"]) == ("gone", file_layout.STATE_CLOSED, 1, 4)
         talk.end_input()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.driver_service import DriverReader, DriverWriter
 from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from skinware.memory.schema import STATIC_NAME, from_file
 from skinware.service import Column
 from skinware.structure import Structure
@@ -177,7 +177,7 @@ def test_changed_bytes_never_do_harm(services: Files, data: st.DataObject) -> No
     namespace = Namespace()
     namespace.create()
     damaged = bytearray(services[data.draw(st.sampled_from(sorted(services)))])
-    head = _layout.COLUMN_OFFSET + 30 * _layout.COLUMN.itemsize
+    head = file_layout.COLUMN_OFFSET + 30 * file_layout.COLUMN.itemsize
     for _ in range(data.draw(st.integers(1, 3))):
         offset = data.draw(st.integers(0, min(head, len(damaged)) - 1) | st.integers(0, len(damaged) - 1))
         if data.draw(st.booleans()):
@@ -208,11 +208,13 @@ def test_changed_fields_never_do_harm(services: Files, kind: str, changes: list[
     namespace = Namespace()
     namespace.create()
     damaged = bytearray(services[kind])
-    header = np.frombuffer(damaged, _layout.HEADER, 1)
+    header = np.frombuffer(damaged, file_layout.HEADER, 1)
     parts = {
         "header": header,
-        "columns": np.frombuffer(damaged, _layout.COLUMN, int(header["column_count"][0]), _layout.COLUMN_OFFSET),
-        "control": np.frombuffer(damaged, _layout.CONTROL, 1, _layout.CONTROL_OFFSET),
+        "columns": np.frombuffer(
+            damaged, file_layout.COLUMN, int(header["column_count"][0]), file_layout.COLUMN_OFFSET
+        ),
+        "control": np.frombuffer(damaged, file_layout.CONTROL, 1, file_layout.CONTROL_OFFSET),
     }
     for part, which, value, relative in changes:
         rows = parts[part]
@@ -244,7 +246,7 @@ def test_any_length_is_refused(services: Files, data: st.DataObject) -> None:
     ).map(lambda dtype: msgspec.json.encode({"columns": {"values": {"dtype": dtype, "shape": [5]}}, "description": ""}))
 )
 def test_no_schema_does_harm(text: bytes) -> None:
-    layout = _layout.plan({}, {"values": ("<u4", 5)})
+    layout = file_layout.plan({}, {"values": ("<u4", 5)})
     try:
         schema = from_file(layout, {STATIC_NAME: np.frombuffer(text, np.uint8)}, "x.ring")
     except BadServiceFile:

@@ -14,7 +14,7 @@ import pytest
 from skinware import BusReason, BusState, DriverWriter, Namespace, PatchState, ServiceReader, ServiceWriter, Status
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from skinware.sensor_types import CATALOGUE
 from skinware.structure import _COLUMNS, VALUE_DTYPES
 from tests.core.c_programs import structure
@@ -48,11 +48,11 @@ def _code(code: str) -> str:
 @pytest.mark.parametrize(
     ("heading", "dtype", "start"),
     [
-        ("Header", _layout.HEADER, 0),
-        ("Control words", _layout.CONTROL, _layout.CONTROL_OFFSET),
-        ("Statistics", _layout.STATISTICS, _layout.STATISTICS_OFFSET),
-        ("Column table", _layout.COLUMN, 0),
-        ("Slots", _layout.SLOT, 0),
+        ("Header", file_layout.HEADER, 0),
+        ("Control words", file_layout.CONTROL, file_layout.CONTROL_OFFSET),
+        ("Statistics", file_layout.STATISTICS, file_layout.STATISTICS_OFFSET),
+        ("Column table", file_layout.COLUMN, 0),
+        ("Slots", file_layout.SLOT, 0),
     ],
 )
 def test_every_field_is_where_the_document_says(heading: str, dtype: np.dtype[Any], start: int) -> None:
@@ -63,24 +63,24 @@ def test_every_field_is_where_the_document_says(heading: str, dtype: np.dtype[An
 def test_the_parts_of_a_file_and_the_limits_are_as_documented() -> None:
     rows = tables("Layout of a file")[0]
     assert [(row[0], row[1]) for row in rows[:4]] == [
-        ("0", str(_layout.HEADER.itemsize)),
-        (str(_layout.CONTROL_OFFSET), str(_layout.CONTROL.itemsize)),
-        (str(_layout.STATISTICS_OFFSET), str(_layout.STATISTICS.itemsize)),
-        (str(_layout.COLUMN_OFFSET), f"{_layout.COLUMN.itemsize} each"),
+        ("0", str(file_layout.HEADER.itemsize)),
+        (str(file_layout.CONTROL_OFFSET), str(file_layout.CONTROL.itemsize)),
+        (str(file_layout.STATISTICS_OFFSET), str(file_layout.STATISTICS.itemsize)),
+        (str(file_layout.COLUMN_OFFSET), f"{file_layout.COLUMN.itemsize} each"),
     ]
-    assert f"version **{_layout.VERSION[0]}.{_layout.VERSION[1]}**" in DOCUMENT
+    assert f"version **{file_layout.VERSION[0]}.{file_layout.VERSION[1]}**" in DOCUMENT
     header = {row[2]: row[3] for row in tables("Header")[0]}
-    assert header["magic"] == _layout.MAGIC.decode()
-    assert header["version_major"] == str(_layout.VERSION[0])
-    assert header["version_minor"] == str(_layout.VERSION[1])
-    assert header["file_size"].endswith(f"2**{_layout.MAX_FILE_SIZE.bit_length() - 1}")
-    assert header["column_count"].endswith(f"at most {_layout.MAX_COLUMNS}")
-    assert header["slot_count"] == f"{_layout.MIN_SLOTS} to {_layout.MAX_SLOTS}"
+    assert header["magic"] == file_layout.MAGIC.decode()
+    assert header["version_major"] == str(file_layout.VERSION[0])
+    assert header["version_minor"] == str(file_layout.VERSION[1])
+    assert header["file_size"].endswith(f"2**{file_layout.MAX_FILE_SIZE.bit_length() - 1}")
+    assert header["column_count"].endswith(f"at most {file_layout.MAX_COLUMNS}")
+    assert header["slot_count"] == f"{file_layout.MIN_SLOTS} to {file_layout.MAX_SLOTS}"
     bits = {name: int(bit) for bit, name, _ in tables("Control words")[1]}
     assert bits == {
-        "PAUSED": _layout.STATE_PAUSED,
-        "SUPERSEDED": _layout.STATE_SUPERSEDED,
-        "CLOSED": _layout.STATE_CLOSED,
+        "PAUSED": file_layout.STATE_PAUSED,
+        "SUPERSEDED": file_layout.STATE_SUPERSEDED,
+        "CLOSED": file_layout.STATE_CLOSED,
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.memory import _futex
+from skinware.memory import futex
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
 
@@ -82,12 +82,12 @@ def test_an_announcement_tells_the_age_of_a_frame(namespace: Namespace) -> None:
 
 def test_a_futex_word_that_cannot_be_is_refused_at_once() -> None:
     with pytest.raises(OSError, match="Invalid argument"):
-        _futex.Word(np.zeros(8, np.uint8), 1)
+        futex.Word(np.zeros(8, np.uint8), 1)
 
 
 def test_a_futex_wait_ends_by_another_value_or_a_wake_up() -> None:
     memory = np.array([5], np.uint32)
-    word = _futex.Word(memory.view(np.uint8), 0)
+    word = futex.Word(memory.view(np.uint8), 0)
     word.wait(4, 30_000_000_000)  # differs: returns at once
     woken = threading.Event()
 
@@ -100,7 +100,7 @@ def test_a_futex_wait_ends_by_another_value_or_a_wake_up() -> None:
     thread.start()
     time.sleep(0.02)
     memory[0] = 6
-    _futex.Word(memory.view(np.uint8), 0).wake_all()
+    futex.Word(memory.view(np.uint8), 0).wake_all()
     thread.join(20)
     assert woken.is_set()
 

@@ -11,7 +11,7 @@ import pytest
 
 from skinware import DriverReader, DriverWriter, Frame, Namespace, ServiceReader, ServiceWriter, Skin
 from skinware.errors import BadServiceFile, PeerGone, StructureChanged
-from skinware.memory import _layout
+from skinware.memory import file_layout
 from tests.cli.fake_skin import BUS_COUNTERS, fake_structure
 from tests.core.services import SMALL, publish
 from tests.core.test_losses import die
@@ -37,7 +37,7 @@ def of_another_kind(name: str) -> ServiceWriter:
 
 def of_a_format_to_come(name: str) -> ServiceWriter:
     writer = ServiceWriter(name, SMALL, kind="driver")
-    writer._ring.segment.data[8] = _layout.VERSION[0] + 1
+    writer._ring.segment.data[8] = file_layout.VERSION[0] + 1
     return writer
 
 

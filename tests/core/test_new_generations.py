@@ -12,7 +12,7 @@ import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, StructureChanged
-from skinware.memory import _layout, _segment, ring
+from skinware.memory import file_layout, ring, segments
 from skinware.service import _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
@@ -63,7 +63,7 @@ def test_a_request_that_is_answered_by_a_new_generation_gets_its_frame() -> None
 
 @pytest.mark.parametrize("paused", [True, False])
 def test_pausing_in_the_middle_of_it_holds_for_the_new_one(paused: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    publish_file = _segment.publish
+    publish_file = segments.publish
     threads: list[threading.Thread] = []
     with ServiceWriter("x", SMALL) as writer:
         if not paused:
@@ -77,20 +77,20 @@ def test_pausing_in_the_middle_of_it_holds_for_the_new_one(paused: bool, monkeyp
             publish_file(*arguments)
 
         with ServiceReader[Frame]("x") as old, monkeypatch.context() as patched:
-            patched.setattr(_segment, "publish", in_the_middle)
+            patched.setattr(segments, "publish", in_the_middle)
             writer.restructure(OTHER)
             threads[0].join()
-            assert old._ring.state & _layout.STATE_SUPERSEDED
+            assert old._ring.state & file_layout.STATE_SUPERSEDED
         with ServiceReader[Frame]("x") as reader:
             assert (writer.paused, reader.paused) == (paused, paused)
 
 
 def test_pausing_an_old_generation_does_not_hide_that_there_is_a_new_one() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
-        writer._ring.set_state(_layout.STATE_SUPERSEDED)
+        writer._ring.set_state(file_layout.STATE_SUPERSEDED)
         writer.pause()
         writer.resume()
-        assert reader._ring.state == _layout.STATE_SUPERSEDED
+        assert reader._ring.state == file_layout.STATE_SUPERSEDED
 
 
 @pytest.mark.parametrize("where", ["RingWriter", "publish"])
@@ -104,7 +104,7 @@ def test_a_failure_before_it_is_there_leaves_the_old_one(
         publish(writer, 1)
         inode = namespace.ring_path("x").stat().st_ino
         with monkeypatch.context() as patched:
-            patched.setattr(*((_ownership, where) if where == "RingWriter" else (_segment, where)), fail)
+            patched.setattr(*((_ownership, where) if where == "RingWriter" else (segments, where)), fail)
             with pytest.raises((MemoryError, NamespaceError)):
                 writer.restructure(OTHER, rate_hz=7)
         publish(writer, 2)

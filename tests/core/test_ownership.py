@@ -13,8 +13,8 @@ import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, NameInUse, NamespaceError, PeerGone, ServiceTimeout
-from skinware.memory._locks import ForkGuard
 from skinware.memory.announcement import living_readers
+from skinware.memory.locks import ForkGuard
 from skinware.service import RequestServer
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver

@@ -15,8 +15,8 @@ import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import SkinwareError
-from skinware.memory._locks import _FLOCK
 from skinware.memory.announcement import living_readers
+from skinware.memory.locks import _FLOCK
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.users import (
     COLUMNS,

@@ -95,7 +95,7 @@ def test_files_that_cannot_be_made_again_are_tried_again_and_told_once(
     with ServiceWriter("x", SMALL) as writer:
         namespace.ring_path("x").unlink()
         with monkeypatch.context() as patched:
-            patched.setattr("skinware.memory._segment.create", full)
+            patched.setattr("skinware.memory.segments.create", full)
             for _ in range(3):
                 writer._next_file_check_ns = 0
                 publish(writer, 1)

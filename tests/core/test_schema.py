@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.memory._layout import plan
+from skinware.memory.file_layout import plan
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 from skinware.service import Columns
 

@@ -12,7 +12,7 @@ import pytest
 
 from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
-from skinware.memory import _fences, _layout, _segment
+from skinware.memory import _fences, file_layout, segments
 from skinware.memory import ring as ring_module
 from skinware.memory.ring import RingReader, RingWriter
 from skinware.memory.schema import Schema
@@ -218,13 +218,13 @@ def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
 
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.create()
-    lock = _segment.take_name(namespace, "x")
+    lock = segments.take_name(namespace, "x")
     schema = Schema.of(SMALL, "")
-    segment = _segment.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
+    segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
     writer = RingWriter(segment)
-    _segment.publish(segment, namespace, "x")
-    reader = RingReader(_segment.attach(namespace, "x"), Frame)
-    writer._half_words[_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
+    segments.publish(segment, namespace, "x")
+    reader = RingReader(segments.attach(namespace, "x"), Frame)
+    writer._half_words[file_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1
     assert writer.commit(5) == 1
     assert reader.wake_count == 0

@@ -22,7 +22,9 @@ from tests.sdk.driving import driving, emulated
 TAKE_NS = 100_000
 
 
-def rest_after_a_take(monkeypatch: pytest.MonkeyPatch, *, latency_s: float, is_awaiting: bool = False) -> float:
+def rest_after_a_take(
+    monkeypatch: pytest.MonkeyPatch, *, latency_s: float, is_awaiting: bool = False, in_step: bool = False
+) -> float:
     """What the loop is asked for after a take of TAKE_NS, s; the clock stands still otherwise."""
     clock_ns = now_ns()
     monkeypatch.setattr(intake, "now_ns", lambda: clock_ns)
@@ -56,7 +58,7 @@ def rest_after_a_take(monkeypatch: pytest.MonkeyPatch, *, latency_s: float, is_a
 
     line: Any = SimpleNamespace(
         bus=SimpleNamespace(receive=receive, fileno=lambda: read),
-        link=SimpleNamespace(is_awaiting=is_awaiting),
+        link=SimpleNamespace(is_awaiting=is_awaiting, expects_data=in_step),
         ordinal=0,
     )
     try:
@@ -76,6 +78,8 @@ def test_the_rest_is_in_proportion_to_what_the_take_cost(monkeypatch: pytest.Mon
 
 def test_while_an_answer_is_waited_for_it_is_shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rest_after_a_take(monkeypatch, latency_s=1.0, is_awaiting=True) == pytest.approx(4 * TAKE_NS / 1e9)
+    rest_s = rest_after_a_take(monkeypatch, latency_s=1.0, is_awaiting=True, in_step=True)
+    assert rest_s == pytest.approx(TAKE_NS / 1e9)
 
 
 def test_a_wake_up_ends_in_time_however_much_waits() -> None:

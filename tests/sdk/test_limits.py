@@ -82,10 +82,11 @@ def test_of_a_bus_with_filters_the_load_is_not_known(watched: tuple[Bus, BusLimi
 
 def test_every_reader_sees_the_load() -> None:
     filtered, busy = emulated(boards=(7,)), emulated(boards=(8,))
-    filtered.narrows, busy.bit_rate = True, 1_000_000
+    filtered.narrows, filtered.bit_rate = True, 0  # as a bus that leaves frames out
     with driving(filtered, busy), DriverReader("roboskin") as reader:
-        frame = read_until(reader, lambda f: f.bus_load[0] == LOAD_FILTERED and f.bus_load[1] != LOAD_UNKNOWN)
-    assert frame.bus_load[1] == 1  # no frame was counted, but it is known
+        assert LOAD_UNKNOWN != LOAD_FILTERED
+        read_until(reader, lambda f: f.bus_load[0] == LOAD_FILTERED and 60 <= f.bus_load[1] <= 90)
+    # 32 frames of 130 bits every 50 ms are 83 thousandths of 1 Mbit/s; the machine may be busy
 
 
 def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:

@@ -20,7 +20,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from tests.commands import running as running_command
-from tests.sdk.driving import Driving, commands, driving, emulated, follow, read_until, troubled
+from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")
 
@@ -193,6 +193,20 @@ def test_buses_that_cannot_be_as_they_are_wanted_change_nothing(
         assert after.generation == before.generation
 
 
+def test_a_slow_bus_that_was_removed_slows_nothing_down() -> None:
+    slow = RoboskinDriver(RoboskinOptions(boards=(8,), period_ms=250))
+    fast = RoboskinDriver(RoboskinOptions(boards=(7,), period_ms=20))
+    lines = [(fast, emulated(boards=(7,))), (slow, emulated(boards=(8,)))]
+    with driving_lines(lines, "roboskin") as running:
+        runner = running.runner
+        assert runner is not None
+        assert runner._period_s == 0.25
+        do(running, lambda: runner.buses.change_to({"bus0": fast}, lambda _name, _adapter: emulated()))
+        assert runner._period_s == 0.02
+        assert runner.generation is not None
+        assert runner.generation.period_s == 0.02
+
+
 def test_sighup_reads_the_buses_of_the_file_again(tmp_path: Path) -> None:
     file = tmp_path / "torso.toml"
     one, two = 'name = "virtual?boards=7"', 'name = "virtual?boards=8,9"'
@@ -213,6 +227,10 @@ def test_sighup_reads_the_buses_of_the_file_again(tmp_path: Path) -> None:
         wait_until(lambda: f"buses stay as they are: {file}:5: bus 2: unknown key 'nme'" in driver.errors)
         write(one, f"{two}\noptions = {{ boards = [9], period_ms = 0 }}")
         wait_until(lambda: f"{file}:6: options of virtual?boards=8,9: " in driver.errors)
+        text = file.read_text()
+        file.write_text(text.replace("roboskin", "xela"))
+        driver.process.send_signal(signal.SIGHUP)
+        wait_until(lambda: f"{file}: driver = 'xela', and 'roboskin' is running: stop it and start" in driver.errors)
         write(one, f"{two}\noptions = {{ boards = [9] }}")
         follow(reader, lambda f: f.structure.n_patches == 2 and not f.status.any())
         write(two)

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from skinware import DriverReader, PatchState, Status
+from skinware import DriverReader, Namespace, PatchState, Status
 from skinware.errors import PeerGone, RequestCancelled, RequestFailed, RequestRefused, RequestTimeout
 from skinware.realtime import now_ns
 from skinware_drivers.can.roboskin import RoboskinDriver
@@ -206,8 +206,6 @@ def test_a_request_to_a_dead_skin_is_answered_with_its_state() -> None:
 
 
 def test_requests_go_on_after_the_files_were_removed() -> None:
-    from skinware import Namespace
-
     with driving(emulated(boards=(7,))), DriverReader("roboskin") as reader:
         assert reader.operations()
         place = Namespace()
@@ -233,3 +231,11 @@ def test_operations_are_coroutines_of_the_loop() -> None:
     with driving(emulated(boards=(7,)), driver=Looking) as running, DriverReader("roboskin") as reader:
         reader.call("look")
         assert loops == [running._loop]
+
+
+def test_a_driver_that_publishes_on_request_only_makes_a_removed_socket_again(namespace: Namespace) -> None:
+    """Nobody can ask for a frame without it, and without a frame the driver has no other reason to look."""
+    with driving(emulated(boards=(7,)), publish="request"), DriverReader("roboskin") as reader:
+        reader.request()
+        namespace.socket_path("roboskin").unlink()
+        wait_until(namespace.socket_path("roboskin").exists)

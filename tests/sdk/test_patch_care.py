@@ -86,8 +86,12 @@ class Stage:
             revived_ns=0,
             suspects=set(),
             limits=self,
+            set_up_ns=0,
         )
         self.care = PatchCare(cast(Any, line), lambda: cast(Any, generation), False, lambda: None, self._begin)
+
+    def knows_load_since(self, _time_ns: int) -> bool:
+        return True
 
     def _begin(self, work: Any) -> asyncio.Task[None]:
         self.tasks.append(asyncio.ensure_future(work))

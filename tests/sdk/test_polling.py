@@ -16,7 +16,6 @@ from skinware import BusState, DriverReader
 from skinware.errors import BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
-from skinware_drivers import polling
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.counters import BusCounters
@@ -242,30 +241,23 @@ def test_no_polls_are_a_pause() -> None:
     assert len(line.sent) > 90
 
 
-def test_polls_that_raise_are_told_once_and_called_again(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A driver with such a mistake says where and what, keeps its other buses, and goes on when it is over."""
-    monkeypatch.setattr(polling, "_AFTER_A_FAILURE_S", 0.01)
-    calls = itertools.count()
+def test_what_polls_raises_ends_the_asking_and_it_can_begin_anew() -> None:
+    """Whoever runs the poller decides what comes next; questions that are no polls are told, too."""
+    line = Line()
+    steps: list[list[Poll] | Exception] = [[ASK], ZeroDivisionError(), [cast(Poll, 7)], [ASK], MemoryError()]
+    answers = iter(steps)
+    poller = Poller(Link(line), BusCounters())  # type: ignore[arg-type]
 
-    class Raising(Answering):
-        @property
-        def polls(self) -> Sequence[Poll]:  # type: ignore[override]
-            number = next(calls)
-            if number < 3:
-                raise ZeroDivisionError("no period")
-            return (ASK,) if number < 5 or number > 7 else [cast(Poll, 7)]
+    def polls() -> Sequence[Poll]:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
-    device = Device()
-    with driving_lines([(Raising(NoOptions()), bus_with(device))], "raising"), DriverReader("raising") as reader:
-        read_until(reader, lambda frame: not frame.status.any())
-        wait_until(lambda: len(device.asked_ns) > 5)
-    told = [record.message for record in caplog.records if "polls" in record.message]
-    assert told == [
-        "bus virtual:Device: `polls` failed, trying again: ZeroDivisionError: no period",
-        "bus virtual:Device: `polls` failed, trying again: AttributeError: 'int' object has no attribute 'period_s'",
-    ]
+    for error in (ZeroDivisionError, AttributeError, MemoryError):
+        with pytest.raises(error):
+            asyncio.run(poller.run(polls, lambda: False))
+    assert len(line.sent) == 2
 
 
 IN_STEP = [

@@ -10,6 +10,7 @@ import pytest
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError, RequestFailed
 from skinware_drivers.can.roboskin import Kind, RoboskinOptions, SpecialBoards
+from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves
 
@@ -125,3 +126,15 @@ def test_a_listener_hears_old_boards() -> None:
 def test_what_the_old_way_cannot_do_is_refused(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         RoboskinOptions(old_style=True, **options)
+
+
+@pytest.mark.parametrize("last", ["4c", "4e"])
+def test_boards_are_silenced_when_the_driver_ends_in_the_middle_of_the_set_up(last: str) -> None:
+    """Set up the old way, a board sends from the first command on."""
+    log: list[msgspec.Struct] = []
+    bus = emulated(log, boards=(7, 8), mtb3=(7, 8))
+    with driving(bus, wait=False, boards=(7, 8), old_style=True, period_ms=209) as running:
+        wait_until(lambda: any(payload.startswith(last) for _, _, payload in commands(log)))
+        assert running.runner is not None
+        assert not running.runner.ready
+    assert [(i, p) for _, i, p in commands(log)][-2:] == [(0x207, "0701"), (0x208, "0701")]

@@ -100,3 +100,21 @@ def test_suspicion_outlasts_the_flag_and_ends_with_set_up(monkeypatch: pytest.Mo
             assert boards.suspects() == [False, False]
         boards.cycle({3: NO_ACK})
         assert boards.suspects() == [True, False]
+
+
+def test_a_board_that_is_set_up_anew_goes_on_counting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its count is a static variable of the firmware: a set-up does not reset it."""
+    with seven_and_eight(monkeypatch) as boards:
+        for _ in range(3):
+            boards.cycle({3: NO_ACK})
+        boards.watch.forget(0)
+        boards.cycle({3: NO_ACK})
+        assert boards.suspects() == [False, False]
+        boards.cycle({3: NO_ACK})  # the fifth
+        assert boards.suspects() == [True, False]
+        boards.watch.forget(0)
+        for _ in range(2):
+            boards.cycle({3: NO_ACK})
+            assert boards.suspects() == [False, False]  # by either count
+        boards.cycle({3: NO_ACK})  # the fifth, if it had restarted when it was first set up anew
+        assert boards.suspects() == [True, False]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import grp
 import os
 import termios
 from pathlib import Path
@@ -17,6 +18,7 @@ from serial.tools import list_ports
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.serial import opening
 from skinware_drivers.serial.bus import SerialBus
 from tests.serial.lines import FRAMING, Usb, data_frame, is_readable, line, opened, receive
 
@@ -99,7 +101,7 @@ def test_a_second_program_on_the_port_is_told() -> None:
 @pytest.mark.parametrize(
     ("number", "message", "reason"),
     [
-        (errno.EACCES, "permission denied; for good: sudo usermod -aG .* \\$USER", BusReason.REFUSED),
+        (errno.EACCES, "permission denied; for good: .* udev rule", BusReason.REFUSED),
         (errno.EBUSY, "another program has it open", BusReason.REFUSED),
         (errno.ENXIO, "no serial port /dev/ttyS9; there is none at all", BusReason.INTERFACE_GONE),
         (errno.EIO, "cannot be opened as a serial port", BusReason.FAILED),
@@ -115,6 +117,30 @@ def test_refusals_say_what_to_do(
     with pytest.raises(BusNotAvailable, match=message) as raised:
         SerialBus("/dev/ttyS9").open()
     assert raised.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("mode", "group", "words"),
+    [
+        (0o660, grp.getgrnam("dialout").gr_gid, "sudo usermod -aG dialout $USER, and log in again"),
+        (0o600, grp.getgrnam("dialout").gr_gid, "a udev rule (skin-find --udev)"),  # the group may not either
+        (0o660, 0, "a udev rule (skin-find --udev)"),  # nobody should be in root's group
+        (0o600, 0, "a udev rule (skin-find --udev)"),
+    ],
+)
+def test_nobody_is_told_to_join_the_group_root(
+    mode: int, group: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(self: serial.Serial) -> None:
+        raise serial.SerialException(errno.EACCES, os.strerror(errno.EACCES))
+
+    info = os.stat_result((0o020000 | mode, 1, 1, 1, 0, group, 0, 0, 0, 0))
+    monkeypatch.setattr(serial.Serial, "open", refuse)
+    monkeypatch.setattr(opening, "os", SimpleNamespace(**{**vars(os), "stat": lambda _path: info}))
+    with pytest.raises(BusNotAvailable) as raised:
+        SerialBus("/dev/ttyS9").open()
+    assert words in str(raised.value)
+    assert "root" not in str(raised.value)
 
 
 @pytest.mark.parametrize("up", [True, False])

@@ -241,6 +241,14 @@ class Hangs(Fingertips):
         await super().start(link)
 
 
+class Computes(Fingertips):
+    enough = threading.Event()
+
+    async def start(self, link: Link) -> None:
+        while not self.enough.is_set():
+            pass
+
+
 class WaitsForEver(Fingertips):
     async def describe(self, link: Link) -> Sequence[Patch]:
         with link.follow(Match(0x181)) as replies:

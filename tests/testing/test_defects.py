@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.testing import clock
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.waiting import wait_until
 from tests.testing import fingertips as f
@@ -88,9 +89,11 @@ class TestFingertips(DriverConformance):
 def tidy() -> Iterator[None]:
     """Ends what wrong drivers leave behind."""
     f.Hangs.go_on.clear()
+    f.Computes.enough.clear()
     f.LeaksThreads.end.clear()
     yield
     f.Hangs.go_on.set()
+    f.Computes.enough.set()
     f.LeaksThreads.end.set()
     while f.LeaksDescriptors.leaked:
         os.close(f.LeaksDescriptors.leaked.pop())
@@ -108,6 +111,16 @@ def test_it_is_found_and_named(driver: type[AnyAdapter], test: str, arguments: t
     suite.driver = driver  # type: ignore[misc, assignment]
     with pytest.raises(pytest.fail.Exception, match=words):
         getattr(suite, test)(*arguments)
+
+
+@pytest.mark.usefixtures("tidy", "namespace")
+def test_a_driver_that_computes_without_end_is_found_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "_LONGEST_TURN_S", 0.5)
+    suite = TestFingertips()
+    suite.driver = f.Computes  # type: ignore[misc]
+    with pytest.raises(pytest.fail.Exception, match=r"busy for ever, here:(?s:.*)fingertips.py(?s:.*)enough"):
+        getattr(suite, VALUES)()
+    f.Computes.enough.set()
 
 
 @pytest.mark.parametrize("test", [VALUES, "test_extreme_values"])

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from skinware.realtime import NS_PER_S
+from skinware_drivers.virtual.roboskin.firmware import Arithmetic
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 from .rig import Rig, cycles
@@ -63,6 +65,18 @@ def test_thermal_pads_feel_warmth_and_no_pressure() -> None:
     assert np.ptp(pads) > 10
     assert pads.min() > 200
     assert abs(np.diff(pads, axis=0)).max() <= 4
+
+
+def test_a_skin_that_nobody_touches_stays_in_range_for_an_hour_whenever_its_baseline_was_taken() -> None:
+    seconds = np.arange(3600)
+    offset = np.full((16, 1), DEFAULT_CDC_OFFSET)
+    raw = Touch(0, 0, pressed=False).capacitances(seconds * NS_PER_S, seconds, offset, fingertip=False)
+    for skin_type in (0, 2):
+        arithmetic = Arithmetic(skin_type, 240, (2,) * 16, mtb3=False)
+        for baseline in raw[::97]:
+            sample = arithmetic.sample(raw, baseline)
+            assert not sample.diagnostics.any()
+            assert 200 < sample.values.min() <= sample.values.max() < 255
 
 
 def test_warmth_shows_in_taxels_that_are_not_compensated() -> None:

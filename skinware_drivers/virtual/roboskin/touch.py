@@ -23,6 +23,9 @@ DEFAULT_CDC_OFFSET = 0x2200
 _THERMAL_PADS = (6, 10)
 _WARMTH = np.array([70, 96, 83, 38, 38, 70, 128, 45, 77, 164, 128, 77]) / 128
 """How strongly each channel follows the warmth of its triangle; 1 for the thermal pads."""
+_WARM_COUNTS, _LUKEWARM_COUNTS = 13, 6
+"""A slow wave of warmth and a faster one. Whenever the baseline was taken, values on the wire stay below 255: at the
+usual shift of 2 and no load of 240, that is at 60 counts."""
 _PRESS_COUNTS = 480
 """Capacitance counts of a firm press: 120 of the values on the wire at the usual shift of 2."""
 _PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
@@ -86,8 +89,8 @@ class Touch:
             raw += pressure
         if not fingertip:
             phase = self._warmth_phase
-            warmer = 60 * np.sin(times_s * (2 * math.pi / 120) + phase)
-            warmer += 25 * np.sin(times_s * (2 * math.pi / 37) + 2 * phase)
+            warmer = _WARM_COUNTS * np.sin(times_s * (2 * math.pi / 120) + phase)
+            warmer += _LUKEWARM_COUNTS * np.sin(times_s * (2 * math.pi / 37) + 2 * phase)
             raw += (warmer * _WARMTH).astype(np.int64)
         raw -= cdc_offset - DEFAULT_CDC_OFFSET
         return np.clip(raw, 1, 0xFFFE, out=raw)

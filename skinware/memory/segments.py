@@ -19,16 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, NamespaceError, ServiceNotFound
-from skinware.memory import _futex, _layout
+from skinware.memory import file_layout, futex
 from skinware.memory._fences import fence
-from skinware.memory._layout import Layout
-from skinware.memory._locks import Descriptor, is_locked, try_lock
+from skinware.memory.file_layout import Layout
+from skinware.memory.locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _COUNT = struct.Struct("<Q")
-_HEAD_BYTES = _layout.COLUMN_OFFSET + _layout.COLUMN.itemsize * _layout.MAX_COLUMNS
+_HEAD_BYTES = file_layout.COLUMN_OFFSET + file_layout.COLUMN.itemsize * file_layout.MAX_COLUMNS
 
 
 @dataclass
@@ -37,7 +37,7 @@ class Segment:
 
     Attributes:
         path: file name, for messages.
-        header: header row (:data:`_layout.HEADER`).
+        header: header row (:data:`file_layout.HEADER`).
         layout: where the columns are.
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
@@ -66,7 +66,7 @@ class Segment:
     @property
     def published(self) -> int:
         """Frames that this generation and those before it published."""
-        return self.published_before + int(self.view(_layout.LATEST_OFFSET, np.dtype("<u8"), 1)[0])
+        return self.published_before + int(self.view(file_layout.LATEST_OFFSET, np.dtype("<u8"), 1)[0])
 
     def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
         """(shape, dtype, offset in the slot) of every column of a slot, by name."""
@@ -89,11 +89,11 @@ class Segment:
 
     def mark(self, state: int) -> None:
         """Set bits of the state word and wake everybody who waits (needs a writable map)."""
-        control = self.view(_layout.CONTROL_OFFSET, _layout.CONTROL, 1)
+        control = self.view(file_layout.CONTROL_OFFSET, file_layout.CONTROL, 1)
         control["state"] |= state
         fence()
         control["wake_word"] += np.uint32(1)
-        _futex.Word(self.data, _layout.WAKE_WORD_OFFSET).wake_all()
+        futex.Word(self.data, file_layout.WAKE_WORD_OFFSET).wake_all()
 
 
 def take_name(namespace: Namespace, name: str) -> Descriptor:
@@ -169,10 +169,10 @@ def create(
     """
     if STATIC_NAME in static:
         raise ConfigurationError(f"the table name {STATIC_NAME!r} is taken: give yours another name")
-    if len(kind.encode()) > _layout.KIND_BYTES:
-        raise ConfigurationError(f"kind {kind!r}: at most {_layout.KIND_BYTES} bytes")
+    if len(kind.encode()) > file_layout.KIND_BYTES:
+        raise ConfigurationError(f"kind {kind!r}: at most {file_layout.KIND_BYTES} bytes")
     static = {**static, **schema.for_file(static)}
-    layout = _layout.plan(static, schema.for_layout(), slots)
+    layout = file_layout.plan(static, schema.for_layout(), slots)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
     header = _header(name, layout, layout.digest(static), kind, period_ns, published_before)
     try:
@@ -183,9 +183,9 @@ def create(
                 raise NamespaceError(f"somebody locked {temporary} as it was made")
             os.posix_fallocate(fd, 0, layout.file_size)
             data = _map(temporary, layout.file_size)
-            table = _layout.column_table(layout)
+            table = file_layout.column_table(layout)
             data[: header.nbytes] = header.view(np.uint8)
-            data[_layout.COLUMN_OFFSET : _layout.COLUMN_OFFSET + table.nbytes] = table.view(np.uint8)
+            data[file_layout.COLUMN_OFFSET : file_layout.COLUMN_OFFSET + table.nbytes] = table.view(np.uint8)
             for column in layout.static:
                 contents = np.ascontiguousarray(static[column.name]).view(np.uint8)
                 data[column.offset : column.offset + contents.nbytes] = contents
@@ -271,7 +271,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
             raise BadServiceFile(f"{path}: not a regular file; not attached")
         if info.st_uid != owner:
             raise BadServiceFile(f"{path}: owned by uid {info.st_uid}, its namespace by uid {owner}; not attached")
-        header, layout = _layout.parse(os.pread(fd, _HEAD_BYTES, 0), str(path), info.st_size)
+        header, layout = file_layout.parse(os.pread(fd, _HEAD_BYTES, 0), str(path), info.st_size)
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
         try:
             data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
@@ -303,7 +303,7 @@ def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
         return None
     try:
         info = os.fstat(fd)
-        has_published = any(os.pread(fd, 8, _layout.LATEST_OFFSET))
+        has_published = any(os.pread(fd, 8, file_layout.LATEST_OFFSET))
         return (info.st_dev, info.st_ino) if has_published and is_locked(fd) else None
     except OSError:
         return None
@@ -320,9 +320,9 @@ def _not_found(namespace: Namespace, name: str) -> str:
 def _header(
     name: str, layout: Layout, digest: bytes, kind: str, period_ns: int, published_before: int
 ) -> npt.NDArray[np.void]:
-    header = np.zeros(1, _layout.HEADER)
-    header["magic"] = _layout.MAGIC
-    header["version_major"], header["version_minor"] = _layout.VERSION
+    header = np.zeros(1, file_layout.HEADER)
+    header["magic"] = file_layout.MAGIC
+    header["version_major"], header["version_minor"] = file_layout.VERSION
     header["file_size"] = layout.file_size
     header["generation"] = header["created_ns"] = time.monotonic_ns()
     header["column_count"] = len(layout.static) + len(layout.slot)

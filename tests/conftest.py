@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -10,6 +12,7 @@ from skinware.memory.namespace import Namespace
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+os.environ.setdefault("SKINWARE_TEST_PATIENCE", "5")  # read when the first test module asks for it
 
 
 @pytest.fixture(autouse=True)

@@ -88,8 +88,8 @@ class DriverFrame(Frame):
 
         Empty places where there are none, or the driver does not tell.
         """
-        shape = (len(self.structure.buses), SAMPLES)
-        return self._told("bus_samples", shape, SAMPLE).view(SAMPLE).reshape(shape)
+        n_buses = len(self.structure.buses)
+        return self._told("bus_samples", (n_buses, SAMPLES * SAMPLE.itemsize), np.uint8).view(SAMPLE)
 
     @property
     def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
@@ -245,7 +245,7 @@ class DriverWriter:
             "bus_reason": ("u1", len(structure.buses)),
             "bus_since_ns": ("<i8", len(structure.buses)),
             "bus_load": ("<u2", len(structure.buses)),
-            "bus_samples": (f"V{SAMPLE.itemsize}", len(structure.buses) * SAMPLES),
+            "bus_samples": ("u1", len(structure.buses) * SAMPLES * SAMPLE.itemsize),
             "bus_counters": ("<u8", len(structure.buses) * len(bus_counters)),
             "patch_counters": ("<u8", structure.n_patches * len(patch_counters)),
             "patch_interval_counts": ("<u8", structure.n_patches * BUCKETS),
@@ -314,7 +314,7 @@ class DriverReader(ServiceReader[DriverFrame]):
                 "bus_state": len(structure.buses),
             }
             optional = dict.fromkeys(("bus_reason", "bus_since_ns", "bus_load"), len(structure.buses))
-            optional["bus_samples"] = len(structure.buses) * SAMPLES
+            optional["bus_samples"] = len(structure.buses) * SAMPLES * SAMPLE.itemsize
             optional |= dict.fromkeys(("patch_interval_counts", "patch_age_counts"), structure.n_patches * BUCKETS)
             expected |= {name: count for name, count in optional.items() if name in columns}
             for name, count in expected.items():

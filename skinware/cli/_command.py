@@ -59,6 +59,11 @@ def json_option(command: _Decorated) -> _Decorated:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
 
 
+def version_option(command: _Decorated) -> _Decorated:
+    """``--version``."""
+    return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
+
+
 def print_json(data: object) -> None:
     """One object on one line, at once. Numbers that JSON does not have (``nan``, ``inf``) become null."""
     import msgspec

@@ -75,8 +75,16 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
     names = {sensor_type.id: sensor_type.name for sensor_type in structure.types}
     columns = (structure.sensor_uid, structure.sensor_type, structure.sensor_module, structure.sensor_patch)
     return [
-        {"uid": uid, "type": names[type_id], "module": module, "patch": patch}
-        for uid, type_id, module, patch in zip(*(column.tolist() for column in columns), strict=True)
+        {
+            "name": structure.sensor_name(position),
+            "uid": uid,
+            "type": names[type_id],
+            "module": module,
+            "patch": patch,
+        }
+        for position, (uid, type_id, module, patch) in enumerate(
+            zip(*(column.tolist() for column in columns), strict=True)
+        )
     ]
 
 

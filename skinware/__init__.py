@@ -19,6 +19,7 @@ from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin, SkinLayout, Snapshot
 from skinware.status import BusReason, BusState, PatchState, Status
 from skinware.structure import Structure
+from skinware.window import Window
 
 __all__ = [
     "BusReason",
@@ -38,6 +39,7 @@ __all__ = [
     "Snapshot",
     "Status",
     "Structure",
+    "Window",
     "get_include",
     "realtime",
     "threads",

@@ -9,10 +9,11 @@ _BY_TYPE = ("temperature", "acceleration", "angular_rate")
 """Sensors of these types are called by their type; all others are taxels."""
 
 
-def patch_names(names: Sequence[str], owners: Sequence[str]) -> tuple[str, ...]:
-    """The names of all patches; where several have one name, with what they are on: ``board 8 on can0``."""
+def distinct(names: Sequence[str], owners: Sequence[str], how: str) -> tuple[str, ...]:
+    """The names; where several things have one name, with what they belong to: ``board 8 on can0``."""
     count = Counter(names)
-    return tuple(f"{name} on {owner}" if count[name] > 1 else name for name, owner in zip(names, owners, strict=True))
+    pairs = zip(names, owners, strict=True)
+    return tuple(f"{name} {how} {owner}" if count[name] > 1 else name for name, owner in pairs)
 
 
 def module_names(
@@ -33,20 +34,24 @@ def module_names(
         if not own and in_patch[patch] > 1:
             own = kind or "module"
             own = f"{own} {number}" if of_kind[patch, kind] > 1 else own
-        names.append(", ".join(filter(None, (names_of_patches[patch], own))))
+        names.append(joined(names_of_patches[patch], own))
     return tuple(names)
 
 
-def sensor_name(module: str, type_name: str, number: int, is_only: bool) -> str:
-    """The name of a sensor's place.
+def name_in_module(type_name: str, number: int, is_only: bool) -> str:
+    """The name of a sensor's place within its module; empty: that of the module says all.
 
     Args:
-        module: name of its module.
         type_name: its type.
         number: its uid, counted from the lowest in the module.
         is_only: the module has no other of that type.
     """
     by_type = type_name.startswith(_BY_TYPE)
     if is_only:
-        return f"{module}, {type_name}" if by_type else module
-    return f"{module}, {type_name if by_type else 'taxel'} {number}"
+        return type_name if by_type else ""
+    return f"{type_name if by_type else 'taxel'} {number}"
+
+
+def joined(owner: str, name: str) -> str:
+    """A name after that of what it belongs to."""
+    return f"{owner}, {name}" if name else owner

@@ -13,97 +13,17 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
+from skinware.driver_frame import DriverFrame
 from skinware.errors import BadServiceFile, StructureError
 from skinware.memory import _segment
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
 from skinware.memory.statistics import BUCKETS
 from skinware.service import DEFAULT_SLOTS, Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
+__all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter"]
+
 KIND = "driver"
-
-
-class DriverFrame(Frame):
-    """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
-
-    Every array is coherent with every other: they were published in one piece.
-    """
-
-    __slots__ = ()
-
-    @property
-    def structure(self) -> Structure:
-        """The structure that this frame belongs to."""
-        return cast(Structure, self.context)
-
-    @property
-    def values(self) -> npt.NDArray[Any]:
-        """(n_sensors,) of the structure's dtype, raw counts as the hardware sent them."""
-        return self.column("values")
-
-    @property
-    def status(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8, bits of :class:`skinware.status.Status`; 0 = fresh and good."""
-        return self.column("status")
-
-    @property
-    def module_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_modules,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each module; 0 = never seen."""
-        return self.column("module_time_ns")
-
-    @property
-    def patch_state(self) -> npt.NDArray[np.uint8]:
-        """(n_patches,) uint8, :class:`skinware.status.PatchState`."""
-        return self.column("patch_state")
-
-    @property
-    def bus_state(self) -> npt.NDArray[np.uint8]:
-        """(n_buses,) uint8, :class:`skinware.status.BusState`."""
-        return self.column("bus_state")
-
-    @property
-    def bus_reason(self) -> npt.NDArray[np.uint8]:
-        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not tell."""
-        return self._told("bus_reason", (len(self.structure.buses),), np.uint8)
-
-    @property
-    def bus_since_ns(self) -> npt.NDArray[np.int64]:
-        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
-        return self._told("bus_since_ns", (len(self.structure.buses),), np.int64)
-
-    @property
-    def bus_load(self) -> npt.NDArray[np.uint16]:
-        """(n_buses,) uint16, share of the bus' time in use over the last second, in thousandths, at least 1.
-
-        0: not known, or the driver does not tell; 0xFFFF: not known because of the bus' filters.
-        """
-        return self._told("bus_load", (len(self.structure.buses),), np.uint16)
-
-    @property
-    def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
-        """(n_patches, BUCKETS) uint64: histogram of the time between two updates of a module, for every patch.
-
-        The buckets are those of :class:`skinware.memory.statistics.Histogram`; all 0 where the driver does not tell.
-        """
-        return self._told("patch_interval_counts", (self.structure.n_patches, BUCKETS), np.uint64)
-
-    @property
-    def patch_age_counts(self) -> npt.NDArray[np.uint64]:
-        """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published, likewise."""
-        return self._told("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
-
-    def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        """A column that a driver need not have."""
-        return self.column(name).reshape(shape) if name in self._columns else np.zeros(shape, dtype)
-
-    def physical(self, type_name: str) -> npt.NDArray[np.float32]:
-        """(n,) float32: values of all sensors of a type, in the type's unit, in the order of ``structure.index``."""
-        return self.structure.physical(self.values, type_name)
-
-    def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """(n,) uint8: status of all sensors of a type, in the order of ``structure.index``."""
-        return self.status[self.structure.index(type_name)]
 
 
 class DriverWriter:

@@ -19,23 +19,34 @@ The file is TOML. Sensors stand in groups that share a type and a frame::
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
-from skinware.structure import Structure
+from skinware._columns import column, texts, within
+from skinware.errors import ConfigurationError, StructureError
 
 FORMAT, VERSION = "skinware-geometry", 1
 
 _LENGTH_TOLERANCE = 0.02
 """Of a normal: files give them with few digits."""
+
+
+class Sensors(Protocol):
+    """What has sensors in an order: a :class:`skinware.Structure`."""
+
+    @property
+    def sensor_uid(self) -> npt.NDArray[np.uint64]: ...
+
+    def index(self, type_name: str, /) -> slice | npt.NDArray[np.int64]: ...
+
 
 Triple = tuple[float, float, float]
 
@@ -112,26 +123,93 @@ class Geometry:
         known: npt.NDArray[np.bool_] = np.isfinite(self.position_m[:, 0])
         return known
 
-    def of(self, structure: Structure, type_name: str) -> Geometry:
+    def of(self, structure: Sensors, type_name: str) -> Geometry:
         """The places of a skin's sensors of one type, in the order of ``structure.index(type_name)``.
 
         Raises:
             StructureError: the skin has no such type.
         """
         uid = structure.sensor_uid[structure.index(type_name)]
-        rows = {int(u): row for row, u in enumerate(self.uid) if self.type_name[row] == type_name}
-        found = np.array([rows.get(int(u), -1) for u in uid], np.int64)
-        return self._take(found, type_name, uid)
+        return self.at([type_name] * len(uid), uid)
 
-    def _take(self, rows: npt.NDArray[np.int64], type_name: str, uid: npt.NDArray[np.uint64]) -> Geometry:
+    def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
+        """The places of n sensors; not known where this geometry does not have them.
+
+        Args:
+            type_name: name of each one's type.
+            uid: (n,) of each.
+        """
+        rows = {pair: row for row, pair in enumerate(zip(self.type_name.tolist(), self.uid.tolist(), strict=True))}
+        found = [rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)]
+        return self._take(np.array(found, np.int64), type_name, uid)
+
+    def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Geometry:
+        """Some of the rows."""
+        return Geometry(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Geometry]) -> Geometry:
+        """One after the other."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names)) if parts else _empty(0)
+
+    @classmethod
+    def unknown(cls, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
+        """Sensors whose places nobody knows."""
+        return _empty(0).at(type_name, uid)
+
+    def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
+        """As named columns, for a driver's file.
+
+        Raises:
+            StructureError: a frame's name is longer than 64 bytes.
+        """
+        frames, frame = np.unique(self.frame.astype(str), return_inverse=True)
+        return {
+            "sensor_position_m": self.position_m.astype("<f8").reshape(-1),
+            "sensor_normal": self.normal.astype("<f8").reshape(-1),
+            "sensor_radius_m": self.radius_m.astype("<f8"),
+            "sensor_frame": frame.astype("<u4"),
+            "frame_name": column("frame_name", frames, "|S64"),
+        }
+
+    @classmethod
+    def from_columns(cls, columns: Mapping[str, npt.NDArray[Any]], type_name: Sequence[str]) -> Geometry | None:
+        """Rebuild it from ``to_columns``' columns and ``sensor_uid``; None where there are none.
+
+        Raises:
+            StructureError: a column is missing, or has a wrong dtype or length.
+        """
+        if "sensor_position_m" not in columns:
+            return None
+        n = len(type_name)
+        for name, code, count in (
+            *((name, "<f8", 3 * n) for name in ("sensor_position_m", "sensor_normal")),
+            ("sensor_radius_m", "<f8", n),
+            ("sensor_frame", "<u4", n),
+        ):
+            if name not in columns or columns[name].dtype != np.dtype(code) or len(columns[name]) != count:
+                raise StructureError(f"structure column {name!r} is missing or not {count} of {code}")
+        frames = np.array(texts(columns["frame_name"]), object) if "frame_name" in columns else np.zeros(0, object)
+        within("sensor", "frame", columns["sensor_frame"], len(frames))
+        return cls(
+            type_name=np.array(type_name, object),
+            uid=np.array(columns["sensor_uid"]),
+            frame=frames[columns["sensor_frame"]],
+            position_m=np.array(columns["sensor_position_m"]).reshape(n, 3),
+            normal=np.array(columns["sensor_normal"]).reshape(n, 3),
+            radius_m=np.array(columns["sensor_radius_m"]),
+        )
+
+    def _take(self, rows: npt.NDArray[np.int64], type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
         """The places of ``rows``; -1: not known."""
         n = len(rows)
         taken = _empty(n)
         known = rows >= 0
         taken.type_name[:] = type_name
         taken.uid[:] = uid
-        for column in ("position_m", "normal", "radius_m", "frame"):
-            getattr(taken, column)[known] = getattr(self, column)[rows[known]]
+        for name in ("position_m", "normal", "radius_m", "frame"):
+            getattr(taken, name)[known] = getattr(self, name)[rows[known]]
         return taken
 
 

@@ -4,168 +4,36 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, Self
 
-import numpy as np
-import numpy.typing as npt
-
-from skinware.driver_service import DriverFrame, DriverReader
-from skinware.errors import (
-    BadServiceFile,
-    Closed,
-    Overrun,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureError,
-)
-from skinware.memory import _futex
+from skinware._renamed import renamed
+from skinware.driver_frame import DriverFrame
+from skinware.driver_service import DriverReader
+from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.freshness import age_limit_ns
+from skinware.geometry import Geometry
+from skinware.memory import _futex, _segment
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
-from skinware.structure import Index, Structure
+from skinware.service._tap import Tap, wake_word_of
+from skinware.skin_layout import SkinLayout
+from skinware.snapshot import Snapshot
+from skinware.structure import Structure
+
+__all__ = ["DriverCallback", "Skin", "SkinLayout", "Snapshot"]
 
 log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
 
-Told = Callable[[str, Structure], object]
+DriverCallback = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
 
 
-@dataclass(frozen=True, eq=False)
-class SkinLayout:
-    """Which drivers the skin is made of at a time. A hot-plug makes a new one; this one never changes.
-
-    Attributes:
-        drivers: names, sorted; the order of everything below.
-        structures: one per driver.
-    """
-
-    drivers: tuple[str, ...]
-    structures: tuple[Structure, ...]
-
-    @cached_property
-    def types(self) -> tuple[str, ...]:
-        """Names of all sensor types, in order of first appearance."""
-        return tuple(dict.fromkeys(t.name for structure in self.structures for t in structure.types))
-
-    @cached_property
-    def _parts(self) -> dict[str, list[tuple[int, Index]]]:
-        return {
-            name: [
-                (driver, structure.index(name))
-                for driver, structure in enumerate(self.structures)
-                if any(t.name == name for t in structure.types)
-            ]
-            for name in self.types
-        }
-
-    def parts(self, type_name: str) -> list[tuple[int, Index]]:
-        """Where the sensors of a type are: (driver, positions in that driver's frame), in order.
-
-        Raises:
-            StructureError: no driver has such sensors; the message lists the types there are.
-        """
-        try:
-            return self._parts[type_name]
-        except KeyError:
-            there_are = ", ".join(self.types) or "none (no driver runs)"
-            raise StructureError(f"no sensor type {type_name!r} in this skin; it has: {there_are}") from None
-
-    def uids(self, type_name: str) -> npt.NDArray[np.uint64]:
-        """(n,) uint64: uid of every sensor of a type, in the order of ``Snapshot.physical``."""
-        parts = self.parts(type_name)
-        return np.concatenate([self.structures[driver].sensor_uid[index] for driver, index in parts])
-
-    def driver_of(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: index into ``drivers`` of every sensor of a type, in the same order."""
-        return np.concatenate(
-            [np.full(len(self.structures[driver].sensor_uid[index]), driver) for driver, index in self.parts(type_name)]
-        )
-
-    def position(self, type_name: str, uid: int, driver: str | None = None) -> int:
-        """Where a sensor is in the order of ``Snapshot.physical``.
-
-        Args:
-            type_name: its type.
-            uid: its uid, unique among the sensors of that type of one driver.
-            driver: which driver's, where several have it.
-
-        Raises:
-            StructureError: there is none, or several drivers have one.
-        """
-        found = self._positions(type_name).get(uid, [])
-        if driver is not None:
-            of = self.driver_of(type_name)
-            found = [position for position in found if self.drivers[of[position]] == driver]
-        if len(found) == 1:
-            return found[0]
-        whose = f" of driver {driver!r}" if driver is not None else ""
-        if not found:
-            raise StructureError(f"no {type_name!r} sensor with uid {uid:#x}{whose} in this skin")
-        names = ", ".join(self.drivers[self.driver_of(type_name)[position]] for position in found)
-        raise StructureError(f"several drivers have a {type_name!r} sensor with uid {uid:#x}: {names}; say which")
-
-    def _positions(self, type_name: str) -> dict[int, list[int]]:
-        if type_name not in self._by_uid:
-            positions: dict[int, list[int]] = {}
-            for position, uid in enumerate(self.uids(type_name).tolist()):
-                positions.setdefault(uid, []).append(position)
-            self._by_uid[type_name] = positions
-        return self._by_uid[type_name]
-
-    @cached_property
-    def _by_uid(self) -> dict[str, dict[int, list[int]]]:
-        return {}
-
-    def __repr__(self) -> str:
-        sensors = sum(structure.n_sensors for structure in self.structures)
-        return f"<SkinLayout {', '.join(self.drivers) or 'no driver'}: {sensors} sensors>"
-
-
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """The newest frame of every driver. Each is coherent in itself; between drivers, compare the times.
-
-    Attributes:
-        layout: which drivers; the same object as long as nothing was plugged in or out.
-        frames: one per driver of ``layout``.
-    """
-
-    layout: SkinLayout
-    frames: tuple[DriverFrame, ...]
-
-    def values(self, type_name: str) -> npt.NDArray[Any]:
-        """(n,) raw values of all sensors of a type, of the narrowest dtype that holds those of every driver.
-
-        Raises:
-            StructureError: no driver has such sensors.
-        """
-        return np.concatenate([self.frames[driver].values[index] for driver, index in self.layout.parts(type_name)])
-
-    def physical(self, type_name: str) -> npt.NDArray[np.float32]:
-        """(n,) float32 values of all sensors of a type, each in its own driver's unit and scale.
-
-        Raises:
-            StructureError: no driver has such sensors.
-        """
-        return np.concatenate([self.frames[driver].physical(type_name) for driver, _ in self.layout.parts(type_name)])
-
-    def status(self, type_name: str) -> npt.NDArray[np.uint8]:
-        """(n,) uint8 status of all sensors of a type; 0 = fresh and good.
-
-        Raises:
-            StructureError: no driver has such sensors.
-        """
-        return np.concatenate([self.frames[driver].status[index] for driver, index in self.layout.parts(type_name)])
-
-    @property
-    def acquired_ns(self) -> npt.NDArray[np.int64]:
-        """(n_drivers,) int64: time of the newest data of each driver, CLOCK_MONOTONIC ns."""
-        return np.array([frame.acquired_ns for frame in self.frames], np.int64)
+class _Reader(Tap[DriverFrame], DriverReader):
+    """A reader of one driver of a skin."""
 
 
 class Skin:
@@ -178,6 +46,8 @@ class Skin:
 
     Args:
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
+        drivers: names of those to take part. Default: all. What others publish is not read, and wakes nobody.
+        types: only drivers that have sensors of one of these types, whole. Default: all.
         on_attach: called with a driver's name and structure when it joins, before the first snapshot that has it.
         on_detach: called with its name and last structure when it leaves.
         on_structure: called with its name and new structure when it came back with another one.
@@ -190,22 +60,45 @@ class Skin:
         self,
         namespace: Namespace | str | None = None,
         *,
-        on_attach: Told | None = None,
-        on_detach: Told | None = None,
-        on_structure: Told | None = None,
+        drivers: Collection[str] | None = None,
+        types: Collection[str] | None = None,
+        on_attach: DriverCallback | None = None,
+        on_detach: DriverCallback | None = None,
+        on_structure: DriverCallback | None = None,
     ) -> None:
         self.namespace: Namespace = Namespace.of(namespace)
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
-        self._readers: dict[str, DriverReader] = {}
+        self._drivers, self._types = _names(drivers), _names(types)
+        self._readers: dict[str, _Reader] = {}
+        self._unwanted: dict[str, tuple[int, int]] = {}  # drivers that have none of the types: their files
         self._layout = SkinLayout((), ())
         self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
 
     @property
     def layout(self) -> SkinLayout:
-        """The present layout; looks for new and dead drivers."""
+        """Which drivers there were when this skin was last read or refreshed."""
+        return self._layout
+
+    def refresh(self) -> SkinLayout:
+        """Look for new and dead drivers now; the layout then. Reading does so by itself.
+
+        Raises:
+            NamespaceError: the namespace cannot be trusted or read.
+        """
+        self._next_discovery_ns = 0
         self._discover()
         return self._layout
+
+    def geometry(self, type_name: str) -> Geometry:
+        """Where every sensor of a type is, as the drivers tell, in the order of snapshots of the present layout.
+
+        Positions, normals and radii are NaN where a driver has no geometry, or none for that sensor.
+
+        Raises:
+            StructureError: no driver has such sensors; before the first ``read`` no driver is known.
+        """
+        return self._layout.geometry(type_name)
 
     def reader(self, driver: str) -> DriverReader:
         """The reader behind one driver, for its counters and losses.
@@ -219,42 +112,74 @@ class Skin:
             there_are = ", ".join(self._readers) or "none"
             raise ServiceNotFound(f"no driver {driver!r} in this skin now; it has: {there_are}") from None
 
-    def read(self, *, newer_than: Snapshot | None = None, timeout_s: float | None = 5.0) -> Snapshot:
+    def read(
+        self,
+        *,
+        newer_than: Snapshot | None = None,
+        max_age_s: float | None = None,
+        align: bool = False,
+        timeout_s: float | None = 5.0,
+    ) -> Snapshot:
         """The newest frame of every living driver.
 
         Args:
             newer_than: wait until a driver has published something newer, came or went. Default: take what is
                 there, and wait only if there is no driver.
-            timeout_s: longest wait; None for ever.
+            max_age_s: wait until the newest data of every driver is at most this old; default: of any age.
+            align: of every driver, of the frames that its ring still holds, the one nearest to one moment: the newest
+                that all of them have reached. A driver that has fallen silent does not hold the moment back.
+                ``Snapshot.spread_s`` says how near they came.
+            timeout_s: longest wait; None for no limit.
 
         Raises:
-            ServiceTimeout: no driver, or nothing newer, in time.
+            ServiceTimeout: no driver, nothing newer, or not all young enough in time; the message says which.
             NamespaceError: the namespace cannot be trusted or read.
             Closed: this skin was closed.
         """
         deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
         while True:
-            if self._closed:
-                raise Closed("this skin was closed")
-            if now_ns() >= self._next_look_ns or self._moved_on():
-                self._discover()
-            words = [reader.wake_word() for reader in self._readers.values()]
-            if self._readers and self._is_newer(newer_than):
-                snapshot = self._snapshot()
-                if snapshot is not None:
-                    return snapshot
+            words, snapshot = self._look(newer_than, align)
+            too_old = _too_old(snapshot, max_age_s) if snapshot is not None else []
+            if snapshot is not None and not too_old:
+                return snapshot
             time_ns = now_ns()
             if deadline_ns is not None and time_ns >= deadline_ns:
-                raise ServiceTimeout(self._why_nothing_came())
+                raise ServiceTimeout(self._why_nothing_came(too_old))
             until_ns = time_ns + WAIT_SLICE_NS
             _sleep_on(words, until_ns if deadline_ns is None else min(until_ns, deadline_ns))
 
+    def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[_futex.Word, int]], Snapshot | None]:
+        """What to sleep on if that is not enough, and a snapshot if there is one that is newer."""
+        if self._closed:
+            raise Closed("this skin was closed")
+        if now_ns() >= self._next_look_ns or self._moved_on():
+            self._discover()
+        words = [wake_word_of(reader) for reader in self._readers.values()]
+        is_newer = self._readers and self._is_newer(known)
+        snapshot = self._snapshot(align) if is_newer else None
+        if align and snapshot is not None and known is not None and _same_frames(snapshot, known):
+            snapshot = None
+        return words, snapshot
+
     def _moved_on(self) -> bool:
         """Whether a driver has told that it closed, or published something else; who was killed is found by looking."""
-        return any(reader.peek() is None for reader in self._readers.values())
+        return any(reader.moved_on or reader.latest is None for reader in self._readers.values())
 
-    def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[Snapshot]:
-        """Snapshots for ever: whenever any driver publishes, or at the deadlines of a rate.
+    def frames(
+        self,
+        rate_hz: float | None = None,
+        *,
+        max_age_s: float | None = None,
+        align: bool = False,
+        timeout_s: float | None = None,
+    ) -> Iterator[Snapshot]:
+        """Snapshots without end: whenever any driver publishes, or at the deadlines of a rate.
+
+        Args:
+            rate_hz: None: whenever any driver publishes. A rate: at its deadlines, what is newest then.
+            max_age_s: as for ``read``, for every snapshot.
+            align: as for ``read``, for every snapshot.
+            timeout_s: longest wait for a snapshot; None for no limit.
 
         Raises:
             ServiceTimeout, NamespaceError, Closed: as ``read``.
@@ -262,11 +187,11 @@ class Skin:
         snapshot: Snapshot | None = None
         if rate_hz is None:
             while True:
-                snapshot = self.read(newer_than=snapshot, timeout_s=timeout_s)
+                snapshot = self.read(newer_than=snapshot, max_age_s=max_age_s, align=align, timeout_s=timeout_s)
                 yield snapshot
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
-            yield self.read(timeout_s=timeout_s)
+            yield self.read(max_age_s=max_age_s, align=align, timeout_s=timeout_s)
 
     def __iter__(self) -> Iterator[Snapshot]:
         return self.frames()
@@ -289,7 +214,7 @@ class Skin:
         if now_ns() >= self._next_discovery_ns:
             self._next_discovery_ns = now_ns() + _DISCOVERY_NS
             for name in self.namespace.services():
-                reader = None if name in self._readers else self._attach(name)
+                reader = self._attach(name) if self._may_join(name) else None
                 if reader is not None:
                     self._readers[name] = reader
             self._readers = dict(sorted(self._readers.items()))
@@ -312,24 +237,36 @@ class Skin:
             elif old[name] is not structure:
                 _call(self._on_structure, name, structure)
 
-    def _attach(self, name: str) -> DriverReader | None:
+    def _may_join(self, name: str) -> bool:
+        if name in self._readers or not (self._drivers is None or name in self._drivers):
+            return False
+        return name not in self._unwanted or self._unwanted[name] != _segment.current_inode(self.namespace, name)
+
+    def _attach(self, name: str) -> _Reader | None:
         try:
-            reader = DriverReader(name, namespace=self.namespace)
+            reader = _Reader(name, namespace=self.namespace)
         except (BadServiceFile, ServiceNotFound):
             return None  # not a driver, or just gone
-        if reader.alive and reader.latest is not None:
+        if self._has_wanted(reader) and reader.alive and reader.latest is not None:
             return reader
         reader.close()
         return None
 
-    @staticmethod
-    def _still_there(reader: DriverReader) -> bool:
-        if reader.latest is None and reader.alive:
+    def _has_wanted(self, reader: _Reader) -> bool:
+        if self._types is None or any(sensor_type.name in self._types for sensor_type in reader.structure.types):
+            return True
+        self._unwanted[reader.name] = reader.inode
+        return False
+
+    def _still_there(self, reader: _Reader) -> bool:
+        if reader.refresh() is None and reader.alive:
             return True  # it came back and is about to publish
         if reader.structure_changed:
             try:
                 reader.reattach()
             except (BadServiceFile, ServiceNotFound):
+                return False
+            if not self._has_wanted(reader):
                 return False
         return reader.alive
 
@@ -337,20 +274,26 @@ class Skin:
         if known is None or known.layout is not self._layout:
             return True
         return any(
-            reader.peek() != frame.position for reader, frame in zip(self._readers.values(), known.frames, strict=True)
+            reader.latest != frame.position for reader, frame in zip(self._readers.values(), known.frames, strict=True)
         )
 
-    def _snapshot(self) -> Snapshot | None:
+    def _snapshot(self, align: bool) -> Snapshot | None:
         if self._moved_on():
             return None  # between two lives of a driver
+        readers = list(self._readers.values())
         try:
-            return Snapshot(self._layout, tuple(reader.take_newest() for reader in self._readers.values()))
+            frames = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
         except Overrun:
             return None
+        return Snapshot(self._layout, frames)
 
-    def _why_nothing_came(self) -> str:
+    def _why_nothing_came(self, too_old: list[str]) -> str:
+        if too_old:
+            return f"drivers whose data is too old: {', '.join(too_old)} (choose others with Skin(drivers=[...]))"
+        chosen = [*sorted(self._drivers or ()), *(f"with {name} sensors" for name in sorted(self._types or ()))]
         if not self._readers:
-            return f"no driver runs in namespace {self.namespace.name!r}; start one (skin-driver --bus ...)"
+            wanted = f" ({', '.join(chosen)})" if chosen else ""
+            return f"no driver{wanted} runs in namespace {self.namespace.name!r}; start one (skin-driver --bus ...)"
         return f"no driver of namespace {self.namespace.name!r} published anything newer: {', '.join(self._readers)}"
 
     def __enter__(self) -> Self:
@@ -363,11 +306,44 @@ class Skin:
         return f"<Skin of namespace {self.namespace.name!r}: {', '.join(self._readers) or 'no driver'}>"
 
 
-def _call(told: Told | None, name: str, structure: Structure) -> None:
-    if told is None:
+def _names(given: Collection[str] | None) -> frozenset[str] | None:
+    if isinstance(given, str):
+        raise ConfigurationError(f"give a list of names, as [{given!r}], not a text")
+    return None if given is None else frozenset(given)
+
+
+def _nearest(readers: list[_Reader]) -> tuple[DriverFrame, ...]:
+    """Of each driver the frame nearest to the newest moment that all have reached whose data still comes."""
+    newest_ns = [reader.newest_acquired_ns() for reader in readers]
+    time_ns = now_ns()
+    reached_ns = [
+        newest
+        for reader, newest in zip(readers, newest_ns, strict=True)
+        if time_ns - newest <= age_limit_ns(reader.period_ns)
+    ]
+    moment_ns = min(reached_ns or newest_ns)
+    return tuple(reader.nearest(moment_ns) for reader in readers)
+
+
+def _same_frames(one: Snapshot, other: Snapshot) -> bool:
+    return one.layout is other.layout and all(
+        a.position == b.position for a, b in zip(one.frames, other.frames, strict=True)
+    )
+
+
+def _too_old(snapshot: Snapshot, max_age_s: float | None) -> list[str]:
+    """The drivers whose newest data is older than that, each with its age."""
+    if max_age_s is None:
+        return []
+    ages = zip(snapshot.layout.drivers, (frame.age_ns / NS_PER_S for frame in snapshot.frames), strict=True)
+    return [f"{driver} ({age_s:.3g} s)" for driver, age_s in ages if age_s > max_age_s]
+
+
+def _call(callback: DriverCallback | None, name: str, structure: Structure) -> None:
+    if callback is None:
         return
     try:
-        told(name, structure)
+        callback(name, structure)
     except Exception:
         log.exception("what was to be called about driver %r failed; the skin goes on", name)
 
@@ -382,3 +358,10 @@ def _sleep_on(words: list[tuple[_futex.Word, int]], until_ns: int) -> None:
         time.sleep(remaining_ns / NS_PER_S)
     elif not _futex.wait_any(words[: _futex.MAX_WORDS], until_ns):
         time.sleep(min(remaining_ns, _POLL_NS) / NS_PER_S)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "Told":
+        renamed("skinware.skin.Told", "DriverCallback")
+        return DriverCallback
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

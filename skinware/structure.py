@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware import _names
+from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
 from skinware.errors import StructureError
+from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 
-_T = TypeVar("_T", bound=np.generic)
-
-Index = slice | npt.NDArray[np.int64]
-"""Positions of sensors in a frame: a slice where they lie together, otherwise (n,) int64."""
+__all__ = ["VALUE_DTYPES", "Index", "Structure"]
 
 VALUE_DTYPES = tuple(np.dtype(code) for code in ("u1", "<i2", "<u2", "<i4", "<f4"))
 """The dtypes that values of a service may have."""
@@ -39,8 +38,13 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     ("sensor_type", "<u4"),
     ("sensor_module", "<u4"),
 )
+_OWN_COLUMNS = tuple(name for name, _ in _COLUMNS if not name.startswith(("type_", "bus_")))
 _OPTIONAL = ("module_name",)
 """Columns that files of earlier versions do not have."""
+
+
+def _column(name: str, data: npt.ArrayLike) -> npt.NDArray[Any]:
+    return column(name, data, dict(_COLUMNS)[name])
 
 
 class Structure:
@@ -58,6 +62,7 @@ class Structure:
         sensor_type: (n_sensors,) uint32, id of a type in ``types``.
         sensor_module: (n_sensors,) uint32, index of the sensor's module.
         dtype: dtype of the values, one of :data:`VALUE_DTYPES`.
+        geometry: where the n_sensors sensors are, in their order; None where the driver does not tell.
 
     Raises:
         StructureError: tables that contradict each other; the message names the row.
@@ -77,6 +82,7 @@ class Structure:
         sensor_module: npt.ArrayLike,
         dtype: npt.DTypeLike,
         module_name: npt.ArrayLike | None = None,
+        geometry: Geometry | None = None,
     ) -> None:
         self.types: tuple[SensorType, ...] = tuple(types)
         self.buses: tuple[str, ...] = tuple(buses)
@@ -91,7 +97,23 @@ class Structure:
         self.sensor_type: npt.NDArray[np.uint32] = _column("sensor_type", sensor_type)
         self.sensor_module: npt.NDArray[np.uint32] = _column("sensor_module", sensor_module)
         self.dtype: np.dtype[Any] = np.dtype(dtype)
+        self.geometry: Geometry | None = geometry
         self._check()
+
+    def replace(self, **changes: Any) -> Structure:
+        """The same tables, but for some: arguments as of the constructor.
+
+        Raises:
+            StructureError: they contradict the others.
+        """
+        own = ("types", "buses", "dtype", "geometry", *_OWN_COLUMNS)
+        return Structure(**{name: getattr(self, name) for name in own} | changes)
+
+    def placed(self, geometry: Geometry) -> Structure:
+        """The same sensors, at the places that a geometry has for them by type and uid."""
+        by_id = {t.id: t.name for t in self.types}
+        type_names = [by_id[type_id] for type_id in self.sensor_type.tolist()]
+        return self.replace(geometry=geometry.at(type_names, self.sensor_uid))
 
     @property
     def n_sensors(self) -> int:
@@ -114,16 +136,16 @@ class Structure:
 
     @cached_property
     def _index_by_module(self) -> list[Index]:
-        return _group(self.sensor_module, self.n_modules)
+        return group(self.sensor_module, self.n_modules)
 
     @cached_property
     def sensor_patch(self) -> npt.NDArray[np.uint32]:
         """(n_sensors,) uint32, index of the patch that each sensor belongs to."""
-        return _frozen(self.module_patch[self.sensor_module])
+        return frozen(self.module_patch[self.sensor_module])
 
     @cached_property
     def _index_by_patch(self) -> list[Index]:
-        return _group(self.sensor_patch, self.n_patches)
+        return group(self.sensor_patch, self.n_patches)
 
     @cached_property
     def _position(self) -> dict[tuple[int, int], int]:
@@ -133,7 +155,7 @@ class Structure:
     @cached_property
     def patch_names(self) -> tuple[str, ...]:
         """Name of every patch, as people know it: ``board 8``; of those that share one ``board 8 on can0``."""
-        return _names.patch_names(_texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()])
+        return _names.distinct(texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()], "on")
 
     @cached_property
     def module_names(self) -> tuple[str, ...]:
@@ -143,7 +165,7 @@ class Structure:
         is called as the patch.
         """
         return _names.module_names(
-            _texts(self.module_name), _texts(self.module_kind), self.module_patch.tolist(), self.patch_names
+            texts(self.module_name), texts(self.module_kind), self.module_patch.tolist(), self.patch_names
         )
 
     def sensor_name(self, position: int) -> str:
@@ -156,10 +178,13 @@ class Structure:
         Args:
             position: in a frame.
         """
-        module, type_id = int(self.sensor_module[position]), int(self.sensor_type[position])
-        of_module = self.module_index(module)
-        return _names.sensor_name(
-            self.module_names[module],
+        return _names.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
+
+    def name_in_module(self, position: int) -> str:
+        """What ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
+        of_module = self.module_index(int(self.sensor_module[position]))
+        type_id = int(self.sensor_type[position])
+        return _names.name_in_module(
             next(t.name for t in self.types if t.id == type_id),
             int(self.sensor_uid[position] - self.sensor_uid[of_module].min()),
             is_only=int((self.sensor_type[of_module] == type_id).sum()) == 1,
@@ -206,7 +231,19 @@ class Structure:
         except KeyError:
             raise StructureError(f"no {type_name} sensor with uid {uid:#x} in this skin") from None
 
-    def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.float32]:
+    def module_of(self, type_name: str) -> npt.NDArray[np.uint32]:
+        """(n,) uint32, index of the module of each sensor of a type, in the order of ``index(type_name)``.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        return self.sensor_module[self.index(type_name)]
+
+    def patch_of(self, type_name: str) -> npt.NDArray[np.uint32]:
+        """(n,) uint32, index of the patch of each sensor of a type, likewise."""
+        return self.sensor_patch[self.index(type_name)]
+
+    def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Physical values of all sensors of a type.
 
         Args:
@@ -214,11 +251,16 @@ class Structure:
             type_name: which sensors to take.
 
         Returns:
-            (n,) float32 in the type's unit, in the order of ``index(type_name)``.
+            (n,) float32 in the type's unit, in the order of ``index(type_name)``; float64 if the raw values are
+            int32, which have more digits than float32 holds.
         """
         sensor_type = self.type(type_name)
-        raw = values[self.index(type_name)].astype(np.float32)
-        return raw * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
+        raw = values[self.index(type_name)]
+        if self.dtype == np.int32:
+            exact: npt.NDArray[np.float64] = raw.astype(np.float64)
+            return exact * sensor_type.scale + sensor_type.offset
+        single: npt.NDArray[np.float32] = raw.astype(np.float32)
+        return single * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """The tables as named columns, for a service's file."""
@@ -233,9 +275,10 @@ class Structure:
             "type_maximum": [t.maximum for t in types],
             "bus_name": [name.encode()[:64] for name in self.buses],
         }
-        return {
+        tables = {
             name: np.asarray(data[name], dtype=code) if name in data else getattr(self, name) for name, code in _COLUMNS
         }
+        return tables | (self.geometry.to_columns() if self.geometry is not None else {})
 
     @classmethod
     def from_columns(cls, columns: Mapping[str, npt.NDArray[np.generic]], dtype: npt.DTypeLike) -> Structure:
@@ -255,11 +298,15 @@ class Structure:
             SensorType(name.decode(), identifier, unit.decode(), scale, offset, minimum, maximum)
             for identifier, name, unit, scale, offset, minimum, maximum in rows
         ]
-        own = [name for name, _ in _COLUMNS if not name.startswith(("type_", "bus_")) and name in columns]
+        own = [name for name in _OWN_COLUMNS if name in columns]
+        type_names = {t.id: t.name for t in types}
         return cls(
             types=types,
             buses=[name.decode() for name in columns["bus_name"].tolist()],
             dtype=dtype,
+            geometry=Geometry.from_columns(
+                columns, [type_names.get(type_id, "") for type_id in columns["sensor_type"].tolist()]
+            ),
             **{name: np.array(columns[name]) for name in own},
         )
 
@@ -269,7 +316,7 @@ class Structure:
         if self.dtype != other.dtype:
             return False
         mine, theirs = self.to_columns(), other.to_columns()
-        return all(np.array_equal(mine[name], theirs[name]) for name in mine)
+        return mine.keys() == theirs.keys() and all(_equal(mine[name], theirs[name]) for name in mine)
 
     __hash__: ClassVar[None]  # type: ignore[assignment]
 
@@ -286,12 +333,14 @@ class Structure:
             raise StructureError(f"values of dtype {self.dtype.name}: choose one of {allowed}")
         if not self.n_sensors:
             raise StructureError("a skin needs at least one sensor")
-        _same_length("patch", self.patch_name, self.patch_bus)
-        _same_length("module", self.module_patch, self.module_kind, self.module_name)
-        _same_length("sensor", self.sensor_uid, self.sensor_type, self.sensor_module)
-        _within("patch", "bus", self.patch_bus, len(self.buses))
-        _within("module", "patch", self.module_patch, self.n_patches)
-        _within("sensor", "module", self.sensor_module, self.n_modules)
+        same_length("patch", self.patch_name, self.patch_bus)
+        same_length("module", self.module_patch, self.module_kind, self.module_name)
+        if self.geometry is not None and len(self.geometry) != self.n_sensors:
+            raise StructureError(f"places of {len(self.geometry)} sensors, for {self.n_sensors}")
+        same_length("sensor", self.sensor_uid, self.sensor_type, self.sensor_module)
+        within("patch", "bus", self.patch_bus, len(self.buses))
+        within("module", "patch", self.module_patch, self.n_patches)
+        within("sensor", "module", self.sensor_module, self.n_modules)
         ids = [t.id for t in self.types]
         if len(set(ids)) < len(ids) or len({t.name for t in self.types}) < len(ids):
             raise StructureError("two sensor types share a name or an id")
@@ -307,58 +356,5 @@ class Structure:
                 seen.add(pair)
 
 
-def as_index(positions: npt.NDArray[np.int64]) -> Index:
-    """``positions`` (ascending) as a slice where they are contiguous, else as they are (read-only int64)."""
-    if len(positions) and positions[-1] - positions[0] + 1 == len(positions):
-        return slice(int(positions[0]), int(positions[-1]) + 1)
-    if not len(positions):
-        return slice(0, 0)
-    return _frozen(positions.astype(np.int64))
-
-
-def _group(owner: npt.NDArray[np.uint32], count: int) -> list[Index]:
-    order = np.argsort(owner, kind="stable")
-    bounds = np.searchsorted(owner[order], np.arange(count + 1))
-    return [as_index(order[bounds[i] : bounds[i + 1]]) for i in range(count)]
-
-
-def _column(name: str, data: npt.ArrayLike) -> npt.NDArray[Any]:
-    wanted = np.dtype(dict(_COLUMNS)[name])
-    given = np.asarray(data)
-    if given.ndim != 1:
-        raise StructureError(f"{name} must be one-dimensional, not of shape {given.shape}")
-    if wanted.kind == "S":
-        if given.dtype.kind == "U":
-            given = np.char.encode(given, "utf-8")
-        too_long = np.char.str_len(given.astype(bytes)) > wanted.itemsize if given.size else np.zeros(0, bool)
-        if too_long.any():
-            row = int(np.argmax(too_long))
-            raise StructureError(f"{name} {row} is longer than {wanted.itemsize} bytes: {given[row]!r}")
-        return _frozen(given.astype(wanted))
-    if given.size and given.dtype.kind not in "ui":
-        raise StructureError(f"{name} must be integers, not {given.dtype.name}")
-    bounds = np.iinfo(wanted)
-    if given.size and (int(given.min()) < 0 or int(given.max()) > bounds.max):
-        raise StructureError(f"{name} has a value outside 0 to {bounds.max}")
-    return _frozen(given.astype(wanted))
-
-
-def _texts(column: npt.NDArray[np.bytes_]) -> list[str]:
-    return [text.decode(errors="replace") for text in column.tolist()]
-
-
-def _frozen(array: npt.NDArray[_T]) -> npt.NDArray[_T]:
-    array.flags.writeable = False
-    return array
-
-
-def _same_length(what: str, *columns: npt.NDArray[np.generic]) -> None:
-    lengths = [len(column) for column in columns]
-    if len(set(lengths)) > 1:
-        raise StructureError(f"the {what} columns have different lengths: {lengths}")
-
-
-def _within(what: str, owner: str, column: npt.NDArray[np.generic], count: int) -> None:
-    if len(column) and int(column.max()) >= count:
-        row = int(np.argmax(column))
-        raise StructureError(f"{what} {row} belongs to {owner} {column[row]}, but there are only {count}")
+def _equal(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> bool:
+    return np.array_equal(one, other, equal_nan=one.dtype.kind == other.dtype.kind == "f")

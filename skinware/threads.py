@@ -5,7 +5,7 @@
     def show(frame):
         print(frame.physical("pressure").max())
 
-    with skinware.threads.read(skinware.DriverReader("roboskin"), show, rate_hz=30):
+    with skinware.threads.start_reader(skinware.DriverReader("roboskin"), show, rate_hz=30):
         ...  # do something else
 
 The thread owns what it was given, and closes it at its end. Its callback must not be slow for long: a reader then loses
@@ -21,6 +21,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy.typing as npt
 
+from skinware._renamed import renamed
 from skinware.errors import Closed, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
@@ -122,7 +123,7 @@ class Worker(Generic[T]):
         self.stop()
 
 
-def read(
+def start_reader(
     reader: ServiceReader[F],
     function: Callable[[F], object],
     *,
@@ -130,7 +131,7 @@ def read(
     in_order: bool = False,
     profile: Profile | None = None,
 ) -> Worker[F]:
-    """Call a function with the frames of a service.
+    """Start a thread that calls a function with the frames of a service.
 
     When the service comes back with another structure, its frames of that structure follow.
 
@@ -153,7 +154,7 @@ def read(
     return Worker(f"reader of {reader.name}", reader, frames, function, profile)
 
 
-def write(
+def start_writer(
     writer: ServiceWriter,
     function: Callable[[dict[str, npt.NDArray[Any]]], object],
     *,
@@ -161,7 +162,7 @@ def write(
     from_last: bool = False,
     profile: Profile | None = None,
 ) -> Worker[dict[str, npt.NDArray[Any]]]:
-    """Call a function to fill each frame of a service.
+    """Start a thread that calls a function to fill each frame of a service.
 
     Args:
         writer: belongs to the thread from now on.
@@ -197,6 +198,18 @@ class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
 
     def resume(self) -> None:
         self._owned.resume()
+
+
+def read(reader: ServiceReader[F], function: Callable[[F], object], **options: Any) -> Worker[F]:
+    """Deprecated: ``start_reader``."""
+    renamed("threads.read", "threads.start_reader")
+    return start_reader(reader, function, **options)
+
+
+def write(writer: ServiceWriter, function: Callable[[dict[str, npt.NDArray[Any]]], object], **options: Any) -> Any:
+    """Deprecated: ``start_writer``."""
+    renamed("threads.write", "threads.start_writer")
+    return start_writer(writer, function, **options)
 
 
 class SkinReplica(Worker[Snapshot]):
@@ -245,15 +258,16 @@ class SkinReplica(Worker[Snapshot]):
 
         Raises:
             ServiceTimeout: none came in time.
-            Closed: the replica was stopped, or ended by an error.
+            Closed: the replica was stopped, or its function failed; ``snapshot`` is what it saw last.
         """
         deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
         with self._news:
-            while self._snapshot is None or self._snapshot is newer_than:
-                if not self._thread.is_alive():
+            while True:
+                if self.error is not None or not self._thread.is_alive():
                     raise Closed(f"the replica of the skin has ended{f' ({self.error})' if self.error else ''}")
+                if self._snapshot is not None and self._snapshot is not newer_than:
+                    return self._snapshot
                 remaining_ns = deadline_ns - now_ns()
                 if remaining_ns <= 0:
                     raise ServiceTimeout(f"nothing new on the skin within {timeout_s:g} s (skin-info shows who runs)")
                 self._news.wait(min(remaining_ns, WAIT_SLICE_NS) / NS_PER_S)
-            return self._snapshot

@@ -58,6 +58,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         latency_ms: the longest that frames may wait so that more are taken with them, 0 to 1000; None for the default.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
+        geometry: file with the places of the sensors, by its path from this file on; empty: they are not published.
     """
 
     driver: str = ""
@@ -68,6 +69,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
     realtime: str | None = None
     cpus: tuple[int, ...] = ()
+    geometry: str = ""
     options: dict[str, Any] = {}
     bus: tuple[BusConfig, ...] = ()
 
@@ -111,6 +113,8 @@ class ConfigFile:
             raise ConfigurationError(f"{self._place(wrong.keys)}: {wrong}") from None
         if is_file(settings.driver):
             settings = msgspec.structs.replace(settings, driver=str(path.parent / settings.driver))
+        if settings.geometry:
+            settings = msgspec.structs.replace(settings, geometry=str(path.parent / settings.geometry))
         self.settings = settings
 
     def options_of_bus(self, struct: type[T], bus_name: str, given: Mapping[str, str] | None = None) -> T:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import StructureError
+from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
 
@@ -83,21 +84,11 @@ class SkinTables:
 
     def with_buses(self, names: Sequence[str]) -> SkinTables:
         """The same sensors on buses of other names, or on some of more buses."""
-        old = self.structure
-        structure = Structure(
-            types=old.types,
-            buses=names,
-            patch_name=old.patch_name,
-            patch_bus=old.patch_bus,
-            module_patch=old.module_patch,
-            module_kind=old.module_kind,
-            module_name=old.module_name,
-            sensor_uid=old.sensor_uid,
-            sensor_type=old.sensor_type,
-            sensor_module=old.sensor_module,
-            dtype=old.dtype,
-        )
-        return replace(self, structure=structure)
+        return replace(self, structure=self.structure.replace(buses=names))
+
+    def placed(self, geometry: Geometry) -> SkinTables:
+        """The same sensors at the places that a geometry has for them."""
+        return replace(self, structure=self.structure.placed(geometry))
 
 
 def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorType]:

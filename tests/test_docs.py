@@ -25,7 +25,7 @@ from tests.commands import PATIENCE_S, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
-ELSEWHERE = ("c-and-cpp", "icub")
+ELSEWHERE = ("asyncio", "c-and-cpp", "icub")
 """Pages whose snippets other tests run."""
 COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)

@@ -43,7 +43,7 @@ class LiveDriver:
             ServiceNotFound: the driver was withdrawn just as it had changed.
             BadServiceFile: it came back as something that cannot be read.
         """
-        position = self.reader.latest
+        position = self.reader.refresh()
         if self.reader.structure_changed:
             self.reader.reattach()
             position = self.reader.latest

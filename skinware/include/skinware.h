@@ -280,6 +280,8 @@ size_t skinware_sensors(const skinware_reader *reader, const skinware_type *type
 /*
  * Physical values of a driver's sensors, in the type's unit: out[i] is that of the sensor at positions[i].
  *
+ * A float holds seven digits; where raw values are int32 and all of them matter, compute offset + scale * raw yourself.
+ *
  * Returns how many were written: count, or 0 if the frame has no such column or a position lies outside it.
  */
 size_t skinware_physical(const skinware_frame *frame, const skinware_column *values, const skinware_type *type,
@@ -1148,8 +1150,11 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
         if (positions[i] >= values->count)
             return 0;
     for (i = 0; i < count; i++) {
-        const float raw = (float)skinware_number(values, data, positions[i]);
-        out[i] = raw * (float)type->scale + (float)type->offset;
+        const double raw = skinware_number(values, data, positions[i]);
+        if (values->kind == 'i' && values->itemsize == 4)
+            out[i] = (float)(raw * type->scale + type->offset); /* more digits than a float has */
+        else
+            out[i] = (float)raw * (float)type->scale + (float)type->offset;
     }
     return count;
 }

@@ -76,6 +76,11 @@ class Word:
             if number not in (EAGAIN, EINTR, ETIMEDOUT):
                 raise OSError(number, os.strerror(number))
 
+    @property
+    def value(self) -> int:
+        """What stands in it."""
+        return ctypes.c_uint32.from_address(self.address).value
+
     def wake_all(self) -> None:
         """Wake everybody who waits on the word: one system call."""
         _poke(_sys_futex, self._address, _wake, _all_waiters)

@@ -43,6 +43,7 @@ class Frame:
         acquired_ns: newest time stamp of the data in it, CLOCK_MONOTONIC ns.
         published_ns: when the writer handed it out, CLOCK_MONOTONIC ns.
         flags: bits for the service's own use.
+        period_ns: the writer's nominal period, 0 if it has none.
         stale: the writer was dead when the frame was taken: this is its last word.
         context: what the reader knows of the service (for a driver: its structure).
     """
@@ -55,6 +56,7 @@ class Frame:
         "context",
         "flags",
         "generation",
+        "period_ns",
         "published_ns",
         "sequence",
         "stale",
@@ -72,6 +74,7 @@ class Frame:
         self._columns = ring.columns
         self.context: object = ring.context
         self.generation: int = ring.generation
+        self.period_ns: int = ring.period_ns
         self.sequence: int = sequence
         self.acquired_ns: int = words[_ACQUIRED]
         self.published_ns: int = words[_PUBLISHED]
@@ -132,6 +135,7 @@ class RingReader(Generic[F]):
         self.columns: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]] = segment.slot_formats()
         self.segment = segment
         self.generation: int = segment.generation
+        self.period_ns: int = int(segment.header["period_ns"])
         self._words = memoryview(segment.data).cast("Q")  # type: ignore[arg-type]
         self._half_words = memoryview(segment.data).cast("I")  # type: ignore[arg-type]
         self.wake_word: _futex.Word = _futex.Word(segment.data, _layout.WAKE_WORD_OFFSET)
@@ -213,14 +217,21 @@ class RingReader(Generic[F]):
 
     def publication_times_ns(self) -> list[int]:
         """When the frames that the ring still holds were published, oldest first."""
+        return [time_ns for _, time_ns in self._times_ns(_PUBLISHED)]
+
+    def acquisition_times_ns(self) -> list[tuple[int, int]]:
+        """(sequence, ``acquired_ns``) of the frames that the ring still holds, oldest first."""
+        return self._times_ns(_ACQUIRED)
+
+    def _times_ns(self, word: int) -> list[tuple[int, int]]:
         times = []
         latest = self.latest
         for sequence in range(max(1, latest - self._count + 2), latest + 1):
             words = self._slot_words[sequence % self._count]
-            time_ns = words[_PUBLISHED]
+            time_ns = words[word]
             fence()
             if words[_SEQUENCE] == sequence:
-                times.append(time_ns)
+                times.append((sequence, time_ns))
         return times
 
     def view(self) -> F | None:

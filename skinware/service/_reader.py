@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Self, TypeVar
 
+from skinware._renamed import renamed
 from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.memory._futex import Word
 from skinware.memory.announcement import ReaderRecord
@@ -64,40 +65,39 @@ class ServiceReader(Attachment[F]):
 
     @property
     def latest(self) -> Position | None:
-        """Position of the newest frame, None before the first; goes over to a new generation if there is one."""
-        self._keep_up()
-        return self._newest_position()
+        """Position of the newest frame of the generation at hand, None before the first."""
+        sequence = self._ring.latest
+        return (self._ring.generation, sequence) if sequence else None
 
-    def peek(self) -> Position | None:
-        """Position of the newest frame of the generation at hand, None before the first or if that has ended.
+    def refresh(self) -> Position | None:
+        """Go over to a newer generation if there is one; position of the newest frame then.
 
-        Unlike ``latest`` it neither looks for a new generation nor asks whether the writer lives.
-        """
-        return None if self._ring.state & MOVED_ON else self._newest_position()
-
-    def take_newest(self) -> F:
-        """A copy of the newest frame of the generation at hand, as lightly as ``peek``.
+        Reading does so by itself. If the newer one has another structure, ``structure_changed`` says so.
 
         Raises:
-            ServiceTimeout: nothing was published yet.
-            Overrun: the writer is too fast for this number of slots.
+            Closed: this reader was closed, or belongs to the process before a fork.
         """
-        return self._newest_now(self._ring.copy, True)
+        self._keep_up()
+        return self.latest
 
-    def wake_word(self) -> tuple[Word, int]:
-        """The futex that every publication wakes, and its present value; take it before ``latest``."""
-        return self._ring.wake_word, self._ring.wake_count
-
-    def read(self, *, newer_than: Frame | Position | None = None, timeout_s: float | None = 5.0) -> F:
+    def read(
+        self,
+        *,
+        newer_than: Frame | Position | None = None,
+        max_age_s: float | None = None,
+        timeout_s: float | None = 5.0,
+    ) -> F:
         """The newest frame, as a private copy.
 
         Args:
             newer_than: wait for a frame that is newer than this one; any frame of another generation is.
                 Default: take what is there, wait only if nothing was published yet.
-            timeout_s: longest wait; None for ever.
+            max_age_s: wait for a frame whose newest data (``acquired_ns``) is at most this old when it is handed out;
+                default: of any age.
+            timeout_s: longest wait; None for no limit.
 
         Raises:
-            ServiceTimeout: nothing newer came in time; the message says whether the writer lives.
+            ServiceTimeout: no such frame came in time; the message says whether the writer lives.
             StructureChanged: the service came back with another structure (only when waiting for newer).
             Overrun: the writer is too fast for this number of slots.
             Closed: this reader was closed, or belongs to the process before a fork.
@@ -107,28 +107,50 @@ class ServiceReader(Attachment[F]):
         if known is None:
             alive = self._keep_up()
             if self._ring.latest:
-                return self._newest_now(self._ring.copy, alive)
-        alive = self._wait_for_newer(known, deadline_ns)
-        return self._taken(self._whole(self._ring.copy), alive)
+                frame = self._newest_now(self._ring.copy, alive)
+                if _is_young(frame, max_age_s):
+                    return frame
+                known = frame.position
+        while True:
+            alive = self._wait_for_newer(known, deadline_ns, max_age_s)
+            frame = self._taken(self._whole(self._ring.copy), alive)
+            if _is_young(frame, max_age_s):
+                return frame
+            known = frame.position
 
     @contextlib.contextmanager
     def view(self) -> Iterator[F]:
-        """The newest frame in place, with no copy: ask ``frame.valid`` after using it, and only then trust it.
+        """The newest frame in place, with no copy, for as long as the block lasts.
+
+        The writer may overwrite it meanwhile: ``frame.valid`` says whether it still is whole, and the end of the block
+        asks once more. What was computed in the block counts only if that did not raise.
 
         Raises:
             ServiceTimeout: nothing was published yet.
-            Overrun, Closed: as ``read``.
+            Overrun: the frame was overwritten before the end of the block.
+            Closed: as ``read``.
         """
         alive = self._keep_up()  # which may replace the ring
-        yield self._newest_now(self._ring.view, alive)
+        frame = self._newest_now(self._ring.view, alive)
+        yield frame
+        if not frame.valid:
+            self._accounts.record.overruns += 1
+            raise Overrun(
+                f"frame {frame.sequence} of {self.name!r} was overwritten while it was viewed: be quicker, take a copy"
+                " with read(), or give the service more slots"
+            )
 
-    def frames(self, rate_hz: float | None = None, *, timeout_s: float | None = None) -> Iterator[F]:
-        """Newest frames, for ever.
+    def frames(
+        self, rate_hz: float | None = None, *, max_age_s: float | None = None, timeout_s: float | None = None
+    ) -> Iterator[F]:
+        """Newest frames, without end.
 
         Args:
             rate_hz: None: each time the writer publishes (ASAP). A rate: at the deadlines of that rate, whatever
                 is newest then; the same frame comes again if there is no newer one.
-            timeout_s: longest silence of the writer before ServiceTimeout (ASAP only); None for any.
+            max_age_s: what is older is not handed out but waited for, as by ``read``; default: any age.
+            timeout_s: longest wait for a frame; None for no limit. At a rate there is one to be had without a wait,
+                unless nothing was published yet or all is older than ``max_age_s``.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
@@ -136,13 +158,13 @@ class ServiceReader(Attachment[F]):
         if rate_hz is None:
             self._accounts.begin_loop("asap")
             while True:
-                yield self.read(newer_than=self._last, timeout_s=timeout_s)
+                yield self.read(newer_than=self._last, max_age_s=max_age_s, timeout_s=timeout_s)
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
             self._accounts.record.lateness.add(now_ns() - timer.deadline_ns + timer.period_ns)
             self._accounts.record.missed_periods = timer.missed
-            frame = self.read(timeout_s=timeout_s)
+            frame = self.read(max_age_s=max_age_s, timeout_s=timeout_s)
             if self._moved:
                 raise self._structure_changed()
             yield frame
@@ -213,7 +235,7 @@ class ServiceReader(Attachment[F]):
 
     # -- waiting ------------------------------------------------------------------------------------------------
 
-    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None) -> bool:
+    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None, max_age_s: float | None = None) -> bool:
         """Wait for a frame that is newer than ``known``; whether its writer lives.
 
         One that is slept for was published within the last slice: its writer lived then, which saves the question
@@ -236,7 +258,7 @@ class ServiceReader(Attachment[F]):
                 raise self._structure_changed()
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
-                raise ServiceTimeout(self._why_nothing_came())
+                raise ServiceTimeout(self._why_nothing_came(max_age_s))
             self._accounts.settle()
             if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
                 return True
@@ -247,14 +269,15 @@ class ServiceReader(Attachment[F]):
             f"service {self.name!r} came back with another structure; call reattach() and read it anew"
         )
 
-    def _why_nothing_came(self) -> str:
+    def _why_nothing_came(self, max_age_s: float | None) -> str:
+        wanted = "newer frame" if max_age_s is None else f"frame younger than {max_age_s:g} s"
         if not self.alive:
-            return f"no newer frame of {self.name!r}: its writer is dead or was stopped; start it again"
+            return f"no {wanted} of {self.name!r}: its writer is dead or was stopped; start it again"
         if self.paused:
-            return f"no newer frame of {self.name!r}: its writer is paused"
+            return f"no {wanted} of {self.name!r}: its writer is paused"
         if not self._ring.latest:
             return f"no frame of {self.name!r} yet: its writer lives, but has published nothing so far"
-        return f"no newer frame of {self.name!r}: its writer lives, but is silent (hung, stopped or waiting)"
+        return f"no {wanted} of {self.name!r}: its writer lives, but is silent (hung, stopped or waiting)"
 
     def _lags(self) -> bool:
         """Whether the generation that is being read has newer frames, though there may be another one already."""
@@ -278,10 +301,6 @@ class ServiceReader(Attachment[F]):
             f"no slot of {self.name!r} could be read, {COPY_ATTEMPTS} times in a row: give it more slots, publish less"
             " often, or start it again if it died while it filled one"
         )
-
-    def _newest_position(self) -> Position | None:
-        sequence = self._ring.latest
-        return (self._ring.generation, sequence) if sequence else None
 
     def _newest_now(self, take: Callable[[], F | None], alive: bool) -> F:
         """The newest frame without a wait, so that this is the moment to count it."""
@@ -308,6 +327,23 @@ class ServiceReader(Attachment[F]):
         self._accounts.taken(frame, lost)
         return frame
 
+    # -- names of version 0.1.0 -------------------------------------------------------------------------------------
+
+    def peek(self) -> Position | None:
+        """Deprecated: ``latest``."""
+        renamed("ServiceReader.peek()", "ServiceReader.latest")
+        return None if self._ring.state & MOVED_ON else self.latest
+
+    def take_newest(self) -> F:
+        """Deprecated: ``read(timeout_s=0)``."""
+        renamed("ServiceReader.take_newest()", "ServiceReader.read(timeout_s=0)")
+        return self._newest_now(self._ring.copy, True)
+
+    def wake_word(self) -> tuple[Word, int]:
+        """Deprecated: waiting is for ``read``, ``frames`` and :mod:`skinware.aio`."""
+        renamed("ServiceReader.wake_word()", "ServiceReader.read(newer_than=...)")
+        return self._ring.wake_word, self._ring.wake_count
+
     def __enter__(self) -> Self:
         return self
 
@@ -316,3 +352,7 @@ class ServiceReader(Attachment[F]):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.name!r} in {self.namespace.name!r}>"
+
+
+def _is_young(frame: Frame, max_age_s: float | None) -> bool:
+    return max_age_s is None or frame.age_ns <= max_age_s * NS_PER_S

@@ -133,6 +133,13 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     metavar="MS",
     help="Longest that frames may wait so that more are taken with them; less costs processor time.  [default: 5]",
 )
+@click.option(
+    "--geometry",
+    "geometry_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="TOML file with the places of the sensors, to be published with them.",
+)
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
@@ -158,6 +165,7 @@ def command(
     publish: PublishMode | None,
     slots: int,
     latency_ms: float | None,
+    geometry_file: Path | None,
     group: str | None,
     realtime: str | None,
     cpus: str | None,
@@ -176,6 +184,7 @@ def command(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
+    from skinware.geometry import read_geometry
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.loading import short_name
@@ -226,6 +235,7 @@ def command(
             wanted = {bus.name: adapter_of(bus.name, new) for bus in new.settings.bus}
             await runner.buses.change_to(wanted, lambda name, adapter: bus_of(name, adapter, new))
 
+    geometry_path = geometry_file or settings.geometry
     adapters = [adapter_of(bus_name, file) for bus_name in bus_names]
     runner = Runner(
         driver_type,
@@ -238,6 +248,7 @@ def command(
         namespace=Namespace(namespace),
         slots=slots,
         group=group,
+        geometry=read_geometry(geometry_path) if geometry_path else None,
         on_ready=lambda: _tell_ready(runner, as_json),
     )
     if profile is not None:

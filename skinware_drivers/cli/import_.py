@@ -122,10 +122,10 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dic
     written = []
     for part in parts:
         files = {"config": folder / f"{part.name}.toml"}
-        texts[files["config"]] = part.configuration()
         if part.groups:
             files["geometry"] = folder / f"{part.name}.geometry.toml"
             texts[files["geometry"]] = part.geometry()
+        texts[files["config"]] = part.configuration(files["geometry"].name if part.groups else "")
         written.append({kind: str(path) for kind, path in files.items()})
     in_the_way = [str(path) for path in texts if path.exists()]
     if in_the_way and not force:

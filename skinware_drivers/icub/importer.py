@@ -46,8 +46,8 @@ class ImportedPart:
     groups: list[GeometryGroup]
     triangles: int
 
-    def configuration(self) -> str:
-        """The text of its configuration file."""
+    def configuration(self, geometry: str = "") -> str:
+        """The text of its configuration file; ``geometry`` is the file beside it with the places of the sensors."""
         where = shown(self.part.element.file.name)
         lines = [f"{shown(self.part.name)} ({self.part.device_type}), made by skin-import from {where}."]
         if self.ports:
@@ -57,11 +57,11 @@ class ImportedPart:
                 "The robot reads these boards through an Ethernet board. This driver needs the CAN bus itself."
             )
             lines.append("It must be the only one that sets the boards up.")
-        return configuration_text(self.name, self.buses, "\n".join(lines))
+        return configuration_text(self.name, self.buses, "\n".join(lines), geometry)
 
     def geometry(self) -> str:
         """The text of its geometry file."""
-        lines = f"Places of the sensors of {self.name}, made by skin-import: read it with skinware.geometry."
+        lines = f"Places of the sensors of {self.name}, made by skin-import: its driver publishes them."
         return geometry_to_toml(self.groups, lines)
 
     def figures(self) -> dict[str, object]:

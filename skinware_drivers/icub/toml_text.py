@@ -14,16 +14,18 @@ from skinware_drivers.icub.translate import TranslatedBus
 _HEXADECIMAL = ("cdc_offset", "no_load")
 
 
-def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str) -> str:
+def configuration_text(name: str, buses: Sequence[TranslatedBus], comment: str, geometry: str = "") -> str:
     """What ``skin-driver --config`` reads.
 
     Args:
         name: of the skin.
         buses: of the part.
         comment: lines for its head.
+        geometry: file beside it with the places of the sensors.
     """
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     lines += ['driver = "roboskin"', f"name = {_value(name)}"]
+    lines += [f"geometry = {_value(geometry)}"] if geometry else []
     for bus in buses:
         lines += ["", "[[bus]]", f"name = {_value(bus.name)}" + (f"  # {bus.comment}" if bus.comment else "")]
         lines += ["[bus.options]", *_option_lines(bus.options)]

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
+from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import LOAD_UNKNOWN, BusState, PatchState, Status
 from skinware_drivers.adapter import Watch
@@ -23,8 +24,6 @@ ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
 _IDLE_NS = NS_PER_S // 4
-_SILENT_PERIODS = 3
-_LEAST_SILENCE_NS = NS_PER_S // 5
 _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
@@ -78,7 +77,7 @@ class Publisher:
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
         self._patience_ns = self._period_ns * 3 // 2
         self._pause_ns = self._period_ns // 2
-        self._silence_ns = max(_SILENT_PERIODS * self._period_ns, _LEAST_SILENCE_NS)
+        self._silence_ns = age_limit_ns(self._period_ns)
         structure = decoder.tables.structure
         self._module_patch = structure.module_patch.astype(np.intp)
         self._sensor_module = structure.sensor_module.astype(np.intp)

@@ -13,10 +13,12 @@ import numpy as np
 
 from skinware.driver_service import DriverWriter
 from skinware.errors import BusError, BusNotAvailable, StructureError
+from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
+from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
@@ -53,6 +55,7 @@ class Runner:
             cycle, but only what a program has asked for); default: what the adapter says.
         latency_s: the longest that frames may wait so that more are taken with them, s.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
+        geometry: where the sensors are, for programs; None where nobody knows.
         on_ready: called once, when frames are being published.
 
     Attributes:
@@ -76,6 +79,7 @@ class Runner:
         namespace: Namespace | None = None,
         slots: int = DEFAULT_SLOTS,
         group: str | None = None,
+        geometry: Geometry | None = None,
         on_ready: Callable[[], None] = lambda: None,
     ) -> None:
         self.name = name
@@ -95,6 +99,7 @@ class Runner:
         self._namespace = namespace or Namespace()
         self._slots = slots
         self._group = group
+        self._geometry = geometry
         self._on_ready = on_ready
         self._machine = MachineLimits()
         self._serving: dict[BusLine, asyncio.Task[None]] = {}
@@ -278,6 +283,9 @@ class Runner:
                 join_types([adapter.types for adapter in adapters]),
                 np.result_type(*(adapter.dtype for adapter in adapters)),
             )
+            if self._geometry is not None:
+                tables = tables.placed(self._geometry)
+                _warn_of_foreign(tables.structure)
         except StructureError as error:
             log.error("what was found makes no skin: %s", str(error))
             return
@@ -376,3 +384,8 @@ class Runner:
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
         return figures(self.lines, self._machine, self.writer, self.generation)
+
+
+def _warn_of_foreign(structure: Structure) -> None:
+    if structure.geometry is not None and not structure.geometry.known.any():
+        log.warning("the geometry has no place for any of the sensors: types and uid in its file are of another skin")

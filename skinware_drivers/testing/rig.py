@@ -86,7 +86,7 @@ class Recorder:
             self.reader = DriverReader(runner.name)
         while True:
             last = self.frames[-1].position if self.frames else None
-            newest = self.reader.latest
+            newest = self.reader.refresh()
             if newest is None or newest == last:
                 return
             try:

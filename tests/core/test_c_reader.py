@@ -101,7 +101,7 @@ def test_c_reads_what_python_reads(any_program: Path, dtype: str) -> None:
                 positions = np.flatnonzero(made.sensor_type == sensor_type.id)
                 assert (type_seen["id"], type_seen["unit"]) == (sensor_type.id, sensor_type.unit)
                 assert type_seen["positions"] == positions.tolist()
-                assert type_seen["physical"] == frame.physical(sensor_type.name).tolist()
+                assert type_seen["physical"] == frame.physical(sensor_type.name).astype(np.float32).tolist()
                 bounds = np.array([sensor_type.minimum, sensor_type.maximum])
                 assert type_seen["range"] == as_json(bounds)
 

@@ -13,6 +13,7 @@ import pytest
 
 from skinware import BusReason, BusState, DriverWriter, Namespace, PatchState, ServiceReader, ServiceWriter, Status
 from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry
 from skinware.memory import _layout
 from skinware.sensor_types import CATALOGUE
 from skinware.structure import _COLUMNS, VALUE_DTYPES
@@ -85,7 +86,9 @@ def test_the_parts_of_a_file_and_the_limits_are_as_documented() -> None:
 
 def test_a_real_driver_has_the_documented_tables_and_columns() -> None:
     static, columns, *_ = tables("Drivers")
-    with DriverWriter("x", structure(), bus_counters=["lost"], patch_counters=["cycles", "late"]):
+    made = structure()
+    places = Geometry.unknown(["pressure"] * made.n_sensors, made.sensor_uid)
+    with DriverWriter("x", made.placed(places), bus_counters=["lost"], patch_counters=["cycles", "late"]):
         with ServiceReader[Any]("x") as reader:
             layout = reader._ring.segment.layout
     assert {row[0]: np.dtype(row[1]) for row in static} == {c.name: c.dtype for c in layout.static}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.errors import Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
+from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory import _fences, _layout, _segment
 from skinware.memory import ring as ring_module
 from skinware.memory.ring import RingReader, RingWriter
@@ -44,13 +44,30 @@ def test_a_slot_that_is_being_filled_is_never_handed_out() -> None:
 def test_a_view_says_when_it_was_overwritten() -> None:
     with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
         publish(writer, 1)
+        view = reader.view()
+        frame = view.__enter__()
+        assert frame.valid
+        assert not frame.column("values").flags.writeable
+        publish(writer, 2)
+        assert frame.valid
+        writer.begin()
+        assert not frame.valid
+        with pytest.raises(Overrun, match="frame 1 of 'x' was overwritten while it was viewed"):
+            view.__exit__(None, None, None)
+        assert reader.statistics.overruns == 1
+
+
+def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
+    def look(reader: ServiceReader[Frame], writer: ServiceWriter) -> None:
         with reader.view() as frame:
-            assert frame.valid
-            assert not frame.column("values").flags.writeable
             publish(writer, 2)
-            assert frame.valid
-            writer.begin()
-            assert not frame.valid
+            publish(writer, 3)
+            frame.column("colour")
+
+    with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        with pytest.raises(KeyError, match="no column 'colour'"):
+            look(reader, writer)
 
 
 def test_other_processors_get_fences_from_libatomic(monkeypatch: pytest.MonkeyPatch) -> None:

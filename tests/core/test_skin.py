@@ -48,10 +48,10 @@ def test_a_callback_that_raises_costs_no_other(caplog: pytest.LogCaptureFixture)
     with skin, DriverWriter("a", fake_structure(1, 2)) as a, DriverWriter("b", fake_structure(1, 2)) as b:
         publish(a, 1)
         publish(b, 2)
-        wait_until(lambda: skin.layout.drivers == ("a", "b"))
-        assert skin.read().values("pressure").tolist() == [1] * 20 + [2] * 20
+        wait_until(lambda: skin.refresh().drivers == ("a", "b"))
+        assert skin.read().raw("pressure").tolist() == [1] * 20 + [2] * 20
         b.close()
-        wait_until(lambda: skin.layout.drivers == ("a",))
+        wait_until(lambda: skin.refresh().drivers == ("a",))
     assert told == ["a", "b", "b"]
     assert caplog.text.count("failed; the skin goes on") == 3
     assert "no window for b" in caplog.text
@@ -62,21 +62,21 @@ def test_drivers_come_change_and_go() -> None:
     told = Told()
     small, large = fake_structure(1, 2), fake_structure(2, 2)
     with told.skin() as skin, DriverWriter("b", small) as b:
-        assert skin.layout.drivers == ()
+        assert skin.refresh().drivers == ()
         publish(b, 1)
-        wait_until(lambda: skin.layout.drivers == ("b",))
+        wait_until(lambda: skin.refresh().drivers == ("b",))
         with DriverWriter("a", small) as a:
             publish(a, 2)
-            wait_until(lambda: skin.layout.drivers == ("a", "b"))
+            wait_until(lambda: skin.refresh().drivers == ("a", "b"))
             snapshot = skin.read()
-            assert snapshot.values("pressure").tolist() == [2] * 20 + [1] * 20
+            assert snapshot.raw("pressure").tolist() == [2] * 20 + [1] * 20
             assert snapshot.physical("temperature").tolist() == [1.0] * 4 + [0.5] * 4
             b.restructure(large)
             publish(b, 3)
             wait_until(lambda: skin.read().layout.structures[1].n_sensors == 48)
-            assert snapshot.values("pressure").tolist() == [2] * 20 + [1] * 20  # the old one stays readable
-            assert skin.read().values("pressure").tolist() == [2] * 20 + [3] * 40
-        wait_until(lambda: skin.layout.drivers == ("b",))
+            assert snapshot.raw("pressure").tolist() == [2] * 20 + [1] * 20  # the old one stays readable
+            assert skin.read().raw("pressure").tolist() == [2] * 20 + [3] * 40
+        wait_until(lambda: skin.refresh().drivers == ("b",))
     assert told.lines == ["+b 24", "+a 24", "~b 48", "-a 24"]
 
 
@@ -84,7 +84,7 @@ def test_a_sensor_is_found_by_type_and_uid() -> None:
     with Skin() as skin, FakeSkin("a", fake_structure(1, 2)) as a, FakeSkin("b", fake_structure(1, 1)) as b:
         a.publish()
         b.publish()
-        wait_until(lambda: len(skin.layout.drivers) == 2)
+        wait_until(lambda: len(skin.refresh().drivers) == 2)
         layout = skin.layout
         uids = layout.uids("pressure")
         assert layout.position("pressure", 1012, "a") == np.flatnonzero(uids == 1012)[0] == 10
@@ -117,15 +117,15 @@ def test_a_killed_driver_leaves_and_comes_back(namespace: Any) -> None:
     with told.skin() as skin, FakeSkin("living") as living:
         with fake_process("dying") as process:
             living.publish()
-            wait_until(lambda: skin.layout.drivers == ("dying", "living"))
+            wait_until(lambda: skin.refresh().drivers == ("dying", "living"))
             kill(process)
-            wait_until(lambda: skin.layout.drivers == ("living",))
+            wait_until(lambda: skin.refresh().drivers == ("living",))
         with fake_process("dying") as process:
-            wait_until(lambda: skin.layout.drivers == ("dying", "living"))
+            wait_until(lambda: skin.refresh().drivers == ("dying", "living"))
             before = skin.read()
             wait_until(lambda: skin.read().frames[0].sequence > before.frames[0].sequence)
             kill(process)
-            wait_until(lambda: skin.layout.drivers == ("living",))
+            wait_until(lambda: skin.refresh().drivers == ("living",))
         with FakeSkin("dying"):
             pass  # clears away what the killed one left
     assert [line.split()[0] for line in told.lines] == ["+living", "+dying", "-dying", "+dying", "-dying"] or [
@@ -203,5 +203,6 @@ def test_an_error_in_the_function_of_a_replica_ends_it_and_is_told() -> None:
             replica.stop()
         snapshot = replica.snapshot
         assert snapshot is not None
-        with pytest.raises(Closed, match="my own mistake"):
-            replica.wait(newer_than=snapshot)
+        for known in (snapshot, None):
+            with pytest.raises(Closed, match="my own mistake"):
+                replica.wait(newer_than=known)

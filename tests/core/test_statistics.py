@@ -113,7 +113,7 @@ def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
 
 def _lags(reader: ServiceReader[Frame], frame: Frame) -> bool:
     """Whether the next frame will be lost."""
-    generation, sequence = reader.peek() or frame.position
+    generation, sequence = reader.latest or frame.position
     return generation == frame.generation and sequence >= frame.sequence + 2
 
 

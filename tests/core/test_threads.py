@@ -29,7 +29,9 @@ def test_a_reader_is_called_with_the_newest(options: dict[str, Any], kind: str, 
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
         reader = ServiceReader[Frame]("x")
-        with threads.read(reader, lambda frame: seen.append(int(frame.column("values")[0])), **options) as worker:
+        with threads.start_reader(
+            reader, lambda frame: seen.append(int(frame.column("values")[0])), **options
+        ) as worker:
             wait_until(lambda: seen[-1:] == [1])
             assert worker.active
             publish(writer, 2)
@@ -45,7 +47,7 @@ def test_a_reader_that_wants_every_frame_gets_it() -> None:
     with ServiceWriter("x", SMALL, slots=64) as writer:
         publish(writer, 0)
         reader = ServiceReader[Frame]("x")
-        with threads.read(reader, lambda frame: seen.append(int(frame.column("values")[0])), in_order=True):
+        with threads.start_reader(reader, lambda frame: seen.append(int(frame.column("values")[0])), in_order=True):
             wait_until(lambda: seen == [0])
             for value in range(1, 50):
                 publish(writer, value)
@@ -58,7 +60,7 @@ def test_a_paused_reader_is_not_called() -> None:
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
         reader = ServiceReader[Frame]("x")
-        with threads.read(reader, lambda frame: seen.append(int(frame.column("values")[0]))) as worker:
+        with threads.start_reader(reader, lambda frame: seen.append(int(frame.column("values")[0]))) as worker:
             wait_until(lambda: seen == [1])
             worker.pause()
             assert worker.paused
@@ -77,7 +79,7 @@ def test_another_structure_is_followed() -> None:
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
         reader = ServiceReader[Frame]("x")
-        with threads.read(reader, lambda frame: sizes.append(len(frame.column("values")))):
+        with threads.start_reader(reader, lambda frame: sizes.append(len(frame.column("values")))):
             wait_until(lambda: sizes == [4])
             writer.restructure({"values": ("<i8", 9)})
             publish(writer, 2)
@@ -93,7 +95,7 @@ def test_a_writer_is_called_to_fill(rate_hz: float | None) -> None:
         count += 1
         columns["values"][0] = count
 
-    with threads.write(ServiceWriter("x", SMALL), fill, rate_hz=rate_hz, from_last=True) as worker:
+    with threads.start_writer(ServiceWriter("x", SMALL), fill, rate_hz=rate_hz, from_last=True) as worker:
         with ServiceReader[Frame]("x") as reader:
             assert reader.request().column("values")[0] >= 1
             assert reader.request().column("values")[0] >= 2
@@ -114,7 +116,7 @@ def test_an_error_ends_a_worker_and_is_told(caplog: pytest.LogCaptureFixture) ->
     def fail(_: object) -> None:
         raise RuntimeError("the sensor is on fire")
 
-    worker = threads.write(ServiceWriter("x", SMALL), fail, rate_hz=1000)
+    worker = threads.start_writer(ServiceWriter("x", SMALL), fail, rate_hz=1000)
     wait_until(lambda: worker.error is not None)
     wait_until(lambda: not worker.active)
     with pytest.raises(RuntimeError, match="the sensor is on fire"):
@@ -125,12 +127,23 @@ def test_an_error_ends_a_worker_and_is_told(caplog: pytest.LogCaptureFixture) ->
 
 def test_a_worker_that_waits_is_stopped() -> None:
     with ServiceWriter("x", SMALL):
-        worker = threads.read(ServiceReader[Frame]("x"), lambda _: None)
+        worker = threads.start_reader(ServiceReader[Frame]("x"), lambda _: None)
         stopper = threading.Thread(target=worker.stop)
         stopper.start()
         stopper.join(30)
         assert not stopper.is_alive()
-        paused = threads.read(ServiceReader[Frame]("x"), lambda _: None)
+        paused = threads.start_reader(ServiceReader[Frame]("x"), lambda _: None)
         paused.pause()
         paused.stop()
         assert not paused.active
+
+
+def test_names_of_the_version_before_go_on_with_a_warning() -> None:
+    def fill(columns: dict[str, npt.NDArray[Any]]) -> None:
+        columns["values"][0] = 1
+
+    with pytest.warns(DeprecationWarning, match=r"threads\.write is called threads\.start_writer now"):
+        writer = threads.write(ServiceWriter("x", SMALL), fill, rate_hz=100)
+    with writer:
+        with pytest.warns(DeprecationWarning, match=r"threads\.start_reader"):
+            threads.read(ServiceReader[Frame]("x"), lambda _: None, rate_hz=100).stop()

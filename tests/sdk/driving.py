@@ -10,11 +10,11 @@ from unittest import mock
 
 import msgspec
 
+from skinware import freshness
 from skinware.driver_service import DriverFrame, DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
-from skinware_drivers.running import publisher
 from skinware_drivers.running.runner import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
@@ -228,7 +228,7 @@ def driving(
 ) -> Iterator[Driving]:
     lines = [(driver(RoboskinOptions(**options)), bus) for bus in buses]
     with (
-        mock.patch.object(publisher, "_LEAST_SILENCE_NS", SILENCE_NS),
+        mock.patch.object(freshness, "_LEAST_NS", SILENCE_NS),
         driving_lines(
             lines, "roboskin", listen_only=listen_only, wait=wait, publish=publish, wait_for_buses=wait_for_buses
         ) as running,

@@ -158,7 +158,7 @@ def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
         assert later.generation == frame.generation
         before = len(commands(log))
         running.do(lambda: setattr(late, "present", True))
-        wait_until(lambda: reader.latest is not None and reader.structure_changed)
+        wait_until(lambda: reader.refresh() is not None and reader.structure_changed)
         reader.reattach()
         frame = read_until(reader, lambda f: not f.status.any())
         assert frame.structure.sensor_uid[[0, 192]].tolist() == [7 << 16, 1 << 32 | 7 << 16]

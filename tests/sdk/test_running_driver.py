@@ -269,7 +269,7 @@ def test_what_a_listener_hears_later_is_counted_and_joins_on_request() -> None:
         assert reader.structure.n_patches == 1
         assert running.runner is not None
         running.do(running.runner.join)
-        wait_until(lambda: reader.latest is not None and reader.structure_changed)
+        wait_until(lambda: reader.refresh() is not None and reader.structure_changed)
         reader.reattach()
         frame = read_until(reader, lambda f: not f.status.any())
         assert [bytes(name) for name in frame.structure.patch_name] == [b"board 7", b"board 9"]

@@ -204,7 +204,7 @@ def _use(
     if mode == "skin":
         use_fifo(_READER_PRIORITY if fifo else None)
         with Skin(namespace) as skin:
-            while len(skin.layout.drivers) < len(names):
+            while len(skin.refresh().drivers) < len(names):
                 time.sleep(0.01)
             pipe.send(READY)
             window = pipe.recv()

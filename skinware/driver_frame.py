@@ -1,0 +1,132 @@
+"""One frame of a driver: its columns, and what of them belongs to the sensors of a type."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.freshness import age_limit_ns, is_fresh
+from skinware.memory.ring import Frame
+from skinware.memory.statistics import BUCKETS
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.structure import Structure
+
+
+class DriverFrame(Frame):
+    """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
+
+    Every array is coherent with every other: they were published in one piece. Properties are whole columns of the
+    frame; methods take a sensor type and give what belongs to its sensors, as those of a snapshot do.
+    """
+
+    __slots__ = ()
+
+    @property
+    def structure(self) -> Structure:
+        """The structure that this frame belongs to."""
+        return cast(Structure, self.context)
+
+    @property
+    def values(self) -> npt.NDArray[Any]:
+        """(n_sensors,) of the structure's dtype, raw counts as the hardware sent them."""
+        return self.column("values")
+
+    @property
+    def status(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8, bits of :class:`skinware.status.Status`; 0 = good as of the frame (see ``fresh``)."""
+        return self.column("status")
+
+    @property
+    def module_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_modules,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each module; 0 = never seen."""
+        return self.column("module_time_ns")
+
+    @property
+    def patch_state(self) -> npt.NDArray[np.uint8]:
+        """(n_patches,) uint8, :class:`skinware.status.PatchState`."""
+        return self.column("patch_state")
+
+    @property
+    def bus_state(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.BusState`."""
+        return self.column("bus_state")
+
+    @property
+    def bus_reason(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.BusReason`; 0 where the driver does not tell."""
+        return self._told("bus_reason", (len(self.structure.buses),), np.uint8)
+
+    @property
+    def bus_since_ns(self) -> npt.NDArray[np.int64]:
+        """(n_buses,) int64, CLOCK_MONOTONIC ns since when each bus has had its state and reason; 0: not told."""
+        return self._told("bus_since_ns", (len(self.structure.buses),), np.int64)
+
+    @property
+    def bus_load(self) -> npt.NDArray[np.uint16]:
+        """(n_buses,) uint16, share of the bus' time in use over the last second, in thousandths, at least 1.
+
+        0: not known, or the driver does not tell; 0xFFFF: not known because of the bus' filters.
+        """
+        return self._told("bus_load", (len(self.structure.buses),), np.uint16)
+
+    @property
+    def patch_interval_counts(self) -> npt.NDArray[np.uint64]:
+        """(n_patches, BUCKETS) uint64: histogram of the time between two updates of a module, for every patch.
+
+        The buckets are those of :class:`skinware.memory.statistics.Histogram`; all 0 where the driver does not tell.
+        """
+        return self._told("patch_interval_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+
+    @property
+    def patch_age_counts(self) -> npt.NDArray[np.uint64]:
+        """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published, likewise."""
+        return self._told("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+
+    def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+        """A column that a driver need not have."""
+        return self.column(name).reshape(shape) if name in self._columns else np.zeros(shape, dtype)
+
+    # -- by type ------------------------------------------------------------------------------------------------
+
+    def raw(self, type_name: str) -> npt.NDArray[Any]:
+        """(n,) of the structure's dtype: raw counts of all sensors of a type, in the order of ``structure.index``.
+
+        Raises:
+            StructureError: no such type here; the same for all that take a type.
+        """
+        return self.values[self.structure.index(type_name)]
+
+    def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
+        """(n,) float32: values of all sensors of a type, in the type's unit; float64 where raw values are int32."""
+        return self.structure.physical(self.values, type_name)
+
+    def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
+        """(n,) uint8: status of all sensors of a type."""
+        return self.status[self.structure.index(type_name)]
+
+    def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64: ``module_time_ns`` of the module of each sensor of a type."""
+        return self.module_time_ns[self.structure.module_of(type_name)]
+
+    def fresh(
+        self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which sensors of a type can be trusted now.
+
+        Those have the status 0, their driver lived when the frame was taken, and their data is not too old.
+
+        Args:
+            type_name: which sensors.
+            max_age_s: the age beyond which nothing is fresh. Default: three of the driver's periods and at least
+                0.2 s; 1 s where it has no period.
+            at_ns: the moment at which to look, CLOCK_MONOTONIC ns; default: now.
+        """
+        return is_fresh(
+            self.status_of(type_name),
+            self.time_ns(type_name),
+            at_ns=now_ns() if at_ns is None else at_ns,
+            max_age_ns=age_limit_ns(self.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S),
+            alive=not self.stale,
+        )

@@ -1,0 +1,124 @@
+"""The newest frame of every driver, read as one skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware._renamed import renamed
+from skinware.driver_frame import DriverFrame
+from skinware.errors import StructureError
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.skin_layout import SkinLayout
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The newest frame of every driver. Each is coherent in itself; between drivers, see ``spread_s``.
+
+    Attributes:
+        layout: which drivers; the same object as long as nothing was plugged in or out.
+        frames: one per driver of ``layout``.
+    """
+
+    layout: SkinLayout
+    frames: tuple[DriverFrame, ...]
+
+    def of(self, driver: str) -> DriverFrame:
+        """The frame of one driver.
+
+        Raises:
+            StructureError: no such driver in this snapshot; the message lists those there are.
+        """
+        if driver not in self.layout.drivers:
+            there_are = ", ".join(self.layout.drivers) or "none"
+            raise StructureError(f"no driver {driver!r} in this snapshot; it has: {there_are}")
+        return self.frames[self.layout.drivers.index(driver)]
+
+    @property
+    def acquired_ns(self) -> npt.NDArray[np.int64]:
+        """(n_drivers,) int64: time of the newest data of each driver, CLOCK_MONOTONIC ns."""
+        return np.array([frame.acquired_ns for frame in self.frames], np.int64)
+
+    @property
+    def spread_s(self) -> float:
+        """Time between the newest data of the driver furthest ahead and that of the one furthest behind, s."""
+        return float(np.ptp(self.acquired_ns)) / NS_PER_S
+
+    # -- by type: the sensors of all drivers that have it, driver by driver ---------------------------------------
+
+    def raw(self, type_name: str) -> npt.NDArray[Any]:
+        """(n,) raw counts of all sensors of a type, of the narrowest dtype that holds those of every driver.
+
+        Raises:
+            StructureError: no driver has such sensors; the same for all that take a type.
+        """
+        return np.concatenate([frame.raw(type_name) for frame in self._frames_with(type_name)])
+
+    def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
+        """(n,) float32 values of all sensors of a type, in ``unit(type_name)``; float64 if raw values are int32.
+
+        Raises:
+            StructureError: also where drivers have different units; the message says how to choose.
+        """
+        self.layout.unit(type_name)
+        return np.concatenate([frame.physical(type_name) for frame in self._frames_with(type_name)])
+
+    def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
+        """(n,) uint8 status of all sensors of a type, bits of :class:`skinware.Status`; see ``fresh``."""
+        return np.concatenate([frame.status_of(type_name) for frame in self._frames_with(type_name)])
+
+    def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64: time of the data of each sensor of a type (of its module), CLOCK_MONOTONIC ns; 0: never seen."""
+        return np.concatenate([frame.time_ns(type_name) for frame in self._frames_with(type_name)])
+
+    def fresh(
+        self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
+    ) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which sensors of a type can be trusted now.
+
+        Those have the status 0, their driver lived when its frame was taken, and their data is not too old.
+
+        Args:
+            type_name: which sensors.
+            max_age_s: the age beyond which nothing is fresh. Default: for each driver three of its periods and at
+                least 0.2 s; 1 s where it has no period.
+            at_ns: the moment at which to look, CLOCK_MONOTONIC ns; default: now.
+        """
+        at_ns = now_ns() if at_ns is None else at_ns
+        frames = self._frames_with(type_name)
+        return np.concatenate([frame.fresh(type_name, max_age_s=max_age_s, at_ns=at_ns) for frame in frames])
+
+    def unit(self, type_name: str) -> str:
+        """Unit of ``physical(type_name)``.
+
+        Raises:
+            StructureError: also where drivers have different units.
+        """
+        return self.layout.unit(type_name)
+
+    def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64: index into ``layout.patches``, the names of patches, of every sensor of a type."""
+        return self.layout.patch_of(type_name)
+
+    def module_of(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n,) int64: index into ``layout.modules``, the names of modules, of every sensor of a type."""
+        return self.layout.module_of(type_name)
+
+    def _frames_with(self, type_name: str) -> list[DriverFrame]:
+        return [self.frames[driver] for driver, _ in self.layout.parts(type_name)]
+
+    # -- names of version 0.1.0 -------------------------------------------------------------------------------------
+
+    def values(self, type_name: str) -> npt.NDArray[Any]:
+        """Deprecated: ``raw``."""
+        renamed("Snapshot.values", "Snapshot.raw")
+        return self.raw(type_name)
+
+    def status(self, type_name: str) -> npt.NDArray[np.uint8]:
+        """Deprecated: ``status_of``."""
+        renamed("Snapshot.status", "Snapshot.status_of")
+        return self.status_of(type_name)

@@ -55,6 +55,7 @@ class Picture:
         self._palette = palette
         self._watched: dict[str, _Watched] = {}
         self._wiping = False
+        self._unmoved = np.zeros(0, np.int64)
         self._levels: npt.NDArray[np.uint8] | None = None
         self._made_for: tuple[object, ...] = ()
 
@@ -88,13 +89,13 @@ class Picture:
     def wipe_text(self, driver: str) -> str | None:
         """How the wipe test goes for what is drawn, for people; None where there is none."""
         watched = self._watched.get(driver)
-        if watched is None or watched.wipe is None or self.arrangement is None:
+        if watched is None or watched.wipe is None:
             return None
-        never = np.intersect1d(self.arrangement.sensors, self._never_moved(watched))
-        if not len(never):
+        count = len(self._unmoved)
+        if not count:
             return "wipe test: every sensor has moved"
-        first = watched.structure.sensor_name(int(never[0]))
-        return f"wipe test: {len(never)} never moved (l saves the list): {first}{' ...' * (len(never) > 1)}"
+        first = watched.structure.sensor_name(int(self._unmoved.min()))
+        return f"wipe test: {count} never moved (l saves the list): {first}{' ...' * (count > 1)}"
 
     def save_wipe(self, driver: str, folder: Path) -> Path | None:
         """Save the list of the sensors that never moved; None where no test goes on.
@@ -107,13 +108,6 @@ class Picture:
             return None
         name = self.type_in(watched.structure).name
         return watched.wipe.save(folder, driver, name, watched.rest.noise(name))
-
-    def _never_moved(self, watched: _Watched) -> npt.NDArray[np.int64]:
-        """Sensors of the type that is drawn, of the whole driver."""
-        name = self.type_in(watched.structure).name
-        if watched.wipe is None:
-            return np.zeros(0, np.int64)
-        return watched.wipe.never_moved(name, watched.rest.noise(name))
 
     def draw(self, key: RowKey, frame: DriverFrame, width: int, height: int, life: str) -> None:
         """Draw a frame: sets ``arrangement`` and all that is drawn.
@@ -137,11 +131,13 @@ class Picture:
                 self.title += f" (there are no {self._wanted} sensors)"
         watched = self._watch(key.driver, frame)
         sensors = self.arrangement.sensors
-        status = frame.status[sensors]
         name, scaled = self._scaled(watched, frame, sensors, sensor_type)
         self._levels = scaled.levels
-        marks = marks_of(status_now(life, status))
-        marks[(marks == FRESH) & np.isin(sensors, self._never_moved(watched))] = UNMOVED
+        marks = marks_of(status_now(life, frame)[sensors])
+        if watched.wipe is not None:
+            unmoved = np.isin(sensors, watched.wipe.never_moved(sensor_type.name, watched.rest.noise(sensor_type.name)))
+            self._unmoved = sensors[unmoved]
+            marks[(marks == FRESH) & unmoved] = UNMOVED
         self.pixels = self.arrangement.draw(codes_of(self._levels, marks))
         unit = "" if name == RAW else sensor_type.unit
         self.scale = Text(f"{name} ", no_wrap=True).append_text(scale_text(scaled.values, unit, self._palette))

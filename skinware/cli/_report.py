@@ -204,7 +204,7 @@ def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list
         entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0}
     if frame is None:
         return entries
-    is_fresh = status_now(life, frame.status) == 0
+    is_fresh = status_now(life, frame) == 0
     fresh = np.bincount(structure.sensor_patch[is_fresh], minlength=structure.n_patches).tolist()
     for patch, (entry, age_ns) in enumerate(zip(entries, patch_ages_ns(frame), strict=True)):
         entry["state"] = patch_state_name(int(frame.patch_state[patch]))

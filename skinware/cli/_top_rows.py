@@ -91,7 +91,7 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
 
 
 def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row]:
-    structure, status = frame.structure, status_now(life, frame.status)
+    structure, status = frame.structure, status_now(life, frame)
     was = "was " if life in WITHOUT_NEWS else ""
     total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
     fresh = np.bincount(structure.sensor_patch[status == 0], minlength=structure.n_patches).tolist()

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from textual.pilot import Pilot
-from textual.widgets import Static
+from textual.widgets import DataTable, Static
 
 from skinware import Namespace
 from skinware.cli._heat_map import BACKGROUND, LEVELS
@@ -23,17 +23,16 @@ PATIENCE_S = 120.0
 _FONTS = "ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace"
 
 
-async def main(path: Path) -> None:
+async def picture() -> str:
+    """The screen as SVG."""
     app = SkinTop(Namespace(), palette=TRUE_COLOURS)
     async with app.run_test(size=SIZE) as pilot:
         async with asyncio.timeout(PATIENCE_S):
-            while app.query_one("#list").row_count < 6:
+            while app.query_one("#list", DataTable).row_count < 6:
                 await pilot.pause(0.1)
             await pilot.press("down", "down")
             await _pressed(app, pilot)
-        svg = app.export_screenshot(title="skin-top")
-    path.write_text(plain(svg), encoding="utf-8")
-    print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
+        return plain(app.export_screenshot(title="skin-top"))
 
 
 async def _pressed(app: SkinTop, pilot: Pilot[None]) -> None:
@@ -55,4 +54,6 @@ def plain(svg: str) -> str:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(Path(sys.argv[1])))
+    file = Path(sys.argv[1])
+    file.write_text(asyncio.run(picture()), encoding="utf-8")
+    print(f"{file}: {file.stat().st_size / 1000:.0f} kB")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 from textual.pilot import Pilot
@@ -13,7 +14,7 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware.cli import _health, _live, _top_app
 from skinware.cli._heat_widget import HeatMap
-from skinware.cli._palette import TRUE_COLOURS
+from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
@@ -216,6 +217,49 @@ def test_types_and_scales_take_turns() -> None:
                 await until(pilot, lambda: line(app, "scale").startswith("raw "))
 
     go(scene)
+
+
+def test_a_wipe_test_and_its_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    async def scene() -> None:
+        with FakeSkin("a", fake_structure(1, 1)) as skin:
+            skin.values = skin.status * 0 + 240
+            skin.publish()
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: line(app, "marks") == "10 fresh")
+                await pilot.press("l")  # there is no list yet
+                await pilot.press("w")
+                await until(pilot, lambda: line(app, "marks") == "10 fresh  □ 10 never moved")
+                assert line(app, "detail").startswith("wipe test: 10 never moved (l saves the list): board 7, taxel 0")
+                assert line(app, "scale").startswith("peak ")
+                await pilot.press("l")
+                await until(pilot, lambda: bool(list(tmp_path.iterdir())))
+                await pilot.press("w", "b")
+                await until(pilot, lambda: line(app, "marks") == "10 fresh")
+
+    go(scene)
+    (saved,) = tmp_path.iterdir()
+    assert saved.read_text().startswith("# a: 10 of 10 pressure sensors never moved")
+
+
+@pytest.mark.parametrize(
+    ("environment", "palette"),
+    [
+        ({"TERM": "xterm-256color", "COLORTERM": "truecolor"}, TRUE_COLOURS),
+        ({"TERM": "xterm-256color"}, COLOURS_256),  # as over ssh
+        ({"TERM": "xterm"}, COLOURS_16),
+        ({"TERM": "xterm-256color", "COLORTERM": "truecolor", "NO_COLOR": "1"}, CHARACTERS),
+    ],
+)
+def test_the_terminal_chooses_the_palette(
+    environment: dict[str, str], palette: Palette, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("COLORTERM", "NO_COLOR", "TEXTUAL_COLOR_SYSTEM"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert SkinTop(Namespace())._heat_map._palette is palette
 
 
 def test_the_mouse_chooses_and_points() -> None:

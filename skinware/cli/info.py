@@ -323,7 +323,9 @@ def _redraw(lines: list[str]) -> None:
     height = shutil.get_terminal_size().lines - 1
     if len(lines) > height:
         lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
-    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False)
+    if click.get_current_context().color is False:
+        lines = [click.unstyle(line) for line in lines]
+    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False, color=True)
 
 
 def main() -> None:

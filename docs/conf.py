@@ -6,6 +6,9 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
+from sphinx.ext import napoleon
+from sphinx.ext.napoleon import GoogleDocstring
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 project = "Skinware"
@@ -29,7 +32,18 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
+
+class _Docstring(GoogleDocstring):
+    """Docstrings of attributes: their words up to a colon are no type, and sections in them are sections."""
+
+    def _consume_inline_attribute(self) -> tuple[str, list[str]]:
+        return "", GoogleDocstring(self._consume_to_end(), self._config).lines()
+
+
+napoleon.GoogleDocstring = _Docstring
+
 html_theme = "furo"
+pygments_dark_style = "github-dark"  # the default one underlines names, which look like links then
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_title = f"Skinware {release}"

@@ -78,8 +78,8 @@ class DriverFrame(Frame):
 
         Empty places where there are none, or the driver does not tell.
         """
-        shape = (len(self.structure.buses), SAMPLES)
-        return self._told("bus_samples", shape, SAMPLE).view(SAMPLE).reshape(shape)
+        n_buses = len(self.structure.buses)
+        return self._told("bus_samples", (n_buses, SAMPLES * SAMPLE.itemsize), np.uint8).view(SAMPLE)
 
     @property
     def patch_interval_counts(self) -> npt.NDArray[np.uint64]:

@@ -238,7 +238,7 @@ def _frame_columns(
         "bus_reason": ("u1", n_buses),
         "bus_since_ns": ("<i8", n_buses),
         "bus_load": ("<u2", n_buses),
-        "bus_samples": (f"V{SAMPLE.itemsize}", n_buses * SAMPLES),
+        "bus_samples": ("u1", n_buses * SAMPLES * SAMPLE.itemsize),
         "bus_counters": ("<u8", n_buses * n_bus_counters),
         "patch_counters": ("<u8", n_patches * n_patch_counters),
         "patch_interval_counts": ("<u8", n_patches * BUCKETS),

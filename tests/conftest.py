@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 import pytest
@@ -12,6 +13,7 @@ from skinware.memory.namespace import Namespace
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+os.environ.setdefault("SKINWARE_TEST_PATIENCE", "5")  # read when the first test module asks for it
 
 # what a shell runs in the background ignores Ctrl-C, and so would all that the tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)

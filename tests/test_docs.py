@@ -205,3 +205,27 @@ def test_attributes_that_the_parity_table_names_exist() -> None:
     functions = re.findall(r"`threads\.(\w+)", text)
     assert functions
     assert [name for name in functions if not hasattr(threads, name)] == []
+
+
+def test_what_is_said_of_an_attribute_is_not_taken_for_its_type() -> None:
+    """Sphinx takes the words before the first colon for one: a page of errors had lines such as "Type: It says so"."""
+    code = """
+import runpy
+runpy.run_path("docs/conf.py")
+from sphinx.ext import napoleon
+text = ["It reports an error: which one, is counted.", "", "Raises:", "    ValueError: never."]
+lines = napoleon.GoogleDocstring(text, napoleon.Config(), what="attribute", name="x").lines()
+assert lines[0] == text[0], lines
+assert ":type:" not in " ".join(lines), lines
+assert ":raises ValueError: never." in lines, lines
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
+@pytest.mark.parametrize("image", sorted((ROOT / "docs/images").glob("*.svg")), ids=lambda image: image.stem)
+def test_pictures_need_nothing_from_elsewhere(image: Path) -> None:
+    text = image.read_text()
+    assert set(re.findall(r"\w+://[^\"'\s)>]+", text)) <= {"http://www.w3.org/2000/svg"}
+    assert "@font-face" not in text
+    assert "@import" not in text
+    assert image.stat().st_size < 100_000

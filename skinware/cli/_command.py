@@ -59,6 +59,11 @@ def json_option(command: _Decorated) -> _Decorated:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
 
 
+def version_option(command: _Decorated) -> _Decorated:
+    """``--version``."""
+    return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
+
+
 def print_json(data: object) -> None:
     """One object on one line, at once. Numbers that JSON does not have (``nan``, ``inf``) become null."""
     import msgspec
@@ -84,14 +89,15 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
     """Run a command: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 bus not available.
 
     Every expected error becomes one line on stderr. Output that nobody reads any more (``| head -1``) ends the command
-    in silence.
+    in silence. ``NO_COLOR`` in the environment takes the colours away.
     """
     name = command.name or os.path.basename(sys.argv[0])
     if f"_{name}_COMPLETE".upper().replace("-", "_") in os.environ:
         command.main(list(arguments), prog_name=name)  # the shell asks for completions
     try:
         # not command.main(): that one makes a closed pipe a failure
-        with command.make_context(name, list(arguments)) as context:
+        color = False if os.environ.get("NO_COLOR") else None  # None: where there is a terminal
+        with command.make_context(name, list(arguments), color=color) as context:
             command.invoke(context)
         _flush_output()
         return EXIT_DONE

@@ -1,10 +1,17 @@
-"""Numbers, times and tables as people read them."""
+"""Numbers, times, states and tables as people read them."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Sequence
 
+import click
+
 NO_VALUE = "-"
+NOT_FRESH = "not fresh"
+"""Shown instead of ``live`` where frames come, but not one sensor of them is fresh."""
+_BETWEEN = "  "
 
 
 def age_text(age_ns: int | float | None) -> str:
@@ -44,14 +51,49 @@ def plural(count: int, what: str, several: str = "") -> str:
     return f"{count_text(count)} {what if count == 1 else several or what + 's'}"
 
 
-def table(titles: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 1) -> list[str]:
-    """Aligned columns under their titles; the first ``left`` of them begin left, the others end right."""
+def state_shown(state: str, fresh: int, sensors: int) -> str:
+    """A state for people: nothing is called live of which no sensor is fresh."""
+    return NOT_FRESH if state == "live" and sensors and not fresh else state
+
+
+def table(
+    titles: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 1, width: int | None = None
+) -> list[str]:
+    """Aligned columns under their titles; the first ``left`` of them begin left, the others end right.
+
+    What is wider than ``width`` goes on in a table below, of which the first column is the same.
+    """
     lines = [list(titles), *(list(row) for row in rows)]
     widths = [max(len(line[column]) for line in lines) for column in range(len(titles))]
+    parts = [[0]]
+    for column in range(1, len(titles)):
+        used = sum(widths[c] + len(_BETWEEN) for c in parts[-1])
+        if width is not None and used + widths[column] > width and len(parts[-1]) > 1:
+            parts.append([0])
+        parts[-1].append(column)
     return [
-        "  ".join(
-            text.ljust(width) if column < left else text.rjust(width)
-            for column, (text, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
+        _BETWEEN.join(line[c].ljust(widths[c]) if c < left else line[c].rjust(widths[c]) for c in columns).rstrip()
+        for columns in parts
         for line in lines
     ]
+
+
+def terminal_width() -> int | None:
+    """Columns of the terminal on stdout; None where there is none, and lines may be as long as they are."""
+    is_terminal = sys.stdout is not None and sys.stdout.isatty()
+    return shutil.get_terminal_size().columns if is_terminal else None
+
+
+def wrapped(line: str, width: int | None) -> list[str]:
+    """A line that may have colours, broken where it is wider than ``width``; what follows is indented further."""
+    if width is None or len(click.unstyle(line)) <= width:
+        return [line]
+    indent = line[: len(line) - len(line.lstrip())]
+    first, *words = line.lstrip().split(" ")
+    lines = [indent + first]
+    for word in words:
+        if len(click.unstyle(lines[-1])) + 1 + len(click.unstyle(word)) <= width:
+            lines[-1] += f" {word}"
+        elif word:
+            lines.append(f"{indent}    {word}")
+    return lines

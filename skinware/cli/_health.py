@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from skinware.freshness import age_limit_ns, is_fresh
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState, PatchState, Status
 
@@ -105,15 +106,25 @@ def health_of(reader: DriverReader, frame: DriverFrame | None, measured_hz: floa
         rate_hz,
         frame.age_ns,
         frame.structure.n_sensors,
-        count_statuses(status_now(life, frame.status)),
+        count_statuses(status_now(life, frame)),
         {state: states.count(state) for state in dict.fromkeys(sorted(states))},
         counters,
     )
 
 
-def status_now(life: str, status: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """(n,) uint8: the status of sensors, which are stale where nothing newer comes."""
-    return status | np.uint8(Status.STALE) if life in WITHOUT_NEWS else status
+def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
+    """(n_sensors,) uint8: the status of a frame's sensors now: what has become too old since, is stale."""
+    status, stale = frame.status, np.uint8(Status.STALE)
+    if life in WITHOUT_NEWS:
+        return status | stale
+    fresh = is_fresh(
+        status,
+        frame.module_time_ns[frame.structure.sensor_module],
+        at_ns=now_ns(),
+        max_age_ns=age_limit_ns(frame.period_ns),
+        alive=not frame.stale,
+    )
+    return np.where(fresh | (status != 0), status, stale)
 
 
 def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:

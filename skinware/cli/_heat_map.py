@@ -14,31 +14,32 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from skinware.cli._shapes import Shape, rows_of, shape_of
 from skinware.status import Status
 from skinware.structure import Structure
 
 LEVELS = 16
-FRESH, STALE, OUT_OF_RANGE, SUSPECT, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED = range(8)
+FRESH, STALE, OUT_OF_RANGE, SUSPECT, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(9)
 FIRST_WITHOUT_VALUE = NO_ACK
-"""From this mark on, the value means nothing and is not drawn."""
+"""From this mark on, the level means nothing and is not drawn. ``UNMOVED``: never moved in a wipe test."""
 BACKGROUND = 255
 """Code of a pixel that is no sensor."""
 
 _HOLD = 0.75
 """A level is kept while the value is within so many levels of its middle: noise on an edge does not flicker."""
-_NUMBER_ROOM = 2
+_LABEL_ROOM = 2
 _SIZES = (
-    (8, _NUMBER_ROOM),
+    (8, _LABEL_ROOM),
     (8, 0),
-    (6, _NUMBER_ROOM),
+    (6, _LABEL_ROOM),
     (6, 0),
-    (4, _NUMBER_ROOM),
+    (4, _LABEL_ROOM),
     (4, 0),
-    (2, _NUMBER_ROOM),
+    (2, _LABEL_ROOM),
     (2, 0),
     (1, 0),
 )
-"""Zooms, and room in pixels above a block for the number of its module; the first that fits is taken."""
+"""Zooms, and room in pixels above a block for the name of its module; the first that fits is taken."""
 _LONGEST_NAME = 16
 _NAMES_FROM_WIDTH = 48
 _MARK_BITS = (
@@ -133,10 +134,12 @@ class Arrangement:
         return int(self.sensors[found]) if found >= 0 else None
 
 
-def arrange(structure: Structure, patches: Sequence[int], type_name: str, width: int, height: int) -> Arrangement:
+def arrange(
+    structure: Structure, patches: Sequence[int], type_name: str, width: int, height: int, *, smallest: int = 1
+) -> Arrangement:
     """Lay out the sensors of one type on some patches, module by module, as large as they fit.
 
-    What does not fit even at one pixel a sensor becomes higher than ``height`` (and is scrolled).
+    What does not fit even at the smallest size becomes higher than ``height`` (and is scrolled).
 
     Args:
         structure: what they belong to.
@@ -144,6 +147,7 @@ def arrange(structure: Structure, patches: Sequence[int], type_name: str, width:
         type_name: which sensors.
         width: columns of the terminal.
         height: lines of the terminal.
+        smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
 
     Raises:
         StructureError: there is no such type.
@@ -158,19 +162,26 @@ def arrange(structure: Structure, patches: Sequence[int], type_name: str, width:
         return Arrangement(positions, np.full((0, 1), -1, np.int64), {}, 1)
     modules, starts = np.unique(structure.sensor_module[positions], return_index=True)
     blocks = [
-        _Block(module, int(structure.module_patch[module]), start, end)
+        _Block(module, int(structure.module_patch[module]), structure.module_kind[module].decode(), start, end)
         for module, start, end in zip(modules.tolist(), starts, [*starts[1:], len(positions)], strict=True)
     ]
-    names = {patch: structure.patch_name[patch].decode() for patch in patches} if len(patches) > 1 else {}
-    grid = _choose_grid(blocks, names, max(8, width), max(1, height))
-    return _place(blocks, names, grid, positions)
+    labels = [
+        _within_patch(structure.module_names[block.module], structure.patch_names[block.patch]) for block in blocks
+    ]
+    names = {patch: structure.patch_names[patch] for patch in patches} if len(patches) > 1 else {}
+    grid = _choose_grid(blocks, labels, names, max(8, width), max(1, height), smallest)
+    return _place(blocks, labels, names, grid, positions)
 
 
-def block_columns(count: int) -> int:
-    """How many of ``count`` sensors of a module are drawn side by side: a compact block with few empty places."""
-    narrowest = math.isqrt(count - 1) + 1
-    widest = max(narrowest, int(2.5 * math.sqrt(count)))
-    return min(range(narrowest, widest + 1), key=lambda columns: (-count % columns, columns))
+def _within_patch(module: str, patch: str) -> str:
+    """What a module is called within its patch; empty for the only one of a patch."""
+    return module.removeprefix(patch).removeprefix(", ")
+
+
+def _short(label: str) -> str:
+    """The number at the end of a name, else the name."""
+    last = label.rpartition(" ")[2]
+    return last if last.isdigit() else label
 
 
 @dataclass(frozen=True)
@@ -179,8 +190,12 @@ class _Block:
 
     module: int
     patch: int
+    kind: str
     start: int
     end: int
+
+    def shape(self, compact: bool) -> Shape:
+        return shape_of("" if compact else self.kind, self.end - self.start)
 
 
 @dataclass(frozen=True)
@@ -188,21 +203,23 @@ class _Grid:
     """Equal places for all blocks. Sizes in pixels, but ``margin``: columns for the names of patches."""
 
     zoom: int
-    columns: int
-    """Sensors side by side in a block."""
+    halves: int
+    """Half sensors side by side in a block."""
     rows: int
     """Sensors above each other in a block."""
     per_line: int
     """Blocks side by side."""
     head: int
-    """Room above a block for its number; 0 = no numbers."""
+    """Room above a block for its name; 0 = no names."""
     gap: int
     """Room below a block."""
     margin: int
+    compact: bool
+    """Every block as a rectangle: what has another shape takes less room so."""
 
     @property
     def width(self) -> int:
-        return self.columns * self.zoom
+        return (self.halves * self.zoom + 1) // 2
 
     @property
     def pitch(self) -> int:
@@ -219,61 +236,76 @@ class _Grid:
         last_pixels = math.ceil(last / self.per_line) * self.pitch - self.gap
         return sum(self.group_lines(count) for count in above) + math.ceil(last_pixels / 2)
 
+    def shape(self, block: _Block) -> Shape:
+        """How a block is drawn: in its own shape, where that is not wider than there is room."""
+        own = block.shape(self.compact)
+        return own if own.halves <= self.halves else rows_of(len(own.cells), self.halves // 2)
 
-def _choose_grid(blocks: list[_Block], names: dict[int, str], width: int, height: int) -> _Grid:
+
+def _choose_grid(
+    blocks: list[_Block], labels: list[str], names: dict[int, str], width: int, height: int, smallest: int
+) -> _Grid:
     """The largest zoom at which everything fits, else the smallest."""
-    largest = max(block.end - block.start for block in blocks)
     margin = min(_LONGEST_NAME, max(map(len, names.values()))) + 2 if names and width >= _NAMES_FROM_WIDTH else 0
     room = width - margin
-    number_width = len(str(blocks[-1].module))
+    label_width = max(len(_short(label)) for label in labels)
     groups = _by_patch(blocks)
     longest = max(len(group) for group in groups)
-    for zoom, head in _SIZES:
-        columns = min(block_columns(largest), max(1, room // zoom))
+    sizes = [(zoom, head, False) for zoom, head in _SIZES if zoom >= smallest]
+    for zoom, head, compact in [*sizes, (smallest, 0, True)]:
+        shapes = {block.shape(compact) for block in blocks}
+        natural = max(shape.halves for shape in shapes)
+        halves = min(natural, 2 * max(1, room // zoom))
+        fits = halves == natural
         gap = 2 if zoom > 1 else 1
-        most = max(1, (room + gap) // (columns * zoom + gap))
+        most = max(1, (room + gap) // ((halves * zoom + 1) // 2 + gap))
         rows_of_blocks = math.ceil(longest / most)
         grid = _Grid(
             zoom=zoom,
-            columns=columns,
-            rows=math.ceil(largest / columns),
+            halves=halves,
+            rows=max(s.rows if s.halves <= halves else math.ceil(len(s.cells) / (halves // 2)) for s in shapes),
             per_line=math.ceil(longest / rows_of_blocks),
             head=head,
             gap=0 if head else gap,
             margin=margin,
+            compact=compact,
         )
-        if head and (len(blocks) == 1 or number_width > grid.width):
+        if head and (len(blocks) == 1 or not 0 < label_width <= grid.width):
             continue
-        if grid.columns == block_columns(largest) and grid.lines(groups) <= height:
+        if fits and grid.lines(groups) <= height:
             return grid
     return grid
 
 
-def _place(blocks: list[_Block], names: dict[int, str], grid: _Grid, positions: npt.NDArray[np.int64]) -> Arrangement:
+def _place(
+    blocks: list[_Block], labels: list[str], names: dict[int, str], grid: _Grid, positions: npt.NDArray[np.int64]
+) -> Arrangement:
     groups = _by_patch(blocks)
     gap = 2 if grid.zoom > 1 else 1
     across = grid.width + gap
     width = grid.margin + grid.per_line * across - gap
     height = 2 * sum(grid.group_lines(len(group)) for group in groups)
     pixels = np.full((height, width), -1, np.int64)
-    labels: dict[int, list[Label]] = {}
+    words: dict[int, list[Label]] = {}
     line = 0
+    if max(map(len, labels)) > grid.width:
+        labels = [_short(label) for label in labels]
+    label_of = {block.module: label for block, label in zip(blocks, labels, strict=True)}
     for group in groups:
         if grid.margin:
             name = names[group[0].patch]
-            labels.setdefault(line + (1 if grid.head else 0), []).append(Label(0, name[:_LONGEST_NAME]))
+            words.setdefault(line + (1 if grid.head else 0), []).append(Label(0, name[:_LONGEST_NAME]))
         for number, block in enumerate(group):
             top = 2 * line + number // grid.per_line * grid.pitch
             left = grid.margin + number % grid.per_line * across
             if grid.head:
-                labels.setdefault(top // 2, []).append(Label(left, str(block.module)))
-            cells = np.full(grid.rows * grid.columns, -1, np.int64)
-            cells[: block.end - block.start] = np.arange(block.start, block.end)
-            square = cells.reshape(grid.rows, grid.columns).repeat(grid.zoom, axis=0).repeat(grid.zoom, axis=1)
+                words.setdefault(top // 2, []).append(Label(left, label_of[block.module]))
             top += grid.head
-            pixels[top : top + len(square), left : left + grid.width] = square
+            for sensor, (row, half) in enumerate(grid.shape(block).cells, block.start):
+                y, x = top + row * grid.zoom, left + half * grid.zoom // 2
+                pixels[y : y + grid.zoom, x : x + grid.zoom] = sensor
         line += grid.group_lines(len(group))
-    return Arrangement(positions, pixels[: 2 * grid.lines(groups)], labels, grid.zoom)
+    return Arrangement(positions, pixels[: 2 * grid.lines(groups)], words, grid.zoom)
 
 
 def _by_patch(blocks: list[_Block]) -> list[list[_Block]]:

@@ -12,10 +12,11 @@ from textual.strip import Strip
 
 from skinware.cli._heat_map import Arrangement
 from skinware.cli._painting import changed_lines, segments_of
+from skinware.cli._palette import Palette
 
 
 class HeatMap(ScrollView, can_focus=False):
-    """A picture line by line; only lines that changed are drawn again."""
+    """A picture line by line, in the colours of a palette; only lines that changed are drawn again."""
 
     class Pointed(Message):
         """The mouse points at a sensor (its position in the frame), or at none."""
@@ -24,8 +25,9 @@ class HeatMap(ScrollView, can_focus=False):
             super().__init__()
             self.sensor = sensor
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002 - Textual's name
+    def __init__(self, palette: Palette, *, id: str) -> None:  # noqa: A002 - Textual's name
         super().__init__(id=id)
+        self._palette = palette
         self._arrangement: Arrangement | None = None
         self._pixels: npt.NDArray[np.uint8] | None = None
         self._strips: dict[int, Strip] = {}
@@ -61,7 +63,7 @@ class HeatMap(ScrollView, can_focus=False):
         if arrangement is None or pixels is None or line >= arrangement.lines:
             return Strip.blank(0)
         upper, lower = pixels[2 * line : 2 * line + 2]
-        segments = segments_of(upper, lower, arrangement.labels.get(line, ()))
+        segments = segments_of(upper, lower, arrangement.labels.get(line, ()), self._palette)
         strip = self._strips[line] = Strip(segments, arrangement.columns)
         return strip
 

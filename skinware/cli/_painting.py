@@ -15,12 +15,7 @@ from rich.text import Text
 
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
-from skinware.sensor_types import SensorType
-
-_ANCHORS = ("#22304f", "#243c66", "#27548a", "#2a7f96", "#3aa882", "#8cc152", "#e6c440", "#f08c38", "#e8453c")
-"""From no touch to full scale: the higher, the warmer and brighter."""
-_GROUND = ColorTriplet(18, 18, 18)
-_NO_VALUE = ColorTriplet(48, 48, 48)
+from skinware.cli._palette import Palette
 
 MARK_CHARACTERS = {
     heat.FRESH: " ",
@@ -31,6 +26,7 @@ MARK_CHARACTERS = {
     heat.MASKED: "-",
     heat.NEVER_SEEN: "·",
     heat.NOT_CONNECTED: "x",
+    heat.UNMOVED: "□",
 }
 MARK_NAMES = {
     heat.STALE: "stale",
@@ -40,34 +36,18 @@ MARK_NAMES = {
     heat.MASKED: "switched off",
     heat.NEVER_SEEN: "never seen",
     heat.NOT_CONNECTED: "not connected",
+    heat.UNMOVED: "never moved",
 }
 
 
-def _ramp() -> list[ColorTriplet]:
-    anchors = [Color.parse(text).get_truecolor() for text in _ANCHORS]
-    colours = []
-    for level in range(LEVELS):
-        place = level * (len(anchors) - 1) / (LEVELS - 1)
-        first = min(int(place), len(anchors) - 2)
-        colours.append(_mixed(anchors[first], anchors[first + 1], place - first))
-    return colours
-
-
-def _mixed(one: ColorTriplet, other: ColorTriplet, share: float) -> ColorTriplet:
-    """A colour between two: ``one`` at share 0, ``other`` at 1."""
-    return ColorTriplet(*(round(a + (b - a) * share) for a, b in zip(one, other, strict=True)))
-
-
-RAMP = _ramp()
-"""One colour per level."""
-
-
-def colour_of(code: int) -> ColorTriplet:
+def colour_of(code: int, palette: Palette) -> ColorTriplet:
     """What a sensor of this code looks like where there is no room for its character."""
     mark, level = divmod(code, LEVELS)
+    if mark == heat.UNMOVED:
+        return palette.unmoved
     if mark >= heat.FIRST_WITHOUT_VALUE:
-        return _NO_VALUE
-    return _mixed(RAMP[level], _GROUND, 0.6) if mark == heat.STALE else RAMP[level]
+        return palette.no_value
+    return palette.stale[level] if mark == heat.STALE else palette.ramp[level]
 
 
 def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> list[int]:
@@ -77,19 +57,22 @@ def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> 
     return lines
 
 
-def segments_of(upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label]) -> list[Segment]:
+def segments_of(
+    upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label], palette: Palette
+) -> list[Segment]:
     """One line of a map.
 
     Args:
         upper: (columns,) uint8, codes of the pixels in the upper half of the line.
         lower: (columns,) uint8, codes of those in the lower half.
         labels: words to put in.
+        palette: the terminal's.
     """
     pairs = upper.astype(np.uint16) << 8 | lower
     edges = (np.flatnonzero(pairs[1:] != pairs[:-1]) + 1).tolist()
     segments = []
     for start, end in zip([0, *edges], [*edges, len(pairs)], strict=True):
-        character, style = _cell(int(pairs[start]))
+        character, style = _cell(int(pairs[start]), palette)
         segments.append(Segment(character * (end - start), style))
     for label in labels:
         end = label.column + len(label.text)
@@ -102,22 +85,28 @@ _LABEL = Style.parse("#8a8a8a")
 
 
 @cache
-def _cell(pair: int) -> tuple[str, Style]:
+def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
     """Character and colours of one cell: its upper code in the high byte, its lower one in the low."""
     upper, lower = divmod(pair, 256)
+    if palette.characters:
+        return _character(lower if upper == BACKGROUND else upper, palette), Style.null()
     if upper != lower and BACKGROUND in (upper, lower):
-        return ("▀", _style(upper)) if lower == BACKGROUND else ("▄", _style(lower))
+        return ("▀", _style(upper, palette)) if lower == BACKGROUND else ("▄", _style(lower, palette))
     if upper != lower:
-        return "▀", Style(color=_colour(colour_of(upper)), bgcolor=_colour(colour_of(lower)))
+        return "▀", Style(color=_colour(colour_of(upper, palette)), bgcolor=_colour(colour_of(lower, palette)))
     if upper == BACKGROUND:
         return " ", Style.null()
+    ground = colour_of(upper, palette)
     mark, level = divmod(upper, LEVELS)
-    if mark == heat.STALE:
-        ground = _mixed(RAMP[level], _GROUND, 0.75)
-        return MARK_CHARACTERS[mark], Style(color=_colour(_mixed(RAMP[level], _GROUND, 0.35)), bgcolor=_colour(ground))
-    colour = colour_of(upper)
-    ink = ColorTriplet(150, 150, 150) if mark >= heat.FIRST_WITHOUT_VALUE else _ink(colour)
-    return MARK_CHARACTERS.get(mark, "?"), Style(color=_colour(ink), bgcolor=_colour(colour))
+    ink = palette.ramp[level] if mark == heat.STALE else _ink(ground)
+    return _character(upper, palette), Style(color=_colour(ink), bgcolor=_colour(ground))
+
+
+def _character(code: int, palette: Palette) -> str:
+    if code == BACKGROUND:
+        return " "
+    mark, level = divmod(code, LEVELS)
+    return palette.characters[level] if palette.characters and mark == heat.FRESH else MARK_CHARACTERS.get(mark, "?")
 
 
 def _ink(colour: ColorTriplet) -> ColorTriplet:
@@ -130,31 +119,46 @@ def _colour(triplet: ColorTriplet) -> Color:
     return Color.from_triplet(triplet)
 
 
-def _style(code: int) -> Style:
-    return Style(color=_colour(colour_of(code)))
+def _style(code: int, palette: Palette) -> Style:
+    return Style(color=_colour(colour_of(code, palette)))
 
 
-def scale_text(sensor_type: SensorType, low: float, high: float) -> Text:
-    """The colours, from the value of the first one to that of the last one."""
-    text = Text(f"{low:.5g} ", no_wrap=True)
-    for left, right in zip(RAMP[0::2], RAMP[1::2], strict=True):
-        text.append("▌", Style(color=_colour(left), bgcolor=_colour(right)))
-    text.append(f" {high:.5g} {sensor_type.unit}")
-    return text
+def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
+    """The colours, from that of the least level to that of the highest.
+
+    Args:
+        values: of the lowest level, the middle one if it is to be said, the highest.
+        unit: of the values.
+        palette: the terminal's.
+    """
+    first, *others = (f"{value:.4g}" for value in values)
+    text = Text(f"{first} ", no_wrap=True)
+    half = LEVELS // len(others)
+    for number, other in enumerate(others):
+        for level in range(number * half, (number + 1) * half, 2):
+            if palette.characters:
+                text.append(palette.characters[level + 1])
+            else:
+                left, right = palette.ramp[level : level + 2]
+                text.append("▌", Style(color=_colour(left), bgcolor=_colour(right)))
+        text.append(f" {other}{' ' * (number + 1 < len(others))}")
+    return text.append(f" {unit}".rstrip())
 
 
-def marks_text(marks: npt.NDArray[np.uint8]) -> Text:
+def marks_text(marks: npt.NDArray[np.uint8], palette: Palette) -> Text:
     """How many sensors are fresh, and which of the other marks are to be seen, with what they mean.
 
     Args:
         marks: (n,) uint8, marks of all sensors that are drawn.
+        palette: the terminal's.
     """
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
-    text = Text(f"{counts[heat.FRESH]} fresh", no_wrap=True, overflow="ellipsis")
+    fresh = counts[heat.FRESH] + counts[heat.UNMOVED]  # a stuck one comes in time, too
+    text = Text(f"{fresh} fresh", no_wrap=True, overflow="ellipsis")
     for mark, name in MARK_NAMES.items():
         if counts[mark]:
             level = LEVELS // 2 if mark < heat.FIRST_WITHOUT_VALUE else 0
-            character, style = _cell((mark * LEVELS + level) * 0x101)
+            character, style = _cell((mark * LEVELS + level) * 0x101, palette)
             text.append("  ")
             text.append(character, style)
             text.append(f" {counts[mark]} {name}")

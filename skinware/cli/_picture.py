@@ -1,23 +1,30 @@
-"""What ``skin-top`` draws of the chosen row: keeps scales and levels from frame to frame. No terminal needed."""
+"""What ``skin-top`` draws of the chosen row: keeps baselines and levels from frame to frame. No terminal needed."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from rich.text import Text
 
 from skinware.cli._health import status_now
-from skinware.cli._heat_map import Arrangement, arrange, codes_of, levels_of, marks_of
+from skinware.cli._heat_map import FRESH, UNMOVED, Arrangement, arrange, codes_of, marks_of
 from skinware.cli._painting import marks_text, scale_text
+from skinware.cli._palette import TRUE_COLOURS, Palette
+from skinware.cli._rest import Rest
+from skinware.cli._scale import CHANGE, RANGE, RAW, SCALES, ChangeScale, Scaled, ValueScale
 from skinware.cli._top_rows import RowKey, patches_of, title_of
+from skinware.cli._wipe import WipeTest
 from skinware.driver_service import DriverFrame
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware.structure import Structure
 
 _NAMED_STATUSES = {bit: str(bit.name).lower().replace("_", " ") for bit in Status}
+_PEAK = "peak"
+_EVERYTHING = (-math.inf, math.inf)
 
 
 class Picture:
@@ -25,9 +32,11 @@ class Picture:
 
     Args:
         type_name: the type to draw where there is one of this name; otherwise each driver's first.
+        scale_name: what the colours mean at first, one of ``SCALES``.
+        palette: of the terminal.
 
     Attributes:
-        by_range: colours span the type's range where it has one; otherwise what was seen so far.
+        scale_name: what the colours mean: ``change`` from rest, the type's ``range``, ``raw`` counts.
         arrangement: where sensors are; None before the first ``draw``.
         pixels: (2 * lines, columns) uint8, codes of the pixels last drawn.
         title: what is drawn, in words.
@@ -35,15 +44,18 @@ class Picture:
         marks: what the characters mean, with how many sensors have each.
     """
 
-    def __init__(self, type_name: str | None = None) -> None:
-        self.by_range = True
+    def __init__(self, type_name: str | None = None, scale_name: str = CHANGE, palette: Palette = TRUE_COLOURS) -> None:
+        self.scale_name = scale_name
         self.arrangement: Arrangement | None = None
         self.pixels: npt.NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self.title = ""
         self.scale = Text()
         self.marks = Text()
         self._wanted = type_name
-        self._seen: dict[tuple[str, str], tuple[float, float]] = {}
+        self._palette = palette
+        self._watched: dict[str, _Watched] = {}
+        self._wiping = False
+        self._unmoved = np.zeros(0, np.int64)
         self._levels: npt.NDArray[np.uint8] | None = None
         self._made_for: tuple[object, ...] = ()
 
@@ -56,14 +68,49 @@ class Picture:
         names = [t.name for t in structure.types]
         self._wanted = names[(names.index(self.type_in(structure).name) + 1) % len(names)]
 
-    def other_scale(self) -> None:
-        """Change between the type's range and the values seen from now on."""
-        self.by_range = not self.by_range
-        self._seen.clear()
+    def next_scale(self) -> None:
+        """Go over to the next meaning of the colours."""
+        self.scale_name = SCALES[(SCALES.index(self.scale_name) + 1) % len(SCALES)]
         self._levels = None
 
+    def take_baselines(self) -> None:
+        """What comes next is what the sensors read at rest."""
+        for watched in self._watched.values():
+            watched.rest.begin()
+        self._levels = None
+
+    def wipe_test(self) -> None:
+        """Begin a wipe test, or end it."""
+        self._wiping = not self._wiping
+        for watched in self._watched.values():
+            watched.wipe = None
+        self._levels = None
+
+    def wipe_text(self, driver: str) -> str | None:
+        """How the wipe test goes for what is drawn, for people; None where there is none."""
+        watched = self._watched.get(driver)
+        if watched is None or watched.wipe is None:
+            return None
+        count = len(self._unmoved)
+        if not count:
+            return "wipe test: every sensor has moved"
+        first = watched.structure.sensor_name(int(self._unmoved.min()))
+        return f"wipe test: {count} never moved (l saves the list): {first}{' ...' * (count > 1)}"
+
+    def save_wipe(self, driver: str, folder: Path) -> Path | None:
+        """Save the list of the sensors that never moved; None where no test goes on.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        watched = self._watched.get(driver)
+        if watched is None or watched.wipe is None:
+            return None
+        name = self.type_in(watched.structure).name
+        return watched.wipe.save(folder, driver, name, watched.rest.noise(name))
+
     def draw(self, key: RowKey, frame: DriverFrame, width: int, height: int, life: str) -> None:
-        """Draw a frame: sets all attributes but ``by_range``.
+        """Draw a frame: sets ``arrangement`` and all that is drawn.
 
         Args:
             key: which row.
@@ -76,41 +123,90 @@ class Picture:
         made_for = (key, frame.structure, sensor_type, width, height)
         if self.arrangement is None or made_for != self._made_for:
             patches = patches_of(key, frame)
-            self.arrangement = arrange(frame.structure, patches, sensor_type.name, width, height)
+            smallest = 2 if self._palette.characters else 1
+            self.arrangement = arrange(frame.structure, patches, sensor_type.name, width, height, smallest=smallest)
             self._made_for, self._levels = made_for, None
             self.title = title_of(key, frame.structure, patches, sensor_type.name, len(self.arrangement.sensors))
             if self._wanted not in (None, sensor_type.name):
                 self.title += f" (there are no {self._wanted} sensors)"
+        watched = self._watch(key.driver, frame)
         sensors = self.arrangement.sensors
-        raw = frame.values[sensors].astype(np.float32)
-        values = raw * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
-        status = frame.status[sensors]
-        low, high = self._limits(key.driver, sensor_type, values[status == 0])
-        self._levels = levels_of(values, low, high, self._levels)
-        marks = marks_of(status_now(life, status))
+        name, scaled = self._scaled(watched, frame, sensors, sensor_type)
+        self._levels = scaled.levels
+        marks = marks_of(status_now(life, frame)[sensors])
+        if watched.wipe is not None:
+            unmoved = np.isin(sensors, watched.wipe.never_moved(sensor_type.name, watched.rest.noise(sensor_type.name)))
+            self._unmoved = sensors[unmoved]
+            marks[(marks == FRESH) & unmoved] = UNMOVED
         self.pixels = self.arrangement.draw(codes_of(self._levels, marks))
-        self.scale, self.marks = scale_text(sensor_type, low, high), marks_text(marks)
+        unit = "" if name == RAW else sensor_type.unit
+        self.scale = Text(f"{name} ", no_wrap=True).append_text(scale_text(scaled.values, unit, self._palette))
+        self.marks = marks_text(marks, self._palette)
 
-    def _limits(self, driver: str, sensor_type: SensorType, fresh: npt.NDArray[np.float32]) -> tuple[float, float]:
-        if self.by_range and math.isfinite(sensor_type.minimum) and math.isfinite(sensor_type.maximum):
-            return sensor_type.minimum, sensor_type.maximum
-        low, high = self._seen.get((driver, sensor_type.name), (math.inf, -math.inf))
-        finite = fresh[np.isfinite(fresh)]
-        if len(finite):
-            low, high = min(low, float(finite.min())), max(high, float(finite.max()))
-            self._seen[driver, sensor_type.name] = low, high
-        return (low, high) if low <= high else (0.0, 1.0)
+    def _watch(self, driver: str, frame: DriverFrame) -> _Watched:
+        """What is known of a driver, with this frame."""
+        watched = self._watched.get(driver)
+        if watched is None or watched.structure is not frame.structure:
+            watched = self._watched[driver] = _Watched(frame.structure)
+        if self._wiping and watched.wipe is None:
+            watched.wipe = WipeTest(frame.structure)
+        watched.follow(frame)
+        return watched
+
+    def _scaled(
+        self, watched: _Watched, frame: DriverFrame, sensors: npt.NDArray[np.int64], sensor_type: SensorType
+    ) -> tuple[str, Scaled]:
+        """What the colours mean, and the levels of the sensors."""
+        fresh = frame.status[sensors] == 0
+        if watched.wipe is None and self.scale_name != CHANGE:
+            in_range = self.scale_name == RANGE
+            values = watched.physical[sensors] if in_range else frame.values[sensors].astype(np.float32)
+            limits = (sensor_type.minimum, sensor_type.maximum) if in_range else _EVERYTHING
+            scale = watched.values.setdefault((self.scale_name, sensor_type.name), ValueScale())
+            return self.scale_name, scale.draw(values, fresh, limits, self._levels)
+        noise = watched.rest.noise(sensor_type.name)
+        if watched.wipe is None:
+            name, change = CHANGE, watched.rest.change(watched.physical)
+        else:
+            name, change = _PEAK, watched.wipe.travel()
+        change_scale = watched.changes.setdefault((name, sensor_type.name), ChangeScale())
+        return name, change_scale.draw(change[sensors], fresh, noise, frame.published_ns, self._levels)
+
+
+class _Watched:
+    """What is kept of a driver from frame to frame."""
+
+    def __init__(self, structure: Structure) -> None:
+        self.structure = structure
+        self.rest = Rest(structure)
+        self.wipe: WipeTest | None = None
+        self.changes: dict[tuple[str, str], ChangeScale] = {}
+        self.values: dict[tuple[str, str], ValueScale] = {}
+        self.physical: npt.NDArray[np.float32] = np.zeros(structure.n_sensors, np.float32)
+        self._scale = np.ones(structure.n_sensors, np.float32)
+        self._offset = np.zeros(structure.n_sensors, np.float32)
+        for sensor_type in structure.types:
+            index = structure.index(sensor_type.name)
+            self._scale[index], self._offset[index] = sensor_type.scale, sensor_type.offset
+
+    def follow(self, frame: DriverFrame) -> None:
+        self.physical = frame.values.astype(np.float32) * self._scale + self._offset
+        fresh = frame.status == 0
+        self.rest.follow(self.physical, fresh, frame.published_ns)
+        if self.wipe is not None:
+            self.wipe.follow(self.physical, fresh)
 
 
 def describe_sensor(frame: DriverFrame, position: int) -> str:
-    """One sensor in words: where it is, its value, and what is wrong with it."""
+    """One sensor in words: which it is, its value, and what is wrong with it."""
     structure = frame.structure
     sensor_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
     raw = frame.values[position].item()
     value = f"{sensor_type.offset + sensor_type.scale * raw:.5g} {sensor_type.unit}".strip()
     status = int(frame.status[position])
     states = ", ".join(name for bit, name in _NAMED_STATUSES.items() if status & bit) or "fresh"
+    uid = int(structure.sensor_uid[position])
     return (
-        f"{sensor_type.name} sensor {position}: {value} (raw {raw:g}), {states}; module"
-        f" {structure.sensor_module[position]}, uid {int(structure.sensor_uid[position]):#x}"
+        f"{structure.sensor_name(position)}: {sensor_type.name} {value} (raw {raw:g}), {states};"
+        f" position {position}, uid {uid:#x}"
     )

@@ -76,8 +76,16 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
     names = {sensor_type.id: sensor_type.name for sensor_type in structure.types}
     columns = (structure.sensor_uid, structure.sensor_type, structure.sensor_module, structure.sensor_patch)
     return [
-        {"uid": uid, "type": names[type_id], "module": module, "patch": patch}
-        for uid, type_id, module, patch in zip(*(column.tolist() for column in columns), strict=True)
+        {
+            "name": structure.sensor_name(position),
+            "uid": uid,
+            "type": names[type_id],
+            "module": module,
+            "patch": patch,
+        }
+        for position, (uid, type_id, module, patch) in enumerate(
+            zip(*(column.tolist() for column in columns), strict=True)
+        )
     ]
 
 
@@ -200,7 +208,7 @@ def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list
         entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0}
     if frame is None:
         return entries
-    is_fresh = status_now(life, frame.status) == 0
+    is_fresh = status_now(life, frame) == 0
     fresh = np.bincount(structure.sensor_patch[is_fresh], minlength=structure.n_patches).tolist()
     for patch, (entry, age_ns) in enumerate(zip(entries, patch_ages_ns(frame), strict=True)):
         entry["state"] = patch_state_name(int(frame.patch_state[patch]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+from pathlib import Path
 from typing import ClassVar
 
 from rich.console import JustifyMethod
@@ -14,11 +15,13 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware.cli._format import plural
+from skinware.cli._format import NOT_FRESH, plural
 from skinware.cli._health import LIVE, life_of
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._live import LiveDrivers
+from skinware.cli._palette import Palette, palette_for
 from skinware.cli._picture import Picture, describe_sensor
+from skinware.cli._scale import CHANGE
 from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
@@ -36,6 +39,7 @@ _STATE_COLOURS = {
     "paused": "#5fb3d9",
     "stale": "#e6c440",
     "silent": "#e6c440",
+    NOT_FRESH: "#e8453c",
     "down": "#e8453c",
     "gone": "#e8453c",
     "dead": "#e8453c",
@@ -59,6 +63,8 @@ class SkinTop(App[None]):
         namespace: where to look.
         type_name: type of sensors to draw first; default: each driver's first.
         duration_s: end after this time; None = until told to.
+        scale_name: what the colours mean at first: ``change``, ``range`` or ``raw``.
+        palette: default: what the terminal can show.
     """
 
     TITLE = "skin-top"
@@ -87,17 +93,29 @@ class SkinTop(App[None]):
         Binding("ctrl+c", "quit", show=False, priority=True),
         Binding("down", "choose(1)", "Choose", key_display="↑↓"),
         Binding("up", "choose(-1)", show=False),
-        Binding("t", "next_type", "Sensor type"),
-        Binding("s", "other_scale", "Colour scale"),
+        Binding("t", "next_type", "Type"),
+        Binding("s", "next_scale", "Scale"),
+        Binding("b", "take_baselines", "Baseline"),
+        Binding("w", "wipe_test", "Wipe test"),
+        Binding("l", "save_list", "Save list", show=False),
         Binding("pagedown", "scroll(1)", "Scroll", key_display="PgUp/PgDn"),
         Binding("pageup", "scroll(-1)", show=False),
     ]
 
-    def __init__(self, namespace: Namespace, type_name: str | None = None, duration_s: float | None = None) -> None:
+    def __init__(
+        self,
+        namespace: Namespace,
+        type_name: str | None = None,
+        duration_s: float | None = None,
+        *,
+        scale_name: str = CHANGE,
+        palette: Palette | None = None,
+    ) -> None:
         super().__init__()
+        palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
         self._drivers = LiveDrivers(namespace)
         self._duration_s = duration_s
-        self._picture = Picture(type_name)
+        self._picture = Picture(type_name, scale_name, palette)
         self._head = Static(id="head", markup=False)
         self._nothing = Container(id="nothing")
         self._why = Static(id="why", markup=False)
@@ -105,7 +123,7 @@ class SkinTop(App[None]):
         self._table = DataTable[Text](id="list", cursor_type="row")
         self._title = Static(id="title", markup=False)
         self._scale = Static(id="scale", markup=False)
-        self._heat_map = HeatMap(id="map")
+        self._heat_map = HeatMap(palette, id="map")
         self._marks = Static(id="marks", markup=False)
         self._detail = Static(id="detail", markup=False)
         self._rows: list[Row] = []
@@ -168,10 +186,31 @@ class SkinTop(App[None]):
             self._picture.next_type(driver.reader.structure)
             self._must_draw = True
 
-    def action_other_scale(self) -> None:
-        """Change what the colours span: the type's range, or the values seen from now on."""
-        self._picture.other_scale()
+    def action_next_scale(self) -> None:
+        """Change what the colours mean."""
+        self._picture.next_scale()
         self._must_draw = True
+
+    def action_take_baselines(self) -> None:
+        """Take what comes next for what the sensors read at rest."""
+        self._picture.take_baselines()
+        self._must_draw = True
+
+    def action_wipe_test(self) -> None:
+        """Begin a wipe test, or end it."""
+        self._picture.wipe_test()
+        self._must_draw = True
+
+    def action_save_list(self) -> None:
+        """Save the list of the sensors that never moved."""
+        row = self._chosen
+        try:
+            path = self._picture.save_wipe(row.key.driver, Path.cwd()) if row else None
+        except OSError as error:
+            self.notify(f"{error.filename}: {error.strerror}", severity="error", markup=False)
+            return
+        if path is not None:
+            self.notify(f"saved: {path}", markup=False)
 
     def on_data_table_row_highlighted(self) -> None:
         """Another row was chosen, by key or mouse."""
@@ -255,7 +294,7 @@ class SkinTop(App[None]):
         if self._pointed is not None and self._pointed < frame.structure.n_sensors:
             _say(self._detail, describe_sensor(frame, self._pointed))
         else:
-            _say(self._detail, counters_text(row.counters))
+            _say(self._detail, picture.wipe_text(row.key.driver) or counters_text(row.counters))
 
 
 def _say(line: Static, text: str | Text) -> None:

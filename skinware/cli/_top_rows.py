@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text
+from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
 from skinware.cli._health import (
     DEAD,
     LIVE,
@@ -56,20 +56,21 @@ class Row(NamedTuple):
 
 def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth) -> list[Row]:
     """The driver, then each of its buses with its patches below it."""
-    name = health.name
+    name, n_fresh = health.name, health.statuses.get("fresh", 0)
+    shown = health.life if frame is None else state_shown(health.life, n_fresh, health.sensors)
     first = Row(
         RowKey(name, DRIVER, 0),
         (
             name,
-            health.life,
+            shown,
             rate_text(health.rate_hz),
             age_text(health.age_ns),
-            f"{health.statuses.get('fresh', 0)}/{health.sensors}",
+            f"{n_fresh}/{health.sensors}",
             count_text(health.counters.get("lost")),
             count_text(health.counters.get("orphans")),
             "",
         ),
-        health.life,
+        shown,
         health.counters,
     )
     if frame is None:
@@ -90,14 +91,14 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
 
 
 def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row]:
-    structure, status = frame.structure, status_now(life, frame.status)
+    structure, status = frame.structure, status_now(life, frame)
     was = "was " if life in WITHOUT_NEWS else ""
     total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
     fresh = np.bincount(structure.sensor_patch[status == 0], minlength=structure.n_patches).tolist()
     ages_ns = patch_ages_ns(frame)
     rows = []
     for patch, counters in enumerate(reader.patch_counters(frame)):
-        state = was + patch_state_name(int(frame.patch_state[patch]))
+        state = state_shown(was + patch_state_name(int(frame.patch_state[patch])), fresh[patch], total[patch])
         cells = (
             f"    {structure.patch_name[patch].decode()}",
             state,
@@ -139,9 +140,8 @@ def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: s
     if key.kind == PATCH:
         kinds = structure.module_kind[structure.module_patch == key.number]
         kind = kinds[0].decode() if len(kinds) and (kinds == kinds[0]).all() else ""
-        modules = plural(len(kinds), f"{kind} module".strip())
-        bus = structure.buses[structure.patch_bus[key.number]]
-        return f"{structure.patch_name[key.number].decode()} on {bus}: {modules}, {drawn}"
+        modules = plural(len(kinds), kind if kind.isalpha() else "module")
+        return f"{structure.patch_names[key.number]}: {modules}, {drawn}"
     name = structure.buses[key.number] if key.kind == BUS else key.driver
     return f"{name}: {plural(len(patches), 'patch', 'patches')}, {drawn}"
 

@@ -16,6 +16,7 @@ from skinware.cli._command import (
     print_json,
     run,
     seconds,
+    version_option,
     warn,
 )
 
@@ -34,7 +35,7 @@ _LOOK_EVERY_S = 0.1
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-dump -n 3                              three frames",
-        "skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s",
+        "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
         "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
     ),
 )
@@ -43,43 +44,54 @@ _LOOK_EVERY_S = 0.1
 @click.option("-T", "timeout_s", type=seconds, help="Fail after SECONDS without a frame; also wait for the driver.")
 @click.option("--type", "type_name", metavar="TYPE", help="Only the sensors of one type, such as pressure.")
 @click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
-@click.option("--physical", is_flag=True, help="Values in the unit of their type instead of raw counts.")
+@click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
+@click.option("--physical", is_flag=True, hidden=True)
 @namespace_option
 @json_option
+@version_option
 def command(
     name: str | None,
     count: int | None,
     timeout_s: float | None,
     type_name: str | None,
     rate_hz: float | None,
+    counts: bool,
     physical: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
     """Print the frames of driver NAME, each once and in order; without NAME, of the only driver there is.
 
+    Values are physical, in the unit of their type, as skin-top shows them.
+
     A line of text has the least, greatest and mean value of the fresh sensors of each type. JSON has everything.
     """
+    from skinware.cli._format import terminal_width, wrapped
     from skinware.memory.namespace import Namespace
 
+    if physical:
+        if counts:
+            raise click.UsageError("--counts and --physical are opposites")
+        warn("--physical is not needed any more: values are physical")
     taken = 0
     with _attach(Namespace(namespace), name, timeout_s) as reader:
         _check_type(reader.structure, type_name)
         for frame in _frames(reader, rate_hz, timeout_s):
             if as_json:
-                print_json(as_data(reader, frame, type_name, physical))
+                print_json(as_data(reader, frame, type_name, counts))
             else:
                 lost = f"  lost {reader.lost}" if reader.lost and rate_hz is None else ""
-                click.echo(f"{reader.name} {as_line(frame, type_name, physical)}{lost}")
+                line = f"{reader.name} {as_line(frame, type_name, counts)}{lost}"
+                click.echo("\n".join(wrapped(line, terminal_width())))
             taken += 1
             if taken == count:
                 return
 
 
-def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, physical: bool) -> dict[str, Any]:
+def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, counts: bool) -> dict[str, Any]:
     """One frame as JSON prints it; with ``type_name`` only those sensors, and their uids."""
     index: Index = slice(None) if type_name is None else frame.structure.index(type_name)
-    values = _physical(frame)[index] if physical else frame.values[index]
+    values = (frame.values if counts else _physical(frame))[index]
     data = {
         "driver": reader.name,
         "sequence": frame.sequence,
@@ -94,14 +106,14 @@ def as_data(reader: DriverReader, frame: DriverFrame, type_name: str | None, phy
     return data
 
 
-def as_line(frame: DriverFrame, type_name: str | None, physical: bool) -> str:
+def as_line(frame: DriverFrame, type_name: str | None, counts: bool) -> str:
     """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
     from skinware.cli._format import age_text
 
     parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
-    all_values = _physical(frame) if physical else frame.values
+    all_values = frame.values if counts else _physical(frame)
     not_fresh = 0
     for sensor_type in frame.structure.types:
         if type_name in (None, sensor_type.name):
@@ -112,7 +124,7 @@ def as_line(frame: DriverFrame, type_name: str | None, physical: bool) -> str:
             figures, mean = "-", ""
             if len(values):
                 figures, mean = f"{values.min():.5g} to {values.max():.5g}", f" (mean {values.mean():.5g})"
-            parts.append(f"{sensor_type.name} {figures} {sensor_type.unit if physical else 'raw'}{mean}")
+            parts.append(f"{sensor_type.name} {figures} {'raw' if counts else sensor_type.unit}{mean}")
     return "  ".join([*parts, f"not fresh {not_fresh}"])
 
 

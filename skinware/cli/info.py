@@ -5,13 +5,32 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
-from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, table
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    version_option,
+)
+from skinware.cli._format import (
+    NO_VALUE,
+    NOT_FRESH,
+    age_text,
+    count_text,
+    plural,
+    rate_text,
+    state_shown,
+    table,
+    terminal_width,
+    wrapped,
+)
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -20,8 +39,16 @@ _WATCH_PERIOD_S = 1.0
 _OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
 """What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
 and of an update's age when it was published."""
-_ABOUT_A_PATCH = "99 %: at most so much in 99 of 100 cases; interval: between two updates; delay: until published"
-_LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent": "yellow", "dead": "red"}
+_ABOUT_A_PATCH = "99 %: 99th percentile; interval: time between two updates; delay: time until publication"
+_INDENT = 2
+_LIFE_COLOURS = {
+    "live": "green",
+    NOT_FRESH: "red",
+    "paused": "cyan",
+    "starting": "cyan",
+    "silent": "yellow",
+    "dead": "red",
+}
 
 
 @click.command(
@@ -38,6 +65,7 @@ _LIFE_COLOURS = {"live": "green", "paused": "cyan", "starting": "cyan", "silent"
 @click.option("--watch", is_flag=True, help="Again every second, until interrupted.")
 @namespace_option
 @json_option
+@version_option
 def command(name: str | None, sensors: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
     """Show what is attached: drivers, their buses and patches, other services, and who reads them.
 
@@ -63,7 +91,10 @@ def command(name: str | None, sensors: bool, watch: bool, namespace: str | None,
 
 
 def as_text(found: dict[str, Any]) -> list[str]:
-    """The report for people, as lines with colours (which ``click.echo`` takes out where there is no terminal)."""
+    """The report for people, as lines with colours (which ``click.echo`` takes out where there is no terminal).
+
+    On a terminal no line is wider than it.
+    """
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
     if not drivers and not services:
@@ -75,7 +106,13 @@ def as_text(found: dict[str, Any]) -> list[str]:
         lines += ["", _life_line("service", service), *_indented(own)]
     if found["problems"]:
         lines += ["", *(click.style("problem: ", fg="red") + text for text in found["problems"])]
-    return lines
+    return [part for line in lines for part in wrapped(line, terminal_width())]
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """A table that fits the terminal when it is indented."""
+    width = terminal_width()
+    return table(titles, rows, left=left, width=None if width is None else width - _INDENT)
 
 
 def _driver_lines(driver: dict[str, Any]) -> list[str]:
@@ -158,7 +195,9 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     """State of a bus or patch: the last one that is known, where the driver says nothing new."""
     if part["state"] is None:
         return NO_VALUE
-    return part["state"] if driver["state"] == "live" else f"was {part['state']}"
+    if driver["state"] != "live":
+        return f"was {part['state']}"
+    return state_shown(part["state"], part["fresh"], part["sensors"]) if "fresh" in part else part["state"]
 
 
 def _reason(bus: dict[str, Any]) -> str | None:
@@ -185,7 +224,11 @@ _OF_A_BUS = {"reason": _reason, "for": _duration, "load": _load}
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:
     life, age = entry["state"], age_text(None if entry["age_ms"] is None else entry["age_ms"] * 1e6)
-    parts = [click.style(life, fg=_LIFE_COLOURS.get(life), bold=True)]
+    patches = entry.get("patch_list", ())
+    shown = state_shown(life, sum(patch["fresh"] for patch in patches), entry.get("sensors", 0))
+    parts = [click.style(life, fg=_LIFE_COLOURS.get(shown), bold=True)]
+    if shown == NOT_FRESH:
+        parts.append(click.style("but no sensor is fresh", fg="red"))
     if entry["age_ms"] is None:
         parts.append("nothing published yet")
     elif life == "dead":
@@ -216,7 +259,7 @@ def _counter_table(
     """Rows with those of their counters that are not 0 everywhere (and ``always``, where there are such counters)."""
     names = [key for key in dict.fromkeys(key for row in rows for key in row) if key not in _OWN_KEYS]
     shown = [name for name in names if name in always or any(row.get(name) for row in rows)]
-    return table(
+    return _table(
         [*titles, *(name.replace("_", " ") for name in shown)],
         [[*cells(row), *(count_text(row.get(name)) for name in shown)] for row in rows],
         left=min(len(titles), 3),
@@ -254,11 +297,11 @@ def _reader_lines(entry: dict[str, Any]) -> list[str]:
         for reader in entry["readers"]
     ]
     titles = ("reader", "how", "pid", "rate", "data age", "age 99 %", "its loop", "CPU", "frames", "not taken")
-    return table(titles, rows, left=2)
+    return _table(titles, rows, left=2)
 
 
 def _indented(lines: list[str]) -> list[str]:
-    return [f"  {line}" if line else "" for line in lines]
+    return [" " * _INDENT + line if line else "" for line in lines]
 
 
 def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
@@ -268,9 +311,8 @@ def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
     if as_json:
         print_json(rows)
         return
-    cells = [[f"{row['uid']:#x}", row["type"], str(row["module"]), str(row["patch"])] for row in rows]
-    numbered = [[str(position), *row] for position, row in enumerate(cells)]
-    click.echo("\n".join(table(("position", "uid", "type", "module", "patch"), numbered, left=0)))
+    cells = [[str(position), row["name"], row["type"], f"{row['uid']:#x}"] for position, row in enumerate(rows)]
+    click.echo("\n".join(table(("position", "name", "type", "uid"), cells, left=3)))
 
 
 def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
@@ -296,7 +338,9 @@ def _redraw(lines: list[str]) -> None:
     height = shutil.get_terminal_size().lines - 1
     if len(lines) > height:
         lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
-    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False)
+    if click.get_current_context().color is False:
+        lines = [click.unstyle(line) for line in lines]
+    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False, color=True)
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from skinware.cli._command import (
     print_json,
     run,
     seconds,
+    version_option,
     warn,
 )
 
@@ -26,13 +27,15 @@ if TYPE_CHECKING:
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
+_NEEDED = "textual>=8"
+"""What the extra ``top`` brings: installed alone, it is right however this package was installed."""
 
 
 @click.command(
     "skin-top",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-top                    in the terminal (pip install 'skinware[top]')",
+        "skin-top                    in the terminal",
         "skin-top --type proximity   draw another type of sensors",
         "skin-top --plain -T 10      ten seconds of plain lines",
     ),
@@ -40,14 +43,24 @@ _TAKE_PERIOD_S = 0.1
 @click.option("--plain", is_flag=True, help="One line a second for each driver; so it is without a terminal.")
 @click.option("-T", "duration_s", type=seconds, help="End after SECONDS.")
 @click.option("--type", "type_name", metavar="TYPE", help="Sensors to draw first.  [default: the driver's first type]")
+@click.option(
+    "--scale",
+    "scale_name",
+    type=click.Choice(["change", "range", "raw"]),
+    default="change",
+    show_default=True,
+    help="What colours mean first: the change from rest, the range of the type, raw counts.",
+)
 @namespace_option
 @json_option
+@version_option
 @click.pass_context
 def command(
     context: click.Context,
     plain: bool,
     duration_s: float | None,
     type_name: str | None,
+    scale_name: str,
     namespace: str | None,
     as_json: bool,
 ) -> None:
@@ -59,10 +72,10 @@ def command(
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 
-            app = SkinTop(place, type_name, duration_s)
+            app = SkinTop(place, type_name, duration_s, scale_name=scale_name)
             app.run()
             context.exit(app.return_code or 0)
-        warn("for the live view: pip install 'skinware[top]'. Going on with plain lines")
+        warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
     show_lines(place, duration_s, as_json)
 
 

@@ -19,6 +19,7 @@ from skinware.cli._command import (
     print_json,
     run,
     seconds,
+    version_option,
 )
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
@@ -37,6 +38,7 @@ class Declined(SkinwareError):
 @click.command(
     "skin-config",
     context_settings=CONTEXT_SETTINGS,
+    no_args_is_help=True,
     epilog=examples(
         "skin-config can0                        what can be done on can0",
         "skin-config can0 versions               who is there, with which firmware",
@@ -61,6 +63,7 @@ class Declined(SkinwareError):
 @click.option("--force", is_flag=True, help="Change things also on a bus on which somebody sends.")
 @namespace_option
 @json_option
+@version_option
 def command(
     target: str,
     operation: str | None,

@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, namespace_option, print_json, run
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    version_option,
+)
 from skinware.cli._format import plural
 from skinware.errors import ConfigurationError, DriverError
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
@@ -145,6 +153,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 )
 @namespace_option
 @json_option
+@version_option
 @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
 def command(
     buses: tuple[str, ...],

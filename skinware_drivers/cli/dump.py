@@ -19,7 +19,7 @@ _CAN_PAYLOAD = 64
 _SERIAL = ("serial", "pty")
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which a second listener takes nothing away from the first."""
-_OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "physical": "--physical"}
+_OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "counts": "--counts"}
 
 
 def dump(raw: str | None, **options: Any) -> None:
@@ -136,7 +136,7 @@ command: click.Command = click.Command(
     help=frames_command.help,
     epilog=examples(
         "skin-dump -n 3                              three frames",
-        "skin-dump -T 2 --type pressure --physical   fail when nothing comes for 2 s",
+        "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
         "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
         "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
     ),

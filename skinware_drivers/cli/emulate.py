@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run, seconds
+from skinware.cli._command import CONTEXT_SETTINGS, examples, run, seconds, version_option
 from skinware.errors import ConfigurationError
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
@@ -55,6 +55,7 @@ class EmulateCommand(HardwareCommand):
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
 @click.option("-T", "duration_s", type=seconds, metavar="SECONDS", help="End after SECONDS.")
+@version_option
 def command(
     bus_name: str,
     driver: str,

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, seconds, warn
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+    warn,
+)
 
 if TYPE_CHECKING:
     from skinware_drivers.finding.interfaces import CanInterface
@@ -41,6 +50,7 @@ _DETECTION_S = 10.0
 @click.option("--force", is_flag=True, help="With --probe: ask also where that may disturb somebody.")
 @click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")
 @json_option
+@version_option
 def command(
     buses: tuple[str, ...],
     listen_s: float,

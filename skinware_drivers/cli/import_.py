@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, version_option
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ _HEADINGS = {
 
 
 @click.group("skin-import", context_settings=CONTEXT_SETTINGS)
+@version_option
 def command() -> None:
     """Make configurations for skin-driver from the files of other systems."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run
+from skinware.cli._command import CONTEXT_SETTINGS, examples, run, version_option
 
 _HOW_TO_RUN = {
     "can": ("skin-driver --driver {name} --bus virtual",),
@@ -34,6 +34,7 @@ _HOW_TO_RUN = {
     required=True,
     help="What carries the data: a CAN bus, a serial line, or the program itself.",
 )
+@version_option
 def command(name: str, transport: str) -> None:
     """Make a driver package in the new folder NAME: driver, emulated hardware, tests, and how to install them.
 

@@ -6,7 +6,7 @@ one burst of each patch. When one patch begins its next burst while another is i
 burst is held back until the other's is whole.
 
 What was held up for long, or a device that sends far more often than it should, brings more bursts at once than the
-ring has slots. Then the last of them are not told apart: each module's newest update is shown, the others are skipped.
+ring has slots. Then the oldest of them are skipped; and if there still are too many, the last ones are not told apart.
 """
 
 from __future__ import annotations
@@ -80,12 +80,26 @@ class Bursts:
         self._left = most
         parts = [part for part in (self._held, updates) if part is not None]
         self._held = None
-        rest = Updates.join(parts) if parts else None
+        rest = self._skip_the_oldest(Updates.join(parts), most) if parts else None
         while rest is not None:
             if self._left <= 0:
                 self._show_the_newest(rest)
                 return
             rest = self._take_in_order(rest, living, count_and_publish)
+
+    def _skip_the_oldest(self, updates: Updates, most: int) -> Updates:
+        """The last updates of every module, so many at the most: as many bursts as can be published."""
+        if len(updates) <= most:
+            return updates
+        order = np.argsort(updates.module, kind="stable")
+        last = np.cumsum(np.bincount(updates.module, minlength=len(self._module_patch)))  # behind each module's own
+        from_last = np.empty(len(updates), np.int64)
+        from_last[order] = last[updates.module[order]] - np.arange(len(updates))
+        old = from_last > max(1, most)
+        if not old.any():
+            return updates
+        self._skip(np.bincount(self._module_patch[updates.module[old & updates.whole]], minlength=self._n_patches))
+        return updates.take(~old)
 
     def _show_the_newest(self, updates: Updates) -> None:
         """Show updates in one frame, whatever bursts they are of."""

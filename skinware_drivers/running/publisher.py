@@ -183,7 +183,7 @@ class Publisher:
         columns["bus_reason"][:] = self.bus_reason
         columns["bus_since_ns"][:] = self.bus_since_ns
         columns["bus_load"][:] = self.bus_load
-        columns["bus_samples"][:] = self.bus_samples.view(columns["bus_samples"].dtype).reshape(-1)
+        columns["bus_samples"][:] = self.bus_samples.view(np.uint8).reshape(-1)
         columns["bus_counters"][:] = self._counts.reshape(-1)
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)

@@ -296,7 +296,7 @@ class Runner:
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)
-        self._publish_when_due()
+        self._guard(self._publish_when_due)()
 
     @property
     def _period_s(self) -> float:

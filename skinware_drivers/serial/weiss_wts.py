@@ -124,7 +124,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
         self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
         self.layout, self._matrix = self._layout(count), matrix
-        return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{columns}x{rows}")])]
+        return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{rows}x{columns}")])]
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -89,7 +90,8 @@ class Driving:
     def stop(self) -> None:
         """End it in good order; what it failed with is raised here."""
         if self.runner is not None and self._loop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self.runner.stop)
+            with contextlib.suppress(RuntimeError):  # it has failed and closed its loop, and its thread is about to end
+                self._loop.call_soon_threadsafe(self.runner.stop)
         self._thread.join(_LONGEST_S)
         require(not self._thread.is_alive(), "the driver did not stop")
         if self.failure is not None:

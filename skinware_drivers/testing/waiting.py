@@ -15,10 +15,10 @@ from skinware.samples import sample_report, sample_text
 from skinware.status import Status
 from skinware_drivers.testing.defect import defect, require
 
-SLOWER = 4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1
-"""In the CAN lab the processor is emulated."""
+SLOWER = float(os.environ.get("SKINWARE_TEST_PATIENCE") or (4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1))
+"""So many times longer than usual may tests in real time wait; in the CAN lab the processor is emulated."""
 PATIENCE_S = 12.0 * SLOWER
-"""How long a test of a right driver has to wait at most."""
+"""How long to wait for a frame, unless a test says otherwise."""
 
 
 def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:

@@ -10,3 +10,4 @@ from skinware.cli import _health
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", 10**15)
+    monkeypatch.setattr(_health, "age_limit_ns", lambda _: 10**15)

@@ -104,7 +104,7 @@ class FakeSkin:
             columns["bus_reason"][:] = self.bus_reason
             columns["bus_since_ns"][:] = self.bus_since_ns
             columns["bus_load"][:] = self.bus_load
-            columns["bus_samples"][:] = self.bus_samples.view(columns["bus_samples"].dtype).ravel()
+            columns["bus_samples"][:] = self.bus_samples.view(np.uint8).ravel()
             columns["patch_interval_counts"][:] = self.interval_counts.ravel()
             columns["patch_age_counts"][:] = self.age_counts.ravel()
             columns["bus_counters"][:] = self.bus_counters.ravel()

@@ -52,6 +52,19 @@ def test_an_error_is_one_line_under_the_name_of_the_command(capsys: pytest.Captu
     assert capsys.readouterr().err == "skin-try: no such skin\n"
 
 
+@pytest.mark.parametrize(("value", "color"), [(None, None), ("", None), ("1", False)])
+def test_no_color_takes_the_colours_away(
+    value: str | None, color: bool | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    if value is not None:
+        monkeypatch.setenv("NO_COLOR", value)
+    seen: list[bool | None] = []
+    command = click.Command("skin-try", callback=lambda: seen.append(click.get_current_context().color))
+    assert exit_status(command, []) == 0
+    assert seen == [color]
+
+
 def test_an_error_that_nobody_expects_is_not_hidden() -> None:
     with pytest.raises(ZeroDivisionError):
         exit_status(command_that(ZeroDivisionError()), [])

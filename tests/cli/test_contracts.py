@@ -74,8 +74,14 @@ def test_skin_dump_and_skin_info_keep_their_contracts() -> None:
         assert shown["readers"][0]["pid"] == os.getpid()
         sensors = json.loads(run("skin-info", "torso", "--sensors", "--json").stdout)
         assert len(sensors) == 384
-        assert sensors[6] == {"uid": 7 << 16 | 6, "type": "temperature", "module": 0, "patch": 0}
-        physical = run("skin-dump", "torso", "-n", "1", "--json", "--type", "pressure", "--physical")
+        assert sensors[6] == {
+            "name": "board 7, triangle 0, temperature 6",
+            "uid": 7 << 16 | 6,
+            "type": "temperature",
+            "module": 0,
+            "patch": 0,
+        }
+        physical = run("skin-dump", "torso", "-n", "1", "--json", "--type", "pressure")
         assert len(json.loads(physical.stdout)["values"]) == 320
         assert "board 7" in run("skin-info").stdout
         assert "torso #" in run("skin-dump", "-n", "1").stdout

@@ -59,13 +59,13 @@ def test_one_type_has_its_uids(capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a", fake_structure(1, 2)) as skin:
         skin.values = np.arange(24)
         skin.publish()
-        (raw,) = dumped(capsys, "-n", "1", "--type", "temperature")
+        (raw,) = dumped(capsys, "-n", "1", "--type", "temperature", "--counts")
         assert raw["values"] == [10, 11, 22, 23]
         assert raw["uids"] == [1010, 1011, 1022, 1023]
         assert raw["status"] == [0] * 4
-        (physical,) = dumped(capsys, "-n", "1", "--type", "temperature", "--physical")
+        (physical,) = dumped(capsys, "-n", "1", "--type", "temperature")
         assert physical["values"] == [5.0, 5.5, 11.0, 11.5]
-        (everything,) = dumped(capsys, "-n", "1", "--physical")
+        (everything,) = dumped(capsys, "-n", "1")
         assert everything["values"][:3] == [255.0, 254.0, 253.0]
         assert everything["values"][10:13] == [5.0, 5.5, 243.0]
 
@@ -84,14 +84,24 @@ def test_people_see_a_line_per_frame(capsys: pytest.CaptureFixture[str]) -> None
         skin.status[9] = Status.STALE
         skin.status[10:] = Status.NEVER_SEEN
         skin.publish()
-        assert exit_status(command, ["-n", "1"]) == 0
+        assert exit_status(command, ["-n", "1", "--counts"]) == 0
         line = capsys.readouterr().out
         assert re.fullmatch(
             r"a #1  age [\d.]+ ms  pressure 0 to 8 raw \(mean 4\)  temperature - raw  not fresh 3\n", line
         )
-        assert exit_status(command, ["-n", "1", "--physical", "--type", "pressure"]) == 0
+        assert exit_status(command, ["-n", "1", "--type", "pressure"]) == 0
         line = capsys.readouterr().out
         assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  not fresh 1\n", line)
+
+
+def test_the_option_of_before_is_told_off_and_changes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a", fake_structure(1, 1)) as skin:
+        skin.publish()
+        assert exit_status(command, ["-n", "1", "--physical"]) == 0
+        printed = capsys.readouterr()
+        assert " counts (mean" in printed.out
+        assert printed.err == "skin-dump: --physical is not needed any more: values are physical\n"
+        assert exit_status(command, ["-n", "1", "--physical", "--counts"]) == 2
 
 
 def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -237,7 +247,7 @@ def test_frames_end_with_the_timeout() -> None:
             next(frames)
 
 
-@pytest.mark.parametrize("form", ["--json", "--physical"])
+@pytest.mark.parametrize("form", ["--json", "--counts"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespace) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):
@@ -250,7 +260,7 @@ def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespa
         assert list(namespace.reader_files()) == []  # it took its announcement back
 
 
-@pytest.mark.parametrize("form", ["--json", "--physical"])
+@pytest.mark.parametrize("form", ["--json", "--counts"])
 def test_a_reader_of_our_output_may_go_away(form: str) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):
         process = subprocess.Popen([BIN / "skin-dump", form], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+import click
 import pytest
 
-from skinware.cli._format import age_text, count_text, plural, rate_text, table
+from skinware.cli._format import age_text, count_text, plural, rate_text, table, wrapped
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,18 @@ def test_counts_and_plurals() -> None:
     assert (count_text(30848), count_text(None)) == ("30,848", "-")
     assert (plural(1, "patch", "patches"), plural(4, "patch", "patches")) == ("1 patch", "4 patches")
     assert plural(0, "reader") == "0 readers"
+
+
+def test_a_table_that_is_too_wide_goes_on_below() -> None:
+    lines = table(("name", "how", "count"), [("a", "x", "1"), ("longer", "yy", "12345")], left=2, width=13)
+    assert lines == ["name    how", "a       x", "longer  yy", "name    count", "a           1", "longer  12345"]
+    assert table(("name", "how"), [("a", "x")], width=3) == ["name  how", "a       x"]  # there is no narrower
+
+
+def test_a_line_that_is_too_wide_is_broken() -> None:
+    line = "  " + click.style("driver", bold=True) + " one two three"
+    assert [click.unstyle(part) for part in wrapped(line, 14)] == ["  driver one", "      two", "      three"]
+    assert wrapped(line, None) == wrapped(line, 80) == [line]
 
 
 def test_tables_are_aligned() -> None:

@@ -16,6 +16,7 @@ from skinware.cli._health import (
     patch_ages_ns,
     patch_state_name,
     rate_now_hz,
+    status_now,
 )
 from skinware.memory.ring import Frame
 from skinware.status import Status
@@ -37,6 +38,17 @@ def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool =
 def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_health, "now_ns", lambda: NOW_NS)
     monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", SECOND)
+
+
+def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The status is as of the frame: a driver that hangs leaves it at 0."""
+    with FakeSkin("a", fake_structure(1, 1)) as skin, DriverReader("a") as reader:
+        skin.status[3] = Status.OUT_OF_RANGE
+        skin.publish()
+        frame = reader.read()
+        assert status_now("live", frame).tolist() == [0] * 3 + [Status.OUT_OF_RANGE] + [0] * 8
+        monkeypatch.setattr(_health, "age_limit_ns", lambda _: 0)
+        assert status_now("live", frame).tolist() == [Status.STALE] * 3 + [Status.OUT_OF_RANGE] + [Status.STALE] * 8
 
 
 @pytest.mark.usefixtures("frozen_clock")

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skinware import Status, Structure
 from skinware.cli import _heat_map as heat
-from skinware.cli._heat_map import BACKGROUND, LEVELS, arrange, block_columns, codes_of, levels_of, marks_of
+from skinware.cli._heat_map import BACKGROUND, LEVELS, arrange, codes_of, levels_of, marks_of
 from skinware.errors import StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from tests.cli.fake_skin import fake_structure
@@ -80,13 +80,6 @@ def test_what_means_nothing_has_no_level() -> None:
     assert heat.NOT_CONNECTED * LEVELS + LEVELS <= BACKGROUND
 
 
-@pytest.mark.parametrize(
-    ("count", "columns"), [(1, 1), (2, 2), (4, 2), (7, 4), (10, 5), (12, 4), (16, 4), (192, 16), (256, 16)]
-)
-def test_blocks_are_compact(count: int, columns: int) -> None:
-    assert block_columns(count) == columns
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     modules=st.lists(st.integers(1, 20), min_size=1, max_size=6),
@@ -130,11 +123,30 @@ def test_sensors_are_drawn_as_large_as_they_fit() -> None:
     ]
 
 
+def test_modules_have_their_names_within_the_patch_where_there_is_room() -> None:
+    arranged = arrange(fake_structure(4, 2), [1], "pressure", 80, 13)
+    assert [label.text for labels in arranged.labels.values() for label in labels] == ["triangle 0", "triangle 1"]
+
+
+def test_a_triangle_is_drawn_as_one_and_as_a_block_where_that_is_too_high() -> None:
+    (one,) = (arrange(fake_structure(1, 1), [0], "pressure", 8, 4).pixels >= 0,)
+    assert [row.sum() for row in one] == [2, 2, 4, 4, 6, 6, 8, 8]
+    assert one[0].tolist() == [False] * 3 + [True] * 2 + [False] * 3
+    small = arrange(fake_structure(1, 1), [0], "pressure", 8, 1).pixels >= 0
+    assert [row.sum() for row in small] == [5, 5]
+
+
+def test_where_each_sensor_needs_a_character_none_is_smaller() -> None:
+    arranged = arrange(fake_structure(8, 16), range(8), "pressure", 80, 5, smallest=2)
+    assert (arranged.zoom, arranged.lines > 5) == (2, True)
+    assert (arranged.pixels[0::2] == arranged.pixels[1::2]).all()
+
+
 def test_modules_have_their_numbers_and_patches_their_names() -> None:
     structure = fake_structure(4, 16)
     one = arrange(structure, [1], "pressure", 80, 12)
     assert one.zoom == 2
-    assert [label.text for line in sorted(one.labels) for label in one.labels[line]] == [str(m) for m in range(16, 32)]
+    assert [label.text for line in sorted(one.labels) for label in one.labels[line]] == [str(m) for m in range(16)]
     everything = arrange(structure, [0, 1, 2, 3], "pressure", 80, 12)
     assert (everything.zoom, everything.lines) == (1, 12)
     assert [(line, label.text) for line, labels in everything.labels.items() for label in labels] == [

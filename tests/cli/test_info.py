@@ -149,7 +149,7 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
     assert (first["interval"]["p99_ns"], first["age"]["p50_ns"]) == (2**25 - 1, 2**21 - 1)
     assert second["interval"]["p99_ns"] is None
     assert first["interval"]["counts"][25] == 100
-    assert re.search(r"age  interval 99 %  delay 99 %.*(?s:.*)\n  99 %: at most so much in 99 of 100 cases", out)
+    assert re.search(r"age  interval 99 %  delay 99 %.*(?s:.*)\n  99 %: 99th percentile", out)
     assert re.search(r"board 7 .*ms +34 ms +2.1 ms", out)
     assert re.search(r"board 8 .*ms +- +2.1 ms", out)
 
@@ -301,11 +301,12 @@ def test_sensors_in_the_order_of_the_frame(capsys: pytest.CaptureFixture[str]) -
     with FakeSkin("a", fake_structure(2, 1)):
         rows = told(capsys, "a", "--sensors")
         assert len(rows) == 24
-        assert rows[0] == {"uid": 1000, "type": "pressure", "module": 0, "patch": 0}
-        assert rows[23] == {"uid": 1023, "type": "temperature", "module": 1, "patch": 1}
+        assert rows[0] == {"name": "board 7, taxel 0", "uid": 1000, "type": "pressure", "module": 0, "patch": 0}
+        last = {"name": "board 8, temperature 11", "uid": 1023, "type": "temperature", "module": 1, "patch": 1}
+        assert rows[23] == last
         lines = text(capsys, "a", "--sensors").splitlines()
-        assert lines[0].split() == ["position", "uid", "type", "module", "patch"]
-        assert lines[24].split() == ["23", "0x3ff", "temperature", "1", "1"]
+        assert lines[0].split() == ["position", "name", "type", "uid"]
+        assert lines[24].split() == ["23", "board", "8,", "temperature", "11", "temperature", "0x3ff"]
 
 
 def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:

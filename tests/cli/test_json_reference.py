@@ -158,7 +158,7 @@ def test_a_driver_and_those_that_look_at_it(printing: Print, namespace: Namespac
         check("`skin-info NAME --sensors`", rows)
         check(
             "`skin-dump`",
-            *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--physical"),
+            *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--counts"),
             *printing(dump, "roboskin", "-n", "1"),
         )
         check("`skin-top`", *printing(top, "--plain", "-T", "2"))

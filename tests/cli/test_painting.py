@@ -10,20 +10,20 @@ from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
 from skinware.cli._painting import (
     MARK_CHARACTERS,
     MARK_NAMES,
-    RAMP,
     changed_lines,
     colour_of,
     marks_text,
     scale_text,
     segments_of,
 )
-from skinware.sensor_types import PRESSURE
+from skinware.cli._palette import CHARACTERS, TRUE_COLOURS
 
+RAMP = TRUE_COLOURS.ramp
 STALE, MASKED = heat.STALE * LEVELS, heat.MASKED * LEVELS
 
 
 def line(upper: list[int], lower: list[int], *labels: Label) -> list[Segment]:
-    return segments_of(np.array(upper, np.uint8), np.array(lower, np.uint8), labels)
+    return segments_of(np.array(upper, np.uint8), np.array(lower, np.uint8), labels, TRUE_COLOURS)
 
 
 def text(segments: list[Segment]) -> str:
@@ -60,15 +60,17 @@ def test_every_mark_has_its_character(mark: int, character: str) -> None:
 
 
 def test_marks_are_told_apart_where_there_is_no_room_for_characters() -> None:
-    assert colour_of(9) == RAMP[9]
-    assert sum(colour_of(STALE + 9)) < sum(RAMP[9])
-    assert colour_of(MASKED) not in RAMP
+    assert colour_of(9, TRUE_COLOURS) == RAMP[9]
+    assert sum(colour_of(STALE + 9, TRUE_COLOURS)) < sum(RAMP[9])
+    assert colour_of(MASKED, TRUE_COLOURS) not in RAMP
 
 
-def test_the_colours_grow_warmer() -> None:
-    assert len(set(RAMP)) == LEVELS
-    reds = [colour.red for colour in RAMP]
-    assert reds[-1] > 200 > reds[0]
+def test_without_colours_levels_and_marks_are_characters() -> None:
+    codes = np.array([0, 15, STALE + 9, MASKED, BACKGROUND], np.uint8)
+    segments = segments_of(codes, codes, [Label(4, "7")], CHARACTERS)
+    assert text(segments) == "▁█░-7"
+    assert all(colours(segment) == (None, None) for segment in segments[:-1])
+    assert scale_text([0, 1], "N", CHARACTERS).plain == "0 ▂▃▄▅▆▇██ 1 N"
 
 
 def test_labels_take_the_place_of_what_is_below() -> None:
@@ -86,12 +88,19 @@ def test_changed_lines() -> None:
 
 
 def test_the_scale_has_values_and_a_unit() -> None:
-    scale = scale_text(PRESSURE.measured(unit="kPa"), -0.5, 1234.5)
-    assert scale.plain == "-0.5 ▌▌▌▌▌▌▌▌ 1234.5 kPa"  # two colours in each cell
+    scale = scale_text([-0.5, 1234.5], "kPa", TRUE_COLOURS)
+    assert scale.plain == "-0.5 ▌▌▌▌▌▌▌▌ 1234 kPa"  # two colours in each cell
+    assert [span.style.color.triplet for span in scale.spans] == list(RAMP[0::2])  # type: ignore[union-attr]
+    assert scale_text([0, 50, 200], "", TRUE_COLOURS).plain == "0 ▌▌▌▌ 50 ▌▌▌▌ 200"
 
 
 def test_only_marks_that_are_there_are_explained() -> None:
     marks = np.array([heat.FRESH] * 5 + [heat.STALE] * 2 + [heat.NOT_CONNECTED], np.uint8)
-    assert marks_text(marks).plain == "5 fresh  ░ 2 stale  x 1 not connected"
-    assert marks_text(np.zeros(0, np.uint8)).plain == "0 fresh"
-    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(8))
+    assert marks_text(marks, TRUE_COLOURS).plain == "5 fresh  ░ 2 stale  x 1 not connected"
+    assert marks_text(np.zeros(0, np.uint8), TRUE_COLOURS).plain == "0 fresh"
+    assert MARK_NAMES.keys() | {heat.FRESH} == MARK_CHARACTERS.keys() == set(range(9))
+
+
+def test_what_never_moved_is_fresh_all_the_same() -> None:
+    marks = np.array([heat.FRESH] * 5 + [heat.UNMOVED] * 2, np.uint8)
+    assert marks_text(marks, TRUE_COLOURS).plain == "7 fresh  □ 2 never moved"

@@ -3,14 +3,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from skinware import DriverFrame, DriverReader, Status
 from skinware.cli import _heat_map as heat
+from skinware.cli import _rest
 from skinware.cli._heat_map import LEVELS
 from skinware.cli._picture import Picture, describe_sensor
+from skinware.cli._scale import RANGE
 from skinware.cli._top_rows import BUS, DRIVER, PATCH, RowKey
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
@@ -33,10 +36,10 @@ def drawn(picture: Picture, key: RowKey, frame: DriverFrame, life: str = "live")
 
 def test_the_range_of_the_type_gives_the_colours() -> None:
     with published() as (skin, reader):
-        picture = Picture()
+        picture = Picture(scale_name=RANGE)
         assert drawn(picture, PATCH_ROW, reader.read()) == [0]
-        assert picture.title == "board 8 on can0: 3 triangle modules, 30 pressure sensors"
-        assert picture.scale.plain.startswith("0 ")
+        assert picture.title == "board 8: 3 triangles, 30 pressure sensors"
+        assert picture.scale.plain.startswith("range 0 ")
         assert picture.scale.plain.endswith(" 255 counts")
         assert picture.marks.plain == "30 fresh"
         assert skin.values is not None
@@ -47,7 +50,7 @@ def test_the_range_of_the_type_gives_the_colours() -> None:
 
 def test_a_type_without_a_range_gets_its_colours_from_what_was_seen() -> None:
     with published() as (skin, reader):
-        picture = Picture("temperature")
+        picture = Picture("temperature", RANGE)
         assert drawn(picture, DRIVER_ROW, reader.read()) == [0]
         assert picture.title == "a: 2 patches, 12 temperature sensors"
         assert skin.values is not None
@@ -63,17 +66,90 @@ def test_a_type_without_a_range_gets_its_colours_from_what_was_seen() -> None:
         assert picture.scale.plain.endswith(" 30 degC")  # what was once seen counts
 
 
-def test_the_other_scale_is_that_of_the_values_seen_from_now_on() -> None:
+def test_scales_take_turns() -> None:
     with published() as (_, reader):
         picture = Picture()
-        drawn(picture, BUS_ROW, reader.read())
+        seen = []
+        for _ in range(4):
+            drawn(picture, BUS_ROW, reader.read())
+            seen.append(picture.scale.plain.translate({ord("▌"): None}).split())
+            picture.next_scale()
+        assert seen[0] == ["change", "0", "2", "8", "counts"]
+        assert seen[1] == ["range", "0", "255", "counts"]
+        assert seen[2] == ["raw", "255", "255"]
+        assert seen[3] == seen[0]
         assert picture.title == "can0: 2 patches, 60 pressure sensors"
-        picture.other_scale()
-        drawn(picture, BUS_ROW, reader.read())
-        assert picture.scale.plain.endswith(" 0 counts")
-        picture.other_scale()
-        drawn(picture, BUS_ROW, reader.read())
-        assert picture.scale.plain.endswith(" 255 counts")
+
+
+def test_a_light_press_is_seen_beside_a_hard_one() -> None:
+    """At rest 12 to 17 of 255, pressed up to 136: the figures of a real skin. A fixed scale shows nearly nothing."""
+    with published() as (skin, reader):
+        rest, light, hard = 255 - 15, 255 - 27, 255 - 136
+        skin.values = np.full(skin.structure.n_sensors, rest)
+        changing, fixed = Picture(), Picture(scale_name=RANGE)
+        for noise in (-2, 2) * 3:
+            skin.values[:] = rest + noise
+            skin.publish()
+            assert drawn(changing, PATCH_ROW, reader.read())[0] == 0
+        skin.values[:] = rest
+        skin.values[36], skin.values[37] = light, hard
+        skin.publish()
+        at_rest, lightly, firmly = drawn(changing, PATCH_ROW, reader.read())
+        assert at_rest == 0
+        assert lightly >= 2
+        assert firmly >= 12
+        assert drawn(fixed, PATCH_ROW, reader.read()) == [0, 1, 8]
+
+
+def test_the_baseline_is_taken_anew_on_request() -> None:
+    with published() as (skin, reader):
+        assert skin.values is not None
+        picture = Picture()
+        drawn(picture, PATCH_ROW, reader.read())
+        skin.values[36] = 100
+        skin.publish()
+        assert len(drawn(picture, PATCH_ROW, reader.read())) == 2
+        picture.take_baselines()
+        assert drawn(picture, PATCH_ROW, reader.read()) == [0]
+
+
+def test_a_taxel_stuck_at_a_plausible_value_is_found_by_a_wipe_test(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_rest, "SETTLING_S", 0.0)
+    with published() as (skin, reader):
+        assert skin.values is not None
+        picture = Picture()
+        skin.values[41] = 100  # board 8, triangle 0, taxel 5: well within what others say
+        skin.publish()
+        drawn(picture, PATCH_ROW, reader.read())
+        assert (picture.wipe_text("a"), picture.save_wipe("a", tmp_path)) == (None, None)
+        picture.wipe_test()
+        assert drawn(picture, PATCH_ROW, reader.read()) == [heat.UNMOVED * LEVELS]
+        assert (
+            picture.wipe_text("a") == "wipe test: 30 never moved (l saves the list): board 8, triangle 0, taxel 0 ..."
+        )
+        pressure = skin.structure.sensor_type == 1
+        for touch in (80, 0):
+            skin.values[pressure] = 255 - touch
+            skin.values[41] = 100
+            skin.publish()
+            drawn(picture, PATCH_ROW, reader.read())
+        unmoved, peak = sorted(set(picture.pixels.ravel().tolist()) - {heat.BACKGROUND})[::-1]
+        assert (unmoved, peak > 8) == (heat.UNMOVED * LEVELS, True)  # peaks stay, though nothing touches any more
+        assert picture.marks.plain == "30 fresh  □ 1 never moved"
+        assert picture.scale.plain.startswith("peak 0 ")
+        assert picture.wipe_text("a") == "wipe test: 1 never moved (l saves the list): board 8, triangle 0, taxel 5"
+        path = picture.save_wipe("a", tmp_path)
+        assert path is not None
+        assert path.read_text().splitlines()[2:] == ["41\t0x411\tboard 8, triangle 0, taxel 5"]
+        skin.values[41] = 180
+        skin.publish()
+        drawn(picture, PATCH_ROW, reader.read())
+        assert picture.wipe_text("a") == "wipe test: every sensor has moved"
+        picture.wipe_test()
+        drawn(picture, PATCH_ROW, reader.read())
+        assert picture.wipe_text("a") is None
 
 
 def test_nothing_but_nan_is_drawn_all_the_same() -> None:
@@ -122,7 +198,10 @@ def test_a_sensor_in_words() -> None:
         skin.status[10] = Status.STALE | Status.OUT_OF_RANGE
         skin.publish()
         frame = reader.read()
-        assert describe_sensor(frame, 13) == "pressure sensor 13: 0 counts (raw 255), fresh; module 1, uid 0x3f5"
+        assert describe_sensor(frame, 13) == (
+            "board 7, triangle 1, taxel 1: pressure 0 counts (raw 255), fresh; position 13, uid 0x3f5"
+        )
         assert describe_sensor(frame, 10) == (
-            "temperature sensor 10: 20 degC (raw 40), stale, out of range; module 0, uid 0x3f2"
+            "board 7, triangle 0, temperature 10: temperature 20 degC (raw 40), stale, out of range;"
+            " position 10, uid 0x3f2"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 from textual.pilot import Pilot
@@ -13,6 +14,7 @@ from textual.widgets import DataTable, Static
 from skinware import DriverReader, Namespace, Status
 from skinware.cli import _health, _live, _top_app
 from skinware.cli._heat_widget import HeatMap
+from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
@@ -24,7 +26,7 @@ SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
 async def shown(
     size: tuple[int, int] = (80, 24), type_name: str | None = None, duration_s: float | None = None
 ) -> AsyncIterator[tuple[SkinTop, Pilot[None]]]:
-    app = SkinTop(Namespace(), type_name, duration_s)
+    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS)
     async with app.run_test(size=size) as pilot:
         await pilot.pause()
         yield app, pilot
@@ -98,7 +100,7 @@ def test_it_fits_every_terminal(size: tuple[int, int]) -> None:
             async with shown(size) as (app, pilot):
                 await until(pilot, lambda: "pressure sensors" in line(app, "title"))
                 await pilot.press("down", "down", "t", "s", "pagedown", "pageup")
-                await until(pilot, lambda: "board 7 on can0" in line(app, "title"))
+                await until(pilot, lambda: line(app, "title").startswith("board 7: "))
                 heat_map = app.query_one(HeatMap)
                 assert all(len(text) == heat_map.size.width for text in picture(app))
                 for widget in (app.query_one(DataTable), heat_map, app.query_one("#head")):
@@ -124,20 +126,20 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
                 ]
                 assert line(app, "head").startswith("skin-top   namespace ")
                 assert line(app, "title") == "torso: 4 patches, 640 pressure sensors"
-                assert line(app, "scale").endswith("255 counts")
+                assert line(app, "scale").startswith("change 0 ")
                 assert line(app, "detail") == "frames 5,156  lost 2  unknown 7  orphans 3  updates 640"
                 drawn = picture(app)
                 assert len(drawn) == 12  # all of it, unscrolled
                 assert [text[:8].strip() for text in drawn[::3]] == ["board 7", "board 8", "board 9", "board 10"]
                 await pilot.press("down", "down")
-                await until(pilot, lambda: "board 7 on can0" in line(app, "title"))
-                assert line(app, "title") == "board 7 on can0: 16 triangle modules, 160 pressure sensors"
+                await until(pilot, lambda: line(app, "title").startswith("board 7: "))
+                assert line(app, "title") == "board 7: 16 triangles, 160 pressure sensors"
                 assert line(app, "marks").startswith("155 fresh  ░ 2 stale  ^ 1 out of range")
                 assert line(app, "detail") == "orphans 3  updates 640"
                 drawn = picture(app)
-                assert drawn[0].split() == ["0", "1", "2", "3", "4", "5"]
-                assert "xx··" in drawn[2]
-                assert "░░░░" in drawn[2]
+                assert drawn[0].split() == [str(number) for number in range(8)]
+                for mark in ("xx", "··", "░░"):
+                    assert any(mark in text for text in drawn)
 
     go(scene)
 
@@ -148,14 +150,14 @@ def test_a_driver_dies_and_returns_changed() -> None:
             with fake_process("a", "--patches", "1", "--modules", "2") as process:
                 await until(pilot, lambda: len(listed(app)) == 3)
                 await pilot.press("down", "down")
-                await until(pilot, lambda: line(app, "title").endswith("2 triangle modules, 20 pressure sensors"))
+                await until(pilot, lambda: line(app, "title").endswith("2 triangles, 20 pressure sensors"))
                 kill(process)
                 await until(pilot, lambda: listed(app) == ["a dead", "can0 was live", "board 7 was live"])
                 await until(pilot, lambda: line(app, "marks") == "0 fresh  ░ 20 stale")
                 with fake_process("a", "--patches", "2", "--modules", "3"):
                     await until(pilot, lambda: listed(app)[:1] == ["a live"])
                     await until(pilot, lambda: len(listed(app)) == 4)
-                    await until(pilot, lambda: line(app, "title").startswith("board 7 on can0: 3 triangle"))
+                    await until(pilot, lambda: line(app, "title").startswith("board 7: 3 triangles"))
                     await until(pilot, lambda: line(app, "marks") == "30 fresh")
                     assert chosen(app) == "board 7"
 
@@ -207,11 +209,57 @@ def test_types_and_scales_take_turns() -> None:
                 await until(pilot, lambda: line(app, "title") == "a: 1 patch, 2 temperature sensors")
                 await pilot.press("t")
                 await until(pilot, lambda: line(app, "title") == "a: 1 patch, 10 pressure sensors")
+                assert line(app, "scale").startswith("change ")
+                await pilot.press("s")
+                await until(pilot, lambda: line(app, "scale").startswith("range "))
                 assert line(app, "scale").endswith(" 255 counts")
                 await pilot.press("s")
-                await until(pilot, lambda: not line(app, "scale").endswith(" 255 counts"))
+                await until(pilot, lambda: line(app, "scale").startswith("raw "))
 
     go(scene)
+
+
+def test_a_wipe_test_and_its_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    async def scene() -> None:
+        with FakeSkin("a", fake_structure(1, 1)) as skin:
+            skin.values = skin.status * 0 + 240
+            skin.publish()
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: line(app, "marks") == "10 fresh")
+                await pilot.press("l")  # there is no list yet
+                await pilot.press("w")
+                await until(pilot, lambda: line(app, "marks") == "10 fresh  □ 10 never moved")
+                assert line(app, "detail").startswith("wipe test: 10 never moved (l saves the list): board 7, taxel 0")
+                assert line(app, "scale").startswith("peak ")
+                await pilot.press("l")
+                await until(pilot, lambda: bool(list(tmp_path.iterdir())))
+                await pilot.press("w", "b")
+                await until(pilot, lambda: line(app, "marks") == "10 fresh")
+
+    go(scene)
+    (saved,) = tmp_path.iterdir()
+    assert saved.read_text().startswith("# a: 10 of 10 pressure sensors never moved")
+
+
+@pytest.mark.parametrize(
+    ("environment", "palette"),
+    [
+        ({"TERM": "xterm-256color", "COLORTERM": "truecolor"}, TRUE_COLOURS),
+        ({"TERM": "xterm-256color"}, COLOURS_256),  # as over ssh
+        ({"TERM": "xterm"}, COLOURS_16),
+        ({"TERM": "xterm-256color", "COLORTERM": "truecolor", "NO_COLOR": "1"}, CHARACTERS),
+    ],
+)
+def test_the_terminal_chooses_the_palette(
+    environment: dict[str, str], palette: Palette, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("COLORTERM", "NO_COLOR", "TEXTUAL_COLOR_SYSTEM"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert SkinTop(Namespace())._heat_map._palette is palette
 
 
 def test_the_mouse_chooses_and_points() -> None:
@@ -223,14 +271,14 @@ def test_the_mouse_chooses_and_points() -> None:
                 await until(pilot, lambda: len(listed(app)) == 4)
                 await pilot.click(DataTable, offset=(5, 3))
                 await until(pilot, lambda: chosen(app) == "board 7")
-                await until(pilot, lambda: line(app, "title").startswith("board 7 on can0"))
+                await until(pilot, lambda: line(app, "title").startswith("board 7: "))
                 heat_map = app.query_one(HeatMap)
-                column = picture(app)[0].index("?")
-                await pilot.hover(heat_map, offset=(column, 0))
-                await until(pilot, lambda: "pressure sensor 3: " in line(app, "detail"))
-                assert "suspect; module 0, uid 0x3eb" in line(app, "detail")
+                row = next(number for number, text in enumerate(picture(app)) if "?" in text)
+                await pilot.hover(heat_map, offset=(picture(app)[row].index("?"), row))
+                await until(pilot, lambda: line(app, "detail").startswith("board 7, taxel 3: "))
+                assert "suspect; position 3, uid 0x3eb" in line(app, "detail")
                 await pilot.hover("#head")
-                await until(pilot, lambda: "sensor 3" not in line(app, "detail"))
+                await until(pilot, lambda: "taxel 3" not in line(app, "detail"))
 
     go(scene)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import signal
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import running as running_command
-from tests.sdk.driving import TroubledBus, driving, emulated, follow, read_until, troubled
+from tests.sdk.driving import Driving, TroubledBus, driving, emulated, follow, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")
 
@@ -60,6 +62,22 @@ def test_a_bus_that_may_not_be_opened_is_an_error_and_leaves_the_others_closed(n
         pass
     assert first.fileno() == -1
     assert namespace.services() == []
+
+
+def test_what_a_driver_failed_with_is_told_also_while_its_thread_is_about_to_end() -> None:
+    class Lingering(threading.Event):
+        def set(self) -> None:
+            super().set()
+            time.sleep(0.5)  # the thread of a busy machine
+
+    bus = troubled(boards=(7,))
+    bus.refused = True
+    running = Driving([(RoboskinDriver(RoboskinOptions()), bus)], "roboskin", listen_only=False, wait_for_buses=True)
+    running.ready = Lingering()
+    running.start()
+    for step in (running.wait, running.stop):
+        with pytest.raises(BusNotAvailable, match="not permitted"):
+            step()
 
 
 def test_a_driver_that_was_told_to_wait_waits_for_its_only_bus(caplog: pytest.LogCaptureFixture) -> None:

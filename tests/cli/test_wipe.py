@@ -1,0 +1,51 @@
+"""What never moved is found, however plausible its value."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from skinware.cli._wipe import WipeTest
+from tests.cli.fake_skin import fake_structure
+
+STRUCTURE = fake_structure(1, 2)
+N = STRUCTURE.n_sensors
+FRESH = np.ones(N, bool)
+STUCK, MISSING = 3, 12
+NOISE = 2.0
+
+
+def wiped() -> WipeTest:
+    test = WipeTest(STRUCTURE)
+    for touch in (0, 60, 1):
+        values = np.full(N, 14 + touch, np.float32)
+        values[STUCK] = 73 + touch / 60  # plausible, and a little alive
+        fresh = FRESH.copy()
+        fresh[MISSING] = False
+        test.follow(values, fresh)
+    return test
+
+
+def test_what_never_moved_is_found() -> None:
+    test = wiped()
+    assert test.never_moved("pressure", NOISE).tolist() == [STUCK, MISSING]
+    assert test.travel()[[0, STUCK, MISSING]].tolist() == [60, 1, 0]
+    assert WipeTest(STRUCTURE).never_moved("pressure", NOISE).tolist() == [*range(10), *range(12, 22)]
+
+
+def test_a_value_that_is_no_number_takes_nothing_away() -> None:
+    test = wiped()
+    test.follow(np.full(N, np.nan, np.float32), FRESH)
+    assert test.never_moved("pressure", NOISE).tolist() == [STUCK, MISSING]
+
+
+def test_the_list_has_names_that_people_know(tmp_path: Path) -> None:
+    path = wiped().save(tmp_path, "torso", "pressure", NOISE)
+    assert path.name.startswith("never-moved-torso-pressure-")
+    assert path.read_text() == (
+        "# torso: 2 of 20 pressure sensors never moved by more than 12 counts\n"
+        "# position in a frame, uid, name\n"
+        "3\t0x3eb\tboard 7, triangle 0, taxel 3\n"
+        "12\t0x3f4\tboard 7, triangle 1, taxel 0\n"
+    )

@@ -1,0 +1,59 @@
+"""A picture of the real skin-top: waits until somebody presses board 7, and saves what is on the screen as SVG.
+
+Usage: python tools/pictures/skin_top.py FILE.svg        (a driver must run; tools/picture starts one)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import sys
+from pathlib import Path
+
+from textual.pilot import Pilot
+from textual.widgets import DataTable, Static
+
+from skinware import Namespace
+from skinware.cli._heat_map import BACKGROUND, LEVELS
+from skinware.cli._palette import TRUE_COLOURS
+from skinware.cli._top_app import SkinTop
+
+SIZE = (80, 24)
+PATIENCE_S = 120.0
+_FONTS = "ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace"
+
+
+async def picture() -> str:
+    """The screen as SVG."""
+    app = SkinTop(Namespace(), palette=TRUE_COLOURS)
+    async with app.run_test(size=SIZE) as pilot:
+        async with asyncio.timeout(PATIENCE_S):
+            while app.query_one("#list", DataTable).row_count < 6:
+                await pilot.pause(0.1)
+            await pilot.press("down", "down")
+            await _pressed(app, pilot)
+        return plain(app.export_screenshot(title="skin-top"))
+
+
+async def _pressed(app: SkinTop, pilot: Pilot[None]) -> None:
+    """Wait until a finger is on the board that is drawn."""
+    while True:
+        await pilot.pause(0.05)
+        pixels = app._picture.pixels
+        felt = pixels[pixels != BACKGROUND] % LEVELS
+        if str(app.query_one("#title", Static).content).startswith("board 7") and (felt > LEVELS - 4).sum() >= 24:
+            return
+
+
+def plain(svg: str) -> str:
+    """The same without anything from elsewhere: whoever looks at it uses a font of their own."""
+    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"@font-face\s*{.*?}\s*", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"font-family:\s*[^;]*;", f"font-family: {_FONTS};", svg)
+    return "\n".join(line.rstrip() for line in svg.splitlines() if line.strip()) + "\n"
+
+
+if __name__ == "__main__":
+    file = Path(sys.argv[1])
+    file.write_text(asyncio.run(picture()), encoding="utf-8")
+    print(f"{file}: {file.stat().st_size / 1000:.0f} kB")

@@ -111,6 +111,7 @@ class FullBus:
 
     listen_only = False
     channel = "full"
+    medium = "can"
 
     def __init__(self, taken: Sequence[bool]) -> None:
         self.taken = iter(taken)

@@ -15,14 +15,13 @@ import numpy.typing as npt
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import (
-    ERROR_FLAG,
     EXTENDED_FLAG,
     IDENTIFIER_MASK,
-    LARGEST_STANDARD,
     REMOTE_FLAG,
     Bus,
     Filter,
     FrameBatch,
+    check_identifier,
     identifier_text,
 )
 from skinware_drivers.decoding.filters import fewest, filters_of
@@ -31,7 +30,6 @@ from skinware_drivers.layout import Layout
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 0.002, 0.05
 _SEND_TIMEOUT_S = 0.5
 _LATE_NS = 5 * NS_PER_S
-_FLAGS = EXTENDED_FLAG | REMOTE_FLAG | ERROR_FLAG
 DEFAULT_PACE_PER_MS = 4.0
 """Half of what a CAN bus of 1 Mbit/s can carry: the devices' own frames need the other half."""
 AT_ONCE = 8
@@ -119,8 +117,8 @@ class Link:
         """Send one frame; waits while a question in lock step is open (:meth:`ask`), or the interface's queue is full.
 
         Raises:
-            BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only; or a CAN
-                identifier of more than 11 bits lacks the ``EXTENDED_FLAG``.
+            BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
+            ConfigurationError: a CAN identifier of more than 11 bits lacks the ``EXTENDED_FLAG``.
         """
         if self._data_question.locked():
             async with self._data_question:
@@ -128,11 +126,8 @@ class Link:
         await self._send(identifier, payload, timeout_s)
 
     async def _send(self, identifier: int, payload: bytes, timeout_s: float) -> None:
-        if self._bus.medium == "can" and not identifier & EXTENDED_FLAG and identifier & ~_FLAGS > LARGEST_STANDARD:
-            raise BusSendError(
-                f"{self.bus_name}: identifier {identifier:X} has more than 11 bits: send it as EXTENDED_FLAG |"
-                f" {identifier:#x} (from skinware_drivers import EXTENDED_FLAG)"
-            )
+        if self._bus.medium == "can":
+            check_identifier(identifier & ~REMOTE_FLAG)
         loop = asyncio.get_running_loop()
         deadline_s, retry_s = loop.time() + timeout_s, _FIRST_RETRY_S
         while True:

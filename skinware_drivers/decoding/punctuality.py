@@ -5,7 +5,7 @@ that age or longer. So it matters how long after the frame of its kind before ea
 
 * within the maximum age: the sender catches up, and two of its cycles fit into that age;
 * about a period: as it should be, as long as it is less than that half would need;
-* about two periods: the one before was lost, or this one was held up;
+* about two periods, or three, and so on: those before were lost, or this one was held up;
 * anything else: it was held up.
 
 A cycle is one if none of its frames comes soon or was held up, and at least one comes as it should. (In an order that
@@ -81,7 +81,8 @@ class Punctuality:
         late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns
         held_up = late
         if not self._all_as_they_should and late.any():
-            held_up = late & (2 * np.abs(spacing_ns - 2 * self._period_ns) >= self._period_ns - self._reach_ns)
+            beside_ns = np.abs((spacing_ns + self._period_ns // 2) % self._period_ns - self._period_ns // 2)
+            held_up = late & (2 * beside_ns >= self._period_ns - self._reach_ns)
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])

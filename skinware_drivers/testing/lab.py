@@ -25,12 +25,6 @@ from pathlib import Path
 
 MODULES = "can-raw vcan vxcan slcan can-gw kvaser_pci"
 CONTROLLERS = "-object can-bus,id=canbus0" + " -device kvaser_pci,canbus=canbus0" * 2
-FILES = (
-    "-fsdev local,id=files,path=/,security_model=none,readonly=on,multidevs=remap"
-    " -device virtio-9p-pci,fsdev=files,mount_tag=files"
-)
-"""This machine's files once more, for a mount that keeps them in the guest's memory; virtme-ng's asks for each anew,
-which is most of the time that an import takes."""
 PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
 COMMANDS = ("ip", "modprobe", "file")
 """Commands that are needed here or in the guest, beside those that every machine has; virtme-ng asks ``file``."""
@@ -107,22 +101,9 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
         echo 100000 >/proc/sys/net/core/netdev_max_backlog
         ip link set lo up
         mountpoint -q /dev/shm || mount -t tmpfs tmpfs /dev/shm
-        mkdir /run/files /run/written
-        mount -t 9p -o ro,trans=virtio,version=9p2000.L,msize=524288,cache=loose files /run/files
-        for place in {shlex.join(map(str, cached_places(folder)))}; do
-            mkdir -p "/run/written$place/files" "/run/written$place/work"
-            options="lowerdir=/run/files$place,upperdir=/run/written$place/files,workdir=/run/written$place/work"
-            mount -t overlay -o "xino=off,$options" overlay "$place"
-        done
         cd {shlex.quote(str(folder))}
         exec {shlex.join(command)}
     """
-
-
-def cached_places(folder: Path) -> list[Path]:
-    """Folders that programs load most of their files from: Python, its packages, the project."""
-    places = {Path(place).resolve() for place in (sys.base_prefix, sys.prefix, folder)}
-    return [place for place in sorted(places) if not places & set(place.parents)]
 
 
 def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int:
@@ -143,7 +124,7 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
         return report(flavour, lacks)
     # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
     arguments = [vng, "--run", str(kernel), "--disable-kvm", "--force-9p", "--disable-microvm", "--cpus", "2"]
-    arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
+    arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS}"]
     arguments += ["--exec", f"bash -c {shlex.quote(guest_script(flavour, command, folder))}"]
     environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
     # through a pipe: given a file, QEMU opens it anew and overwrites what is in it

@@ -26,6 +26,7 @@ class Wire:
 
     listen_only = False
     name = "bus wire"
+    medium = "can"
 
     def __init__(self, answer: Answer) -> None:
         self._answer = answer

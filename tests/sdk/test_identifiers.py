@@ -20,6 +20,7 @@ VALUES = Values(0, "u1", 1)
 
 class Silent:
     listen_only = narrows = False
+    medium = "can"
     name = channel = "silent"
 
     def send(self, identifier: int, payload: bytes) -> None:

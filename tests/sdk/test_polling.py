@@ -115,6 +115,7 @@ class Line:
     """A line that takes what it wants to, and notes what was sent and when."""
 
     listen_only = narrows = False
+    medium = "can"
     name = channel = "line"
 
     def __init__(self, clock: Callable[[], int] = now_ns, takes: Callable[[], bool] = lambda: True) -> None:

@@ -356,11 +356,9 @@ def is_live(frame: DriverFrame) -> bool:
 
 
 def sensor_name(structure: Structure, sensor: int) -> str:
-    """For people."""
-    patch = bytes(structure.patch_name[structure.sensor_patch[sensor]]).decode()
-    module = int(structure.sensor_module[sensor])
+    """For authors, who know their sensors by uid."""
     type_name = next(t.name for t in structure.types if t.id == structure.sensor_type[sensor])
-    return f"sensor {sensor} ({type_name}, {patch!r}, module {module}, uid {int(structure.sensor_uid[sensor]):#x})"
+    return f"{structure.sensor_name(sensor)} ({type_name}, uid {int(structure.sensor_uid[sensor]):#x})"
 
 
 def play(scenario: Callable[[HandClock], Coroutine[Any, Any, T]]) -> T:

@@ -45,6 +45,7 @@ _WHY = dict(
             "no frame of the layout has this identifier, or it names no patch or module",
             "the layout has no frame of this length",
             "its identifier and length are known, its content is that of no frame of the layout",
+            "it is stamped before this machine booted",
         ),
         strict=True,
     )

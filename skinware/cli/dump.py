@@ -204,7 +204,7 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverFrame]:
-    """Frames for ever, over restarts of the driver; says on stderr when it came back."""
+    """Frames indefinitely, over restarts of the driver; says on stderr when it came back."""
     from skinware.cli._format import plural
     from skinware.errors import StructureChanged
 

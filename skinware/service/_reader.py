@@ -30,7 +30,7 @@ class ServiceReader(Attachment[FrameT]):
     Args:
         name: the service.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
-        timeout_s: how long to wait for the service to appear; 0 for not at all, None for ever.
+        timeout_s: how long to wait for the service to appear; 0 for not at all, None for no limit.
         announce: let others see this reader (``skin-info``).
 
     Raises:

@@ -1,4 +1,4 @@
-"""``skin-config``: set up what hangs on a bus, through its running driver or without one."""
+"""``skin-config``: set up what is attached to a bus, through its running driver or without one."""
 
 from __future__ import annotations
 

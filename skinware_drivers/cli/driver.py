@@ -315,7 +315,7 @@ def _end(runner: Runner, context: dict[str, Any]) -> None:
 
 
 def _has_terminal() -> bool:
-    """Whether this process hangs on a terminal, wherever its input and output go."""
+    """Whether this process is attached to a terminal, wherever its input and output go."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:

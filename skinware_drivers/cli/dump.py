@@ -93,7 +93,7 @@ def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
 
 
 def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[FrameBatch]:
-    """What arrives, at once and for ever."""
+    """What arrives, at once and indefinitely."""
     from skinware.errors import BusError
     from skinware_drivers.bus import FrameBatch
 

@@ -49,7 +49,7 @@ class Decoder:
 
     Args:
         layouts: what frames mean, for each bus; None for a bus of which that is not known yet.
-        tables: what hangs on the buses.
+        tables: what is attached to the buses.
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 

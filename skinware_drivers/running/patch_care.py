@@ -160,7 +160,7 @@ class PatchCare:
         return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
-        """Hear what devices say of themselves, for ever.
+        """Hear what devices say of themselves, indefinitely.
 
         Args:
             pause_s: what to wait after the bus failed.
@@ -173,7 +173,7 @@ class PatchCare:
                 try:
                     with hook("attend", self._line.name):
                         await adapter.attend(self._line.link)
-                    await asyncio.Event().wait()  # for ever: it may still tell something when it is asked
+                    await asyncio.Event().wait()  # indefinitely: it may still tell something when it is asked
                 except BusError as error:
                     self._tell(str(error))
                 await asyncio.sleep(pause_s())

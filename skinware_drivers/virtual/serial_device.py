@@ -43,7 +43,7 @@ class SerialEmulator(Emulator[OptionsT]):
 
     def __init__(self, options: OptionsT, **more: Any) -> None:
         if options.foreign_hz:
-            raise ConfigurationError("option foreign_hz: nothing else hangs on a serial line")
+            raise ConfigurationError("option foreign_hz: nothing else is attached to a serial line")
         super().__init__(options, **more)
         self.wire.speed = self.speed_mbit_s
 

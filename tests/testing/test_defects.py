@@ -133,7 +133,7 @@ def test_a_driver_that_computes_without_end_is_found_by_its_processor_time(monke
     monkeypatch.setattr(clock, "_LONGEST_TURN_S", 0.5)
     suite = TestFingertips()
     suite.driver = f.Computes  # type: ignore[misc]
-    with pytest.raises(pytest.fail.Exception, match=r"busy for ever, here:(?s:.*)fingertips.py(?s:.*)enough"):
+    with pytest.raises(pytest.fail.Exception, match=r"loops without end, here:(?s:.*)fingertips.py(?s:.*)enough"):
         getattr(suite, VALUES)()
     f.Computes.enough.set()
 

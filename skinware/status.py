@@ -47,7 +47,7 @@ class BusState(enum.IntEnum):
     SILENT = 2
     """Open, but no frame arrived for longer than the driver's silence limit."""
     DOWN = 3
-    """The interface exists but is down, its controller is bus-off, or the driver set it aside; the driver waits for it."""
+    """The interface exists but is down, its controller is bus-off, or the driver set it aside."""
     GONE = 4
     """The interface disappeared; it is opened again as soon as it is back."""
 

@@ -1,7 +1,7 @@
 """Driver of patches that speak the open patch protocol: they say themselves what they are.
 
-The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch is on
-each serial line.
+The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch is
+attached to each serial line.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
             BusError: it does not answer, says what cannot be, or must not be asked.
         """
         if link.listen_only:
-            raise BusError("a patch describes itself only on request: listening is not enough")
+            raise BusError("a patch says what it is only when it is asked: listening alone cannot find out")
         greeting = await self._greet(link)
         if self._patch is not None and greeting.crc == self._crc:
             return [self._patch]

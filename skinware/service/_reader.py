@@ -286,7 +286,7 @@ class ServiceReader(Attachment[FrameT]):
 
     def _structure_changed(self) -> StructureChanged:
         return StructureChanged(
-            f"service {self.name!r} came back with another structure; call reattach() and read it anew"
+            f"service {self.name!r} came back with another structure; call reattach() and read it again"
         )
 
     def _why_nothing_came(self, max_age_s: float | None) -> str:

@@ -343,7 +343,7 @@ class Decoder:
             haste[patch] = _NEVER_AGAIN
             log.warning(
                 "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
-                " apart and are not shown; give the driver the right period (period_ms, period_s); told once",
+                " apart and are not shown; give the driver the right period (period_ms, period_s); logged once",
                 self.tables.structure.patch_name[patch].decode(),
             )
 

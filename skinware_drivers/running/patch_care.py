@@ -137,10 +137,12 @@ class PatchCare:
                 )
                 return False
         if not set_ups.begun:
-            log.warning("%s: %s is silent but answers: it has restarted, or was never set up", line.name, patch.name)
+            log.warning(
+                "%s: %s is silent but answers: it has restarted, or was never configured", line.name, patch.name
+            )
         elif set_ups.begun == 1:
             log.warning(
-                "%s: %s answers and was set up, but sends nothing; tried again, more and more rarely",
+                "%s: %s answers and was configured, but sends nothing; it is configured again with growing pauses",
                 line.name,
                 patch.name,
             )

@@ -253,7 +253,7 @@ class Runner:
                 tables = tables.placed(self._geometry)
                 _warn_of_foreign(tables.structure)
         except StructureError as error:
-            log.error("what was found makes no skin: %s", str(error))
+            log.error("the devices that were found do not form a valid skin: %s", str(error))
             return
         known = self.generation
         is_known = known is not None and (known.tables.structure, known.decoder.layouts) == (

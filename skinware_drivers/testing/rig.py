@@ -301,7 +301,7 @@ class Running(Rig):
         if self.truth.bursts:
             Comparison(self).require_no_shift()
         else:
-            defect(f"the devices sent no data {within}: did `start` tell them to? It sent: {self.sent_in_words()}")
+            defect(f"the devices sent no data {within}: does `start` start them? It sent: {self.sent_in_words()}")
         missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
         counters = {name: count for name, count in self.counters().items() if count and name in _NOT_TAKEN}
         never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))

@@ -199,9 +199,7 @@ def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[
         try:
             return await adapter.describe(link)
         except BusError as error:
-            return defect(
-                f"`describe` asks its devices, and nobody answers: give emulated ones as `devices=` ({error})"
-            )
+            return defect(f"`describe` asks its devices, and none answers: give emulated ones as `devices=` ({error})")
         finally:
             asyncio.get_running_loop().remove_reader(bus.fileno())
             bus.close()

@@ -6,7 +6,7 @@ from skinware.status import BusReason
 
 
 class SkinwareError(Exception):
-    """Base of every error that Skinware raises on purpose."""
+    """Base class of all errors of Skinware."""
 
 
 class ConfigurationError(SkinwareError, ValueError):
@@ -22,7 +22,7 @@ class NamespaceError(SkinwareError):
 
 
 class PlatformError(SkinwareError):
-    """This machine lacks something the core cannot do without (memory fences, /dev/shm)."""
+    """This machine lacks something that the core needs (memory fences, /dev/shm)."""
 
 
 class RealtimeRefused(SkinwareError):
@@ -30,7 +30,7 @@ class RealtimeRefused(SkinwareError):
 
 
 class ServiceError(SkinwareError):
-    """Base of what can happen between the writer and the readers of a service."""
+    """Base class of errors between the writer and the readers of a service."""
 
 
 class ServiceNotFound(ServiceError):
@@ -38,11 +38,11 @@ class ServiceNotFound(ServiceError):
 
 
 class ServiceTimeout(ServiceError, TimeoutError):
-    """No newer frame came before the deadline. The message tells whether the writer lives."""
+    """No newer frame arrived before the deadline. The message says whether the writer is running."""
 
 
 class NameInUse(ServiceError):
-    """A living writer owns this name."""
+    """A running writer owns this name."""
 
 
 class BadServiceFile(ServiceError):
@@ -50,7 +50,7 @@ class BadServiceFile(ServiceError):
 
 
 class StructureChanged(ServiceError):
-    """The service came back with another structure. Call ``reattach()`` to go over to it."""
+    """The service came back with another structure. Call ``reattach()`` to attach to it."""
 
 
 class Overrun(ServiceError):
@@ -66,11 +66,11 @@ class Paused(ServiceError):
 
 
 class RequestError(ServiceError):
-    """Base of what can happen to a request: it was not carried out, or nobody knows whether it was."""
+    """Base class of errors of requests: the request was not carried out, or it is unknown whether it was."""
 
 
 class RequestTimeout(RequestError, TimeoutError):
-    """No answer came in time. An answer that comes later is never taken for that of another request."""
+    """No answer arrived in time. A late answer is never taken for the answer to another request."""
 
 
 class RequestRefused(RequestError):
@@ -78,11 +78,11 @@ class RequestRefused(RequestError):
 
 
 class RequestFailed(RequestError):
-    """The operation was begun and went wrong; the message is the writer's."""
+    """The operation was started and failed; the message is the writer's."""
 
 
 class RequestCancelled(RequestError):
-    """The request was cancelled by the one who made it."""
+    """The request was cancelled by the program that sent it."""
 
 
 class PeerGone(RequestError):
@@ -102,7 +102,7 @@ class DriverError(SkinwareError):
 
 
 class BusError(SkinwareError):
-    """Base of what can go wrong with a bus."""
+    """Base class of errors of a bus."""
 
 
 class BusNotAvailable(BusError):
@@ -122,7 +122,7 @@ class BusNotAvailable(BusError):
 
 
 class BusSendError(BusError):
-    """A frame could not be handed to the bus (down, full, or opened to listen only)."""
+    """A frame could not be sent on the bus (down, full, or opened to listen only)."""
 
 
 class HandshakeTimeout(BusError, TimeoutError):

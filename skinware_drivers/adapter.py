@@ -24,24 +24,24 @@ from skinware_drivers.watch import Watch
 
 
 class Adapter(HasOptions[OptionsT], ABC):
-    """One bus of a driver: what is attached to it, what its frames mean, and how to get it going.
+    """One bus of a driver: what is attached to it, what its frames mean, and how to start it.
 
-    In the brackets of the base is named which options it takes: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
+    The brackets of the base class name its options: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
     ``CanAdapter[NoOptions]``.
 
     The runner makes one per bus and calls, in this order, ``describe``, ``configure``, ``start``; while data flows
     ``probe`` and ``revive`` for a patch that fell silent; and ``stop`` before the bus is closed. All are coroutines
     of one event loop: they must never block. Each may raise ``BusError`` (a device did not answer, the bus went
-    down) or ``OSError``; the runner then says so and tries again later. Anything else is a fault of the driver's
+    down) or ``OSError``; the runner then logs it and tries again later. Anything else is a fault of the driver's
     code: the bus is set aside and tried again later, and if no other one is served, the driver ends.
 
     In listen-only mode only ``describe``, ``attend`` and ``join`` are called, and every send is refused.
 
-    What user programs may ask for while it runs is marked with :func:`skinware_drivers.operations.operation`.
+    Operations that programs may call while it runs are marked with :func:`skinware_drivers.operations.operation`.
 
-    ``types``, ``dtype``, ``layout`` and ``period_s`` can be set anew for an object of the class, in ``__init__`` or,
-    for hardware that describes itself, in ``describe``. The types of all buses are put together, and the values of all
-    have the smallest dtype that holds each bus' own.
+    An object of the class can set its own ``types``, ``dtype``, ``layout`` and ``period_s``, in ``__init__`` or,
+    for hardware that describes itself, in ``describe``. The types of all buses are joined, and the values of all
+    buses have the smallest dtype that holds those of each.
 
     Attributes:
         medium: kind of bus: ``can``, ``serial`` or ``virtual``.
@@ -51,9 +51,9 @@ class Adapter(HasOptions[OptionsT], ABC):
         layout: what frames mean.
         patches: what is attached to each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
-        by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
+        by_cycle: publish when every live patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
-        heard_by: gets what ``tell`` tells; the runner sets it.
+        heard_by: receives the notices of ``tell``; the runner sets it.
     """
 
     medium: ClassVar[str]
@@ -68,16 +68,16 @@ class Adapter(HasOptions[OptionsT], ABC):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        """What devices that only answer are asked, again and again, from ``start`` to ``stop``; asked for anew."""
+        """Requests to devices that only answer, sent repeatedly from ``start`` to ``stop``; called before each one."""
         return ()
 
     @property
     def payload_size(self) -> int:
-        """Longest payload that a bus must be able to receive. To be overridden where ``describe`` makes the layout."""
+        """Longest payload that a bus must be able to receive. Override it if ``describe`` makes the layout."""
         return self.layout.payload_size
 
     def check(self) -> None:
-        """Find out early what a driver forgot to say, unless its devices say it in ``describe``.
+        """Check early that the driver's declarations are complete, unless ``describe`` asks its devices for them.
 
         Raises:
             ConfigurationError: something is missing, or contradicts something else; the message says what.
@@ -114,18 +114,18 @@ class Adapter(HasOptions[OptionsT], ABC):
         return self.patches
 
     async def configure(self, link: Link) -> None:
-        """Set the devices up."""
+        """Configure the devices."""
 
     async def start(self, link: Link) -> None:
-        """Make them send data."""
+        """Start the data stream."""
 
     async def stop(self, link: Link) -> None:
-        """Make them silent; also if ``configure`` or ``start`` was interrupted. It has less than a second."""
+        """Stop the data stream, also if ``configure`` or ``start`` was interrupted. It has less than a second."""
 
     async def probe(self, link: Link, patch: Patch) -> bool:
-        """Ask a patch that sends no data whether it is there; it is asked again as long as it is silent.
+        """Ask a patch that sends no data whether it is there; called repeatedly while it is silent.
 
-        By default no question is asked, since many devices answer none: it may have lost its power, and is revived.
+        By default no request is sent, since many devices answer none: it may have lost its power, and is revived.
 
         Returns:
             True if it answered: it has restarted, and ``revive`` is called next.

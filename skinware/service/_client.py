@@ -68,8 +68,8 @@ class PendingRequest:
             if answer is None and remaining_ns <= 0:
                 self.cancel()
                 raise RequestTimeout(
-                    f"{self._client.name}: no answer to {self.operation!r} within {timeout_s:g} s; its writer lives"
-                    " but does not take requests now (busy, hung or stopped)"
+                    f"{self._client.name}: no answer to {self.operation!r} within {timeout_s:g} s;"
+                    " its writer is running but does not take requests now (busy, hung or stopped)"
                 )
         if isinstance(answer, RequestError):
             raise answer

@@ -255,7 +255,7 @@ class ServiceReader(Attachment[FrameT]):
     # -- waiting ------------------------------------------------------------------------------------------------
 
     def _wait_for_newer(self, known: Position | None, deadline_ns: int | None, max_age_s: float | None = None) -> bool:
-        """Wait for a frame that is newer than ``known``; whether its writer lives.
+        """Wait for a frame that is newer than ``known``; whether its writer is running.
 
         One that is slept for was published within the last slice: its writer lived then, which saves the question
         at the very moment at which a reader is in a hurry.
@@ -296,8 +296,8 @@ class ServiceReader(Attachment[FrameT]):
         if self.paused:
             return f"no {wanted} of {self.name!r}: its writer is paused"
         if not self._ring.latest:
-            return f"no frame of {self.name!r} yet: its writer lives, but has published nothing so far"
-        return f"no {wanted} of {self.name!r}: its writer lives, but is silent (hung, stopped or waiting)"
+            return f"no frame of {self.name!r} yet: its writer is running, but has published nothing so far"
+        return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
 
     def _lags(self) -> bool:
         """Whether the generation that is being read has newer frames, though there may be another one already."""

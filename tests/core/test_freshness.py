@@ -77,7 +77,9 @@ def test_a_stopped_driver_does_not_look_fresh() -> None:
         assert not frame.fresh("pressure").any()
         with pytest.raises(ServiceTimeout, match=r"data is too old: fake \(\d"):
             skin.read(max_age_s=0.5, timeout_s=0.1)
-        with pytest.raises(ServiceTimeout, match=r"no frame younger than 0\.5 s of 'fake': its writer lives, but is"):
+        with pytest.raises(
+            ServiceTimeout, match=r"no frame younger than 0\.5 s of 'fake': its writer is running, but is"
+        ):
             reader.read(max_age_s=0.5, timeout_s=0.1)
         os.kill(process.pid, signal.SIGCONT)
         assert skin.read(max_age_s=0.5, timeout_s=30).fresh("pressure", max_age_s=30).all()

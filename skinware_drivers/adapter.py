@@ -50,7 +50,8 @@ class Adapter(HasOptions[OptionsT], ABC):
         dtype: dtype of the values.
         layout: what frames mean.
         patches: what is attached to each bus, unless ``describe`` finds out.
-        period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
+        period_s: nominal time between two updates of a module, 0.02 unless the class says another; an option
+            ``period_ms`` sets it. Ages and silence are judged by it.
         by_cycle: publish when every live patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
         heard_by: receives the notices of ``tell``; the runner sets it.

@@ -29,6 +29,7 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     """
     if layout.cycle is not None:
         _check_age(layout.cycle, period_s)
+        _check_members([frame for frame in layout.frames if frame.name in layout.cycle.members])
     n_channels = [len(module.channels) for patch in patches for module in patch.modules]
     names = [patch.name for patch in patches for _ in patch.modules]
     addresses = Addresses(layout.frames, [range(len(layout.frames))], tables)
@@ -55,6 +56,19 @@ def _check_age(cycle: Cycle, period_s: float) -> None:
         f" frames could not be told apart ({fits}): make it shorter than {most}, say half as long"
         + ("" if cycle.turn > 1 else "; or say where its frames have a `counter`")
     )
+
+
+def _check_members(members: Sequence[Frame]) -> None:
+    """A cycle has one value for each channel."""
+    writer: dict[int, str] = {}
+    for frame in members:
+        for channel in {c for values in frame.runs for c in values.channels if c is not None}:
+            other = writer.setdefault(channel, frame.name)
+            if other != frame.name:
+                raise ConfigurationError(
+                    f"frames {other!r} and {frame.name!r} of a cycle both have a value for channel {channel}: a value"
+                    " lies in one frame, give each frame channels of its own (`to`)"
+                )
 
 
 def _check_dtype(frame: Frame, values: Values, dtype: np.dtype[np.generic]) -> None:

@@ -46,6 +46,11 @@ def count_text(count: int | None) -> str:
     return NO_VALUE if count is None else f"{count:,}"
 
 
+def figure_text(value: float, digits: int = 4) -> str:
+    """A measured value to so many digits, large ones whole: ``0.012``, ``150``, ``20,000``."""
+    return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
+
+
 def plural(count: int, what: str, several: str = "") -> str:
     """``1 patch``, ``4 patches``."""
     return f"{count_text(count)} {what if count == 1 else several or what + 's'}"

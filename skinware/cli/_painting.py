@@ -14,6 +14,7 @@ from rich.style import Style
 from rich.text import Text
 
 from skinware.cli import _heat_map as heat
+from skinware.cli._format import figure_text
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
 from skinware.cli._palette import Palette
 
@@ -131,7 +132,7 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
         unit: of the values.
         palette: the terminal's.
     """
-    first, *others = (f"{value:.4g}" for value in values)
+    first, *others = map(figure_text, values)
     text = Text(f"{first} ", no_wrap=True)
     half = LEVELS // len(others)
     for number, other in enumerate(others):

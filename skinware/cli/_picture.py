@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.text import Text
 
+from skinware.cli._format import figure_text
 from skinware.cli._health import status_now
 from skinware.cli._heat_map import FRESH, UNMOVED, Arrangement, arrange, codes_of, marks_of
 from skinware.cli._painting import marks_text, scale_text
@@ -202,7 +203,7 @@ def describe_sensor(frame: DriverFrame, position: int) -> str:
     structure = frame.structure
     sensor_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
     raw = frame.values[position].item()
-    value = f"{sensor_type.offset + sensor_type.scale * raw:.5g} {sensor_type.unit}".strip()
+    value = f"{figure_text(sensor_type.offset + sensor_type.scale * raw, 5)} {sensor_type.unit}".strip()
     status = int(frame.status[position])
     states = ", ".join(name for bit, name in _NAMED_STATUSES.items() if status & bit) or "fresh"
     uid = int(structure.sensor_uid[position])

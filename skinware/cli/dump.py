@@ -110,7 +110,7 @@ def as_line(frame: DriverFrame, type_name: str | None, counts: bool) -> str:
     """One frame for people: least, greatest and mean value of the fresh sensors of each type."""
     import numpy as np
 
-    from skinware.cli._format import age_text
+    from skinware.cli._format import age_text, figure_text
 
     parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
     all_values = frame.values if counts else _physical(frame)
@@ -123,9 +123,12 @@ def as_line(frame: DriverFrame, type_name: str | None, counts: bool) -> str:
             values = all_values[index][fresh]
             figures, mean = "-", ""
             if len(values):
-                figures, mean = f"{values.min():.5g} to {values.max():.5g}", f" (mean {values.mean():.5g})"
+                figures, mean = (
+                    f"{figure_text(values.min(), 5)} to {figure_text(values.max(), 5)}",
+                    f" (mean {figure_text(values.mean(), 5)})",
+                )
             parts.append(f"{sensor_type.name} {figures} {'raw' if counts else sensor_type.unit}{mean}")
-    return "  ".join([*parts, f"not fresh {not_fresh}"])
+    return "  ".join([*parts, f"{not_fresh} not fresh"])
 
 
 def _physical(frame: DriverFrame) -> npt.NDArray[Any]:

@@ -87,11 +87,11 @@ def test_people_see_a_line_per_frame(capsys: pytest.CaptureFixture[str]) -> None
         assert exit_status(command, ["-n", "1", "--counts"]) == 0
         line = capsys.readouterr().out
         assert re.fullmatch(
-            r"a #1  age [\d.]+ ms  pressure 0 to 8 raw \(mean 4\)  temperature - raw  not fresh 3\n", line
+            r"a #1  age [\d.]+ ms  pressure 0 to 8 raw \(mean 4\)  temperature - raw  3 not fresh\n", line
         )
         assert exit_status(command, ["-n", "1", "--type", "pressure"]) == 0
         line = capsys.readouterr().out
-        assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  not fresh 1\n", line)
+        assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  1 not fresh\n", line)
 
 
 def test_the_option_of_before_is_told_off_and_changes_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,6 +110,7 @@ class Complete(CanAdapter[NoOptions]):
     layout = Layout([Frame("all", [Identifier(0x100)], [8], Values(0, "<u2", 4))])
 
 
+AB = Cycle(["a", "b"], 0.01)
 COUNTER = SequenceNumber(0, "u1", mask=0xF0)
 KEYED = Layout([Frame("all", [Identifier(0x100, mask=0x7F0)], [8], Values(0, "<u2", 4), module=Bits(0, 4))])
 
@@ -153,6 +154,10 @@ def test_what_fits_is_not_refused(changed: dict[str, Any]) -> None:
         (
             {"patches": (Patch("f", [Module(taxels(4)), Module(taxels(2, first_uid=9), key=1)]),), "layout": KEYED},
             "has 2",
+        ),
+        (
+            {"layout": Layout([Frame(n, [Identifier(i)], [8], Values(0, "u1", 4)) for i, n in enumerate("ab")], AB)},
+            "frames 'a' and 'b' of a cycle both have a value for channel 0: a value lies in one frame",
         ),
         ({"layout": halves(0.02)}, "two cycles fit into maximum_age_s = 0.02.*`period_s` is 0.02 s.*or say where"),
         ({"layout": halves(0.01, order="any")}, "make it shorter than half of that"),

@@ -1,4 +1,4 @@
-"""What a driver says of each sensor, patch and bus in every frame: small integers, the same for C readers."""
+"""The state of each sensor, patch and bus in every frame: small integers, the same for C readers."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ class Status(enum.IntFlag):
     STALE = 2
     """The value is older than the patch's last update, or the patch went silent."""
     OUT_OF_RANGE = 4
-    """The hardware says that the true value lies beyond what it can express."""
+    """The hardware reports that the true value is beyond its range."""
     NO_ACK = 8
     """The transducer does not answer its patch's microcontroller."""
     NOT_CONNECTED = 16
-    """The hardware says that no transducer is connected."""
+    """The hardware reports that no transducer is connected."""
     MASKED = 32
     """Switched off by configuration."""
     SUSPECT = 64
-    """Something happened that makes the value doubtful (say, the hardware moved its own baseline)."""
+    """Some event makes the value doubtful (for example, the hardware moved its own baseline)."""
 
 
 class PatchState(enum.IntEnum):
     """What a patch (microcontroller) is doing."""
 
     EXPECTED = 0
-    """Part of the structure, but not heard yet."""
+    """Part of the structure, but has not sent yet."""
     LIVE = 1
     """Its data arrives."""
     STALE = 2
     """It was live and fell silent."""
     RESTARTED = 3
-    """It came back from a power cycle and is being set up again."""
+    """It came back from a power cycle and is being configured again."""
 
 
 class BusState(enum.IntEnum):
@@ -43,50 +43,50 @@ class BusState(enum.IntEnum):
     CONNECTING = 0
     """Not open yet, or being opened again."""
     LIVE = 1
-    """Open, and frames came lately."""
+    """Open, and frames arrived recently."""
     SILENT = 2
-    """Open, but nothing came for longer than the driver's silence limit."""
+    """Open, but no frame arrived for longer than the driver's silence limit."""
     DOWN = 3
-    """The interface exists but is down, its controller is off the bus, or the driver set it aside; it is waited for."""
+    """The interface exists but is down, its controller is bus-off, or the driver set it aside."""
     GONE = 4
-    """The interface vanished; it is opened again as soon as it is back."""
+    """The interface disappeared; it is opened again as soon as it is back."""
 
 
 class BusReason(enum.IntEnum):
-    """Why a bus is in its state; of a live one, what is nevertheless wrong with it."""
+    """Why a bus is in its state; for a live bus, a problem that it has nevertheless."""
 
     NONE = 0
     """Nothing is wrong, or nothing more is known."""
     NOTHING_HEARD = 1
-    """Open and in order, but no frame came for longer than the driver's silence limit."""
+    """Open and in order, but no frame arrived for longer than the driver's silence limit."""
     INTERFACE_DOWN = 2
     """The interface was set down."""
     INTERFACE_GONE = 3
     """There is no such interface (any more)."""
     REFUSED = 4
-    """This user may not use it."""
+    """The driver's account may not use it."""
     FAILED = 5
-    """The interface or its library failed in another way, say because the adapter was unplugged."""
+    """The interface or its library failed in another way, for example because the adapter was unplugged."""
     BUS_OFF = 6
-    """The controller met so many errors in sending that it took itself off the wire."""
+    """The controller counted so many send errors that it took itself off the bus."""
     ERROR_PASSIVE = 7
-    """The controller met many errors and may only whisper: nobody acknowledges, or the wire is bad."""
+    """The controller counted many errors and is error-passive: no acknowledgement, or bad wiring."""
     ERROR_WARNING = 8
-    """The controller meets errors more often than it should."""
+    """The controller sees errors more often than it should."""
     OVERFLOW = 9
-    """The controller lost frames, as the machine did not fetch them in time."""
+    """The controller lost frames because the machine did not fetch them in time."""
     NO_ACKNOWLEDGEMENT = 10
-    """Nobody on the wire acknowledges what is sent."""
+    """No other node acknowledges what is sent."""
     BUS_ERRORS = 11
-    """The controller hears broken frames: another bit rate, missing termination, bad wires."""
+    """The controller receives broken frames: another bit rate, missing termination, bad wiring."""
     REMOVED = 12
-    """The driver was told to do without this bus."""
+    """The bus was removed from the driver's configuration."""
     SET_ASIDE = 13
     """The driver's own code failed on this bus: it was closed, and is tried again later. The driver's log says why."""
 
 
 LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF
-"""In place of a bus' load: its bit rate is not known; or its filters leave frames out, which nobody counts."""
+"""In place of a bus' load: its bit rate is not known; or its filters drop frames without counting them."""
 
 
 def load_report(load: int) -> dict[str, float | str | None]:

@@ -275,5 +275,7 @@ class SkinReplica(Worker[Snapshot]):
                     return self._snapshot
                 remaining_ns = deadline_ns - now_ns()
                 if remaining_ns <= 0:
-                    raise ServiceTimeout(f"nothing new on the skin within {timeout_s:g} s (skin-info shows who runs)")
+                    raise ServiceTimeout(
+                        f"nothing new on the skin within {timeout_s:g} s (skin-info shows the running drivers)"
+                    )
                 self._news.wait(min(remaining_ns, WAIT_SLICE_NS) / NS_PER_S)

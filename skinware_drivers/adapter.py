@@ -24,7 +24,7 @@ from skinware_drivers.watch import Watch
 
 
 class Adapter(HasOptions[OptionsT], ABC):
-    """One bus of a driver: what hangs on it, what its frames mean, and how to get it going.
+    """One bus of a driver: what is attached to it, what its frames mean, and how to get it going.
 
     In the brackets of the base is named which options it takes: ``class ThumbDriver(CanAdapter[ThumbOptions])``, or
     ``CanAdapter[NoOptions]``.
@@ -49,7 +49,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
         layout: what frames mean.
-        patches: what hangs on each bus, unless ``describe`` finds out.
+        patches: what is attached to each bus, unless ``describe`` finds out.
         period_s: nominal time between two updates of a module; an option ``period_ms`` sets it.
         by_cycle: publish when every living patch has delivered (True), or at the rate of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
@@ -110,7 +110,7 @@ class Adapter(HasOptions[OptionsT], ABC):
             )
 
     async def describe(self, link: Link) -> Sequence[Patch]:  # noqa: ARG002
-        """The patches on this bus; by default the declared ones. None yet: the runner asks again, for ever."""
+        """The patches on this bus; by default the declared ones. None yet: the runner asks again, indefinitely."""
         return self.patches
 
     async def configure(self, link: Link) -> None:

@@ -183,7 +183,7 @@ class Bus(ABC):
 
     Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
     down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and
-    opened again by its owner, for ever, with growing pauses.
+    opened again by its owner, indefinitely, with growing pauses.
 
     Args:
         channel: the part of the bus' name behind ``interface:`` (``vcan0``, ``/dev/ttyUSB0``).

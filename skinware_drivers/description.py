@@ -1,4 +1,4 @@
-"""What hangs on a bus: patches of modules of channels, with the keys by which frames name them."""
+"""What is attached to a bus: patches of modules of channels, with the keys by which frames name them."""
 
 from __future__ import annotations
 

@@ -17,67 +17,14 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
-from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD, check_identifier
+from skinware_drivers.bus import check_identifier
+from skinware_drivers.conditions import Bits, Byte, Condition, Identifier
 from skinware_drivers.numbering import DeviceTime, SequenceNumber
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can tell apart, over all its buses."""
 _KEY_BITS = 29
 _FEWEST_COUNTS = 4
-
-
-@dataclass(frozen=True)
-class Identifier:
-    """Condition: ``identifier & mask == value``. Whether the identifier has 11 or 29 bits counts whatever the mask.
-
-    Attributes:
-        value: what the masked bits are; of a 29-bit identifier, with the flag: ``EXTENDED_FLAG | 0x18DA00F1``.
-        mask: bits that count; default: all.
-        extended: the identifier has 29 bits, not 11. To be left out: the value says it.
-    """
-
-    value: int
-    mask: int = -1
-    extended: bool = False
-
-    def __post_init__(self) -> None:
-        is_extended = bool(self.value & EXTENDED_FLAG)
-        if self.extended and not is_extended:
-            text = f"Identifier(0x{self.value:X}, extended=True): write Identifier(EXTENDED_FLAG | 0x{self.value:X})"
-            warnings.warn(text, DeprecationWarning, stacklevel=3)
-            object.__setattr__(self, "value", self.value | EXTENDED_FLAG)
-            is_extended = True
-        object.__setattr__(self, "extended", is_extended)
-        every = EXTENDED_FLAG | IDENTIFIER_MASK if is_extended else LARGEST_STANDARD
-        mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)
-        object.__setattr__(self, "mask", mask)
-
-
-@dataclass(frozen=True)
-class Byte:
-    """Condition: ``payload[offset] & mask == value``; a frame that is too short does not match."""
-
-    offset: int
-    value: int
-    mask: int = 0xFF
-
-
-Condition = Identifier | Byte
-
-
-@dataclass(frozen=True)
-class Bits:
-    """A bit field that names a patch or a module.
-
-    Attributes:
-        shift: position of the lowest bit.
-        width: number of bits, 1 to 29.
-        byte: None: of the identifier; a number: of that payload byte (only as a module's key, at most 8 bits).
-    """
-
-    shift: int
-    width: int
-    byte: int | None = None
 
 
 @dataclass(frozen=True)

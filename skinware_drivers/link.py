@@ -110,7 +110,7 @@ class Link:
 
     @property
     def is_awaiting(self) -> bool:
-        """Whether a question is open. Who follows frames, perhaps for ever, has asked none."""
+        """Whether a question is open. Who follows frames, perhaps indefinitely, has asked none."""
         return self._questions > 0 or self._expected is not None
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = _SEND_TIMEOUT_S) -> None:

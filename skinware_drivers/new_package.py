@@ -80,7 +80,7 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
     """
     folder = where / name
     if folder.exists() or folder.is_symlink():
-        raise ConfigurationError(f"{folder} is there already; nothing was changed")
+        raise ConfigurationError(f"{folder} already exists; nothing was changed")
     words = {"name": name, "Class": "".join(part.capitalize() for part in name.split("_"))}
     unfinished = where / f".{name}.{os.getpid()}"
     made = []

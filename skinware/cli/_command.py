@@ -50,13 +50,13 @@ def examples(*lines: str) -> str:
 
 def namespace_option(command: _Decorated) -> _Decorated:
     """``--namespace NAME``."""
-    text = "Namespace to meet in.  [default: $SKINWARE_NAMESPACE, else 'default']"
+    text = "Namespace of drivers and readers.  [default: $SKINWARE_NAMESPACE, else 'default']"
     return click.option("--namespace", metavar="NAME", help=text)(command)
 
 
 def json_option(command: _Decorated) -> _Decorated:
     """``--json``."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs.")(command)
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
 
 
 def version_option(command: _Decorated) -> _Decorated:

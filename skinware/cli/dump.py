@@ -35,7 +35,7 @@ _LOOK_EVERY_S = 0.1
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-dump -n 3                              three frames",
-        "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
+        "skin-dump -T 2 --type pressure              fail if no frame arrives for 2 s",
         "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
     ),
 )
@@ -64,7 +64,7 @@ def command(
 
     Values are physical, in the unit of their type, as skin-top shows them.
 
-    A line of text has the least, greatest and mean value of the fresh sensors of each type. JSON has everything.
+    A line of text has the minimum, maximum and mean of the fresh sensors of each type. JSON has everything.
     """
     from skinware.cli._format import terminal_width, wrapped
     from skinware.memory.namespace import Namespace
@@ -204,7 +204,7 @@ def _drivers(namespace: Namespace) -> dict[str, bool]:
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverFrame]:
-    """Frames for ever, over restarts of the driver; says on stderr when it came back."""
+    """Frames indefinitely, over restarts of the driver; says on stderr when it came back."""
     from skinware.cli._format import plural
     from skinware.errors import StructureChanged
 

@@ -62,12 +62,12 @@ _LIFE_COLOURS = {
 )
 @click.argument("name", required=False)
 @click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
-@click.option("--watch", is_flag=True, help="Again every second, until interrupted.")
+@click.option("--watch", is_flag=True, help="Update every second, until interrupted.")
 @namespace_option
 @json_option
 @version_option
 def command(name: str | None, sensors: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
-    """Show what is attached: drivers, their buses and patches, other services, and who reads them.
+    """Show all drivers with their buses and patches, other services, and their readers.
 
     With NAME: only that driver or service.
     """

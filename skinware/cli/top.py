@@ -40,7 +40,9 @@ _NEEDED = "textual>=8"
         "skin-top --plain -T 10      ten seconds of plain lines",
     ),
 )
-@click.option("--plain", is_flag=True, help="One line a second for each driver; so it is without a terminal.")
+@click.option(
+    "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
+)
 @click.option("-T", "duration_s", type=seconds, help="End after SECONDS.")
 @click.option("--type", "type_name", metavar="TYPE", help="Sensors to draw first.  [default: the driver's first type]")
 @click.option(
@@ -49,7 +51,7 @@ _NEEDED = "textual>=8"
     type=click.Choice(["change", "range", "raw"]),
     default="change",
     show_default=True,
-    help="What colours mean first: the change from rest, the range of the type, raw counts.",
+    help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
 @namespace_option
 @json_option

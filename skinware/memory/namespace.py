@@ -168,7 +168,7 @@ def _make_folder(path: Path, mode: int, group_id: int) -> None:
         folder = os.open(begun, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         try:
             if os.fstat(folder).st_uid != os.geteuid():
-                raise PermissionError(EPERM, "somebody else's folder is in the way", str(begun))
+                raise PermissionError(EPERM, "the folder belongs to another account", str(begun))
             os.fchown(folder, -1, group_id)
             os.fchmod(folder, mode)
         finally:

@@ -114,7 +114,7 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
     if not try_lock(fd):
         descriptor.close()
         raise NameInUse(
-            f"a living driver or service is called {name!r} in namespace {namespace.name!r};"
+            f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
             " stop it (skin-info shows its pid), or choose another name (--name) or namespace (SKINWARE_NAMESPACE)"
         )
     try:

@@ -27,7 +27,7 @@ class Attachment(Generic[FrameT]):
     Args:
         name: the service.
         namespace: where it is.
-        timeout_s: how long to wait for it to appear; 0 for not at all, None for ever.
+        timeout_s: how long to wait for it to appear; 0 for not at all, None for no limit.
 
     Raises:
         ServiceNotFound: it did not appear in time.

@@ -185,7 +185,7 @@ class RequestClient(ForkGuard):
             raise PeerGone(f"the writer of {self.name!r} is dead") from None
         except BlockingIOError:
             connection.close()
-            raise RequestTimeout(f"{self.name}: too many programs wait to be heard by its writer") from None
+            raise RequestTimeout(f"{self.name}: too many programs are waiting for its writer") from None
         except PermissionError:
             connection.close()
             raise RequestRefused(

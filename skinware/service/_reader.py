@@ -30,7 +30,7 @@ class ServiceReader(Attachment[FrameT]):
     Args:
         name: the service.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
-        timeout_s: how long to wait for the service to appear; 0 for not at all, None for ever.
+        timeout_s: how long to wait for the service to appear; 0 for not at all, None for no limit.
         announce: let others see this reader (``skin-info``).
 
     Raises:
@@ -286,7 +286,7 @@ class ServiceReader(Attachment[FrameT]):
 
     def _structure_changed(self) -> StructureChanged:
         return StructureChanged(
-            f"service {self.name!r} came back with another structure; call reattach() and read it anew"
+            f"service {self.name!r} came back with another structure; call reattach() and read it again"
         )
 
     def _why_nothing_came(self, max_age_s: float | None) -> str:

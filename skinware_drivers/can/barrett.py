@@ -81,7 +81,7 @@ class BarrettOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: Annotated[
         Literal["full", "top10"], msgspec.Meta(description="all cells in 12 bits, or the ten strongest in four")
     ] = "full"
-    period_ms: Annotated[int, msgspec.Meta(description="time between two questions, ms", ge=5, le=1000)] = 20
+    period_ms: Annotated[int, msgspec.Meta(description="time between two requests, ms", ge=5, le=1000)] = 20
     tact: Annotated[int, msgspec.Meta(description="number of the property TACT, by firmware", ge=1, le=127)] = 106
 
     def __post_init__(self) -> None:

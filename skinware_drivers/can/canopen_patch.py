@@ -48,14 +48,14 @@ class CanopenOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     eds: Annotated[str, msgspec.Meta(description="EDS or DCF file of the patches; default: the example's")] = ""
     nodes: Annotated[
-        tuple[int, ...], msgspec.Meta(description="node ids of the patches, 1-127; default: whoever answers")
+        tuple[int, ...], msgspec.Meta(description="node ids of the patches, 1-127; default: all that answer")
     ] = ()
     period_ms: Annotated[int, msgspec.Meta(description="time between two updates, ms", ge=1, le=60_000)] = 20
     heartbeat_ms: Annotated[
         int, msgspec.Meta(description="time between two heartbeats of a patch, ms; 0: none", ge=0, le=60_000)
     ] = 100
-    type: Annotated[str, msgspec.Meta(description="type of the sensors whose name in the EDS says none")] = "pressure"
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns what is there, s", gt=0)] = 1.0
+    type: Annotated[str, msgspec.Meta(description="type of sensors whose name in the EDS contains none")] = "pressure"
+    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns which modules send, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -173,7 +173,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
             raise ConfigurationError("all boards of a bus have one rate: do not name a patch")
         fixed = [board for board in self._boards if self.options.old_style and self._is_mtb4(board)]
         if fixed:
-            raise ConfigurationError(f"board {fixed[0]} is an MTB4: set up the old way, it sends every 40 ms")
+            raise ConfigurationError(f"board {fixed[0]} is an MTB4: configured the old way, it sends every 40 ms")
         special = tuple(
             s if s.period_ms is None else msgspec.structs.replace(s, period_ms=period_ms)
             for s in self.options.special_boards

@@ -121,7 +121,7 @@ async def move_board(link: Link, old: int, new: int) -> Board:
         await link.sleep(_BETWEEN_CHECKS_S)
     else:
         raise HandshakeTimeout(
-            f"{link.bus_name}: board {old} was told to be board {new}, but none of that address answers; to see which"
+            f"{link.bus_name}: board {old} got the address {new}, but no board answers there; to see which"
             " it has now: skin-find --probe"
         )
     if after.board_type != before.board_type or after.firmware != before.firmware:

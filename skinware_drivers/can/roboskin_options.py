@@ -84,11 +84,11 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of the driver, for every board of a bus."""
 
     boards: Annotated[
-        tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: whoever answers")
+        tuple[int, ...], msgspec.Meta(description="addresses of the boards, 1-14; default: all that answer")
     ] = ()
     period_ms: Annotated[int, msgspec.Meta(description="time between two updates, 1-255 ms", ge=1, le=255)] = 50
     skin_type: Annotated[
-        int, msgspec.Meta(description="type of skin that the boards are told: 0, 1, 2, 3, 7 or 8", ge=0, le=15)
+        int, msgspec.Meta(description="skin type that is sent to the boards: 0, 1, 2, 3, 7 or 8", ge=0, le=15)
     ] = 0
     no_load: Annotated[int, msgspec.Meta(description="value of an idle taxel", ge=0, le=255)] = 0xF0
     shift: Annotated[int, msgspec.Meta(description="resolution shift of the boards", ge=0, le=255)] = 2
@@ -97,7 +97,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bool, msgspec.Meta(description="whether triangles that `modules` does not name are switched on")
     ] = True
     kind: Annotated[
-        str, msgspec.Meta(description="what all modules are: triangle, fingertip or palm; default: by skin type")
+        str, msgspec.Meta(description="kind of all modules: triangle, fingertip or palm; default: by skin type")
     ] = ""
     inertial: Annotated[Inertial, msgspec.Meta(description="inertial sensors that the boards send")] = ()
     inertial_period_ms: Annotated[
@@ -107,9 +107,9 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["mtb4", "mtb3"], msgspec.Meta(description="kind of the boards with inertial sensors: it sets the scale")
     ] = "mtb4"
     old_style: Annotated[
-        bool, msgspec.Meta(description="set up with the old commands 4C and 4E; skin data in message class 3")
+        bool, msgspec.Meta(description="configure boards with the old commands 4C and 4E; skin data in message class 3")
     ] = False
-    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns what is there, s", gt=0)] = 1.0
+    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns which modules send, s", gt=0)] = 1.0
     special_boards: Annotated[
         tuple[SpecialBoards, ...], msgspec.Meta(description="boards that differ (configuration file only)")
     ] = ()
@@ -147,12 +147,12 @@ def _check_addresses(options: RoboskinOptions) -> None:
                 f"board address {board}: boards have {FIRST_BOARD} to {LAST_BOARD} (0 is the host, 15 everybody)"
             )
     if len(set(options.boards)) < len(options.boards):
-        raise ConfigurationError(f"boards {options.boards}: one address is there twice")
+        raise ConfigurationError(f"boards {options.boards}: an address occurs twice")
 
 
 def _check_inertial(inertial: Inertial, scale: str) -> None:
     if len(set(inertial)) < len(inertial):
-        raise ConfigurationError(f"inertial sensors {', '.join(inertial)}: one is there twice")
+        raise ConfigurationError(f"inertial sensors {', '.join(inertial)}: one occurs twice")
     if {"accelerometer", "external_accelerometer"} <= set(inertial):
         raise ConfigurationError("a board's own and its external accelerometer send one message: choose one of them")
     imu = [sensor for sensor in inertial if sensor.startswith("imu_")]
@@ -166,13 +166,13 @@ def _check_inertial(inertial: Inertial, scale: str) -> None:
 
 def _check_old_style(options: RoboskinOptions) -> None:
     if options.all_inertial:
-        raise ConfigurationError("old_style: boards that are set up the old way send no inertial data")
+        raise ConfigurationError("old_style: boards that are configured the old way send no inertial data")
     periods = [options.period_ms, *(s.period_ms for s in options.special_boards if s.period_ms is not None)]
     if max(periods) > LONGEST_OLD_PERIOD_MS:
         raise ConfigurationError(f"old_style: a period of {max(periods)} ms, the most is {LONGEST_OLD_PERIOD_MS}")
     for skin_type in (options.skin_type, *(s.skin_type for s in options.special_boards)):
         if skin_type is not None and skin_type > 3:
-            raise ConfigurationError(f"old_style: skin type {skin_type} came with the new set-up; choose 0 to 3")
+            raise ConfigurationError(f"old_style: skin type {skin_type} needs the new commands; choose 0 to 3")
     for module in options.modules:
         if module.shift is not None or module.cdc_offset is not None:
             raise ConfigurationError(

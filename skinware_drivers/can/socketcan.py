@@ -58,14 +58,14 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     buffer: Annotated[int, msgspec.Meta(description="receive buffer, bytes", ge=1)] = WANTED_BUFFER_BYTES
     timestamps: Annotated[
-        Stamping, msgspec.Meta(description="of the controller, of the kernel, or the best that there are")
+        Stamping, msgspec.Meta(description="source of time stamps: the controller, the kernel, or the best available")
     ] = "auto"
     bitrate_switch: Annotated[
         Literal["on", "off"], msgspec.Meta(description="send the payload of CAN FD frames at the data bit rate")
     ] = "on"
     filter: Annotated[
         Literal["on", "off"],
-        msgspec.Meta(description="let the kernel leave out frames that the driver does not know; nobody counts them"),
+        msgspec.Meta(description="let the kernel drop frames that the driver does not know; they are not counted"),
     ] = "off"
 
 

@@ -1,4 +1,4 @@
-"""``skin-config``: set up what hangs on a bus, through its running driver or without one."""
+"""``skin-config``: set up what is attached to a bus, through its running driver or without one."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class Declined(SkinwareError):
     context_settings=CONTEXT_SETTINGS,
     no_args_is_help=True,
     epilog=examples(
-        "skin-config can0                        what can be done on can0",
-        "skin-config can0 versions               who is there, with which firmware",
-        "skin-config torso rebaseline            of a running driver's boards",
-        "skin-config torso rate hz=50 --yes      without asking back",
+        "skin-config can0                        list the operations for can0",
+        "skin-config can0 versions               boards and their firmware",
+        "skin-config torso rebaseline            for the boards of a running driver",
+        "skin-config torso rate hz=50 --yes      without confirmation",
         "skin-config can0 set_address address=9 patch='board 7'",
     ),
 )
@@ -54,13 +54,13 @@ class Declined(SkinwareError):
     "--driver",
     "driver_name",
     metavar="DRIVER",
-    help="Name or file of the driver, where none runs on the bus.  [default: roboskin]",
+    help="Name or file of the driver, if none runs on the bus.  [default: roboskin]",
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file of that driver.")
 @click.option("-T", "timeout_s", type=seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
-@click.option("--yes", is_flag=True, help="Do not ask before something is changed.")
-@click.option("--force", is_flag=True, help="Change things also on a bus on which somebody sends.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
+@click.option("--force", is_flag=True, help="Make changes even if something is sending on the bus.")
 @namespace_option
 @json_option
 @version_option
@@ -77,12 +77,12 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Carry out an OPERATION on boards: of the running driver NAME, or on a BUS.
+    """Carry out an OPERATION on the boards of the running driver NAME, or of a BUS.
 
-    A bus that a running driver has is set up through that driver, so that nobody sends behind its back. On any other
-    bus it is done directly, if nothing is sending there. Without OPERATION: what there is to choose from.
+    If a running driver uses the BUS, the operation goes through that driver. Otherwise it is done directly, if nothing
+    is sending on the BUS. Without OPERATION: list the operations.
 
-    Values are JSON (hz=50, on=false) or plain text. patch=NAME means only that patch.
+    Values are JSON (hz=50, on=false) or plain text. patch=NAME selects one patch.
 
     Exit status: 0 done, 1 failed or declined, 2 wrong usage or a bus in use, 3 bus not available.
     """
@@ -219,7 +219,9 @@ def _ask_back(what: str, description: str, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise ConfigurationError(f"{what}: this changes something, and there is no terminal to ask at; say --yes")
+        raise ConfigurationError(
+            f"{what}: this makes changes, and there is no terminal to ask for confirmation; add --yes"
+        )
     click.echo(f"{what}\n  {description}", err=True)
     if not click.confirm("Go on?", err=True):
         raise Declined("nothing was changed")

@@ -92,7 +92,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --listen-only       send nothing",
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
-        "skin-driver --bus can0 --driver ./my.py    a driver of yours, in this file",
+        "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
     ),
 )
 @click.option(
@@ -100,49 +100,52 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "buses",
     multiple=True,
     metavar="BUS",
-    help="Where the skin hangs: can0, /dev/ttyUSB0, virtual ...; once for each bus.",
+    help="Bus that the skin is attached to: can0, /dev/ttyUSB0, virtual ...; repeat it for several.",
 )
 @click.option(
     "--driver",
     "driver_name",
     metavar="DRIVER",
-    help="What hangs there: roboskin, xela, anyskin ..., or the file of a driver of yours.  [default: roboskin]",
+    help="Driver of the hardware: roboskin, xela, anyskin ..., or the file of your own.  [default: roboskin]",
 )
-@click.option("--name", metavar="NAME", help="Name of the skin for its users.  [default: the driver's name]")
+@click.option("--name", metavar="NAME", help="Name of the skin for programs.  [default: the driver's name]")
 @click.option(
-    "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file with any of these, also bus by bus."
+    "--config",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="TOML file with any of these options, also for each bus.",
 )
-@click.option("--listen-only", is_flag=True, help="Send nothing; learn what is there from what is heard.")
-@click.option("--wait", is_flag=True, help="Wait for a bus that is not there yet, also if there is no other.")
+@click.option("--listen-only", is_flag=True, help="Send nothing; learn from the frames which devices there are.")
+@click.option("--wait", is_flag=True, help="If no bus is available yet, wait for one.")
 @click.option(
     "--publish",
     type=click.Choice(["cycle", "rate", "request"]),
-    help="When every patch has delivered, at the driver's rate, or what programs ask for.  [default: as the driver]",
+    help="When every patch has delivered, at the driver's rate, or on request.  [default: as the driver]",
 )
 @click.option(
     "--slots",
     type=click.IntRange(2, 64),
     default=8,
     show_default=True,
-    help="Frames that slow users may lag behind, 2-64.",
+    help="Ring size: how many frames slow programs may fall behind, 2-64.",
 )
 @click.option(
     "--latency",
     "latency_ms",
     type=click.FloatRange(0, 1000),
     metavar="MS",
-    help="Longest that frames may wait so that more are taken with them; less costs processor time.  [default: 5]",
+    help="Longest time that frames wait to be taken together; less costs processor time.  [default: 5]",
 )
 @click.option(
     "--geometry",
     "geometry_file",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="TOML file with the places of the sensors, to be published with them.",
+    help="TOML file with the positions of the sensors, which the driver publishes.",
 )
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
-@click.option("--cpus", metavar="LIST", help="CPUs to stay on, as 1,2-3.")
+@click.option("--cpus", metavar="LIST", help="CPUs to run on, such as 1,2-3.")
 @click.option(
     "--unit",
     is_flag=True,
@@ -154,7 +157,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @namespace_option
 @json_option
 @version_option
-@click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+@click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
 def command(
     buses: tuple[str, ...],
     driver_name: str | None,
@@ -176,11 +179,11 @@ def command(
 ) -> None:
     """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
 
-    With several buses it starts with those that are there, and the others join when they appear.
+    With several buses, the driver starts with those that are available; the others join when they appear.
 
-    SIGHUP makes a listener take in what it has heard since it started, and reads the buses of the --config file
-    again: those that were added or taken out come or go, those whose options were changed are opened anew, the others
-    go on. It also comes when the terminal is closed: that ends the driver.
+    On SIGHUP, a listener adds the modules that it has heard since it started, and the buses of the --config file are
+    read again: new buses join, removed ones leave, those with changed options are opened again, the others continue.
+    Closing the terminal also sends SIGHUP; the driver then ends.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
@@ -225,7 +228,7 @@ def command(
             bus = make_bus(bus_name, payload_size=adapter.payload_size, listen_only=listen_only, driver=driver_name)
             if not is_named and not bus.fits(adapter.medium):
                 raise ConfigurationError(
-                    f"{bus.name} is {kind_of_bus(bus.medium)}: say with --driver what hangs there. Without it, that is"
+                    f"{bus.name} is {kind_of_bus(bus.medium)}: give its driver with --driver. Without it, that is"
                     f" {driver_name}, on {kind_of_bus(adapter.medium)}{bus.instead(adapter.medium)}"
                 )
             return bus
@@ -315,7 +318,7 @@ def _end(runner: Runner, context: dict[str, Any]) -> None:
 
 
 def _has_terminal() -> bool:
-    """Whether this process hangs on a terminal, wherever its input and output go."""
+    """Whether this process is attached to a terminal, wherever its input and output go."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:

@@ -84,16 +84,18 @@ def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
 
     if interface in _SERIAL:
         raise ConfigurationError(
-            f"{bus_name}: a serial port has one owner, nobody can listen beside it; what its driver makes of it:"
+            f"{bus_name}: a serial port has one owner, so no other program can listen; to see the data of its driver:"
             " skin-dump NAME"
         )
     owner = None if interface in _SHARED else driver_on(bus_name, running_drivers())
     if owner is not None:
-        raise ConfigurationError(f"{bus_name}: {owner} has it, and nobody can listen beside it: skin-dump {owner.name}")
+        raise ConfigurationError(
+            f"{bus_name}: {owner} uses it, and no other program can listen; use skin-dump {owner.name}"
+        )
 
 
 def _batches(bus: Bus, bus_name: str, timeout_s: float | None) -> Iterator[FrameBatch]:
-    """What arrives, at once and for ever."""
+    """What arrives, at once and indefinitely."""
     from skinware.errors import BusError
     from skinware_drivers.bus import FrameBatch
 
@@ -130,7 +132,7 @@ command: click.Command = click.Command(
     params=[
         *frames_command.params,
         click.Option(
-            ["--raw"], metavar="BUS", help="Instead: what is heard on a CAN bus, as candump -L; sends nothing."
+            ["--raw"], metavar="BUS", help="Print the frames of a CAN bus instead, as candump -L; sends nothing."
         ),
     ],
     help=frames_command.help,

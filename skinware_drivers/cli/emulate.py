@@ -44,13 +44,13 @@ class EmulateCommand(HardwareCommand):
         "skin-emulate --driver xela --help                      options of another",
     ),
 )
-@click.option("--bus", "bus_name", metavar="BUS", required=True, help="Bus to live on: vcan0, pty:/tmp/skin ...")
+@click.option("--bus", "bus_name", metavar="BUS", required=True, help="Bus to use: vcan0, pty:/tmp/skin ...")
 @click.option(
     "--driver",
     metavar="DRIVER",
     default=_DEFAULT_DRIVER,
     show_default=True,
-    help="Whose devices: name of a driver, or a file with an emulator.",
+    help="Driver whose devices are emulated, or a file with an emulator.",
 )
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
@@ -64,7 +64,7 @@ def command(
     duration_s: float | None,
     **hardware_options: str | None,
 ) -> None:
-    """Emulate skin patches on a bus, with faults if wanted, until interrupted.
+    """Emulate skin patches on a bus, with faults on request, until interrupted.
 
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
@@ -79,7 +79,8 @@ def command(
 
     if parse_bus_name(bus_name).interface == "virtual":
         raise ConfigurationError(
-            f"--bus {bus_name}: nobody else can open it; give vcan0 or pty:./port, or none: skin-driver --bus virtual"
+            f"--bus {bus_name}: no other program can open it; give vcan0 or pty:./port,"
+            " or none: skin-driver --bus virtual"
         )
     emulator = load_emulator(driver)
     given = {name: text for name, text in hardware_options.items() if text is not None}
@@ -89,7 +90,7 @@ def command(
     if not bus.fits(medium):
         such_as = "vcan0 or can0" if medium == "can" else "pty:./port, or a port that is there"
         raise ConfigurationError(
-            f"--bus {bus_name}: devices of {short_name(driver)} hang on {kind_of_bus(medium)}; give {such_as}"
+            f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"
         )
     log = JsonLinesLog(log_path) if log_path else None
     try:

@@ -156,7 +156,7 @@ class Emulation:
         """Emulate until ``stop``, or for ``duration_s``.
 
         Raises:
-            BusNotAvailable: the bus could not be opened at the start. Later on it is opened again for ever.
+            BusNotAvailable: the bus could not be opened at the start. Later on it is opened again indefinitely.
         """
         self._bus.open()
         self._open = True

@@ -32,22 +32,22 @@ _DETECTION_S = 10.0
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-find                     CAN interfaces, adapters, serial ports",
-        "skin-find can0 --probe        ask who is on can0",
-        "skin-find --udev              names for the serial ports that stay",
+        "skin-find can0 --probe        ask which devices are on can0",
+        "skin-find --udev              fixed names for the serial ports",
         "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
     ),
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
 @click.option("--listen", "listen_s", type=seconds, default="1", show_default=True, help="Listen for SECONDS.")
-@click.option("--probe", is_flag=True, help="Send requests that disturb nobody, to see who answers.")
+@click.option("--probe", is_flag=True, help="Send harmless requests, to see which devices answer.")
 @click.option(
     "--driver",
     "driver_names",
     multiple=True,
     metavar="DRIVER",
-    help="Only this driver (name or file) guesses and asks.",
+    help="Use only this driver (name or file) to recognize and probe devices.",
 )
-@click.option("--force", is_flag=True, help="With --probe: ask also where that may disturb somebody.")
+@click.option("--force", is_flag=True, help="With --probe: also where requests may disturb devices or programs.")
 @click.option("--udev", is_flag=True, help="Print udev rules for the serial devices that are plugged in.")
 @json_option
 @version_option
@@ -60,12 +60,12 @@ def command(
     udev: bool,
     as_json: bool,
 ) -> None:
-    """Show what is plugged in, what is heard on it, and who could use it. Sends nothing unless told to.
+    """Show what is plugged in, its traffic, and which driver could use it. Sends nothing without --probe.
 
-    With BUS, as can0 or /dev/ttyUSB0: only that. Asking (--probe) never sends a discovery where boards are sending,
-    as it would silence some of them; --force does.
+    With BUS, such as can0 or /dev/ttyUSB0: only that. --probe sends no discovery where boards are sending, because this
+    would silence some of them; --force does.
 
-    Exit status: 0 done, 1 failed, 2 wrong usage, 3 a BUS that is not there.
+    Exit status: 0 done, 1 failed, 2 wrong usage, 3 a BUS is not available.
     """
     if force and not probe:
         raise click.UsageError("--force is about --probe: give both")

@@ -28,7 +28,7 @@ _HEADINGS = {
 @click.group("skin-import", context_settings=CONTEXT_SETTINGS)
 @version_option
 def command() -> None:
-    """Make configurations for skin-driver from the files of other systems."""
+    """Create configurations for skin-driver from the files of other systems."""
 
 
 @command.command(
@@ -41,12 +41,18 @@ def command() -> None:
 )
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path, exists=True))
 @click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write files here.")
-@click.option("-f", "--force", is_flag=True, help="Write over files that are there.")
-@click.option("--part", "only", multiple=True, metavar="NAME", help="Only the skin device of this name; several.")
-@click.option("--bus", "buses", multiple=True, metavar="PATCH=NAME", help="Bus that a patch is wired to, as 1=can0.")
-@click.option("--positions", multiple=True, metavar="PART=FILE", help="Position file of a body part, where unclear.")
+@click.option("-f", "--force", is_flag=True, help="Overwrite existing files.")
+@click.option(
+    "--part", "only", multiple=True, metavar="NAME", help="Only the skin device with this name; repeat it for several."
+)
+@click.option(
+    "--bus", "buses", multiple=True, metavar="PATCH=NAME", help="Bus that a patch is attached to, such as 1=can0."
+)
+@click.option(
+    "--positions", multiple=True, metavar="PART=FILE", help="Position file of a body part, if it is not clear."
+)
 @json_option
-@click.option("-v", "--verbose", is_flag=True, help="Also list the remarks that ask for nothing.")
+@click.option("-v", "--verbose", is_flag=True, help="Also list remarks that need no action.")
 def icub(
     paths: tuple[Path, ...],
     output: Path | None,
@@ -59,7 +65,7 @@ def icub(
 ) -> None:
     """Read the skin of an iCub: XML of robots-configuration, positions and drawings of skinGui, or folders of them.
 
-    Configurations go to stdout, or to DIR with a geometry file each. Whatever is not understood is named on stderr.
+    Configurations go to stdout, or to DIR with one geometry file each. Anything not understood is reported on stderr.
     """
     from skinware_drivers.icub.importer import import_files
     from skinware_drivers.icub.notes import Notes

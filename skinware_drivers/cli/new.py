@@ -22,9 +22,9 @@ _HOW_TO_RUN = {
     "skin-new",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-new fingertip --transport can     a driver of a device on a CAN bus",
-        "skin-new forearm --transport serial    of one on a serial line",
-        "skin-new dummy --transport virtual     of values that a program makes",
+        "skin-new fingertip --transport can     a driver for a device on a CAN bus",
+        "skin-new forearm --transport serial    for a device on a serial line",
+        "skin-new dummy --transport virtual     for values that a program computes",
     ),
 )
 @click.argument("name")
@@ -32,15 +32,15 @@ _HOW_TO_RUN = {
     "--transport",
     type=click.Choice(["can", "serial", "virtual"]),
     required=True,
-    help="What carries the data: a CAN bus, a serial line, or the program itself.",
+    help="Where the data comes from: a CAN bus, a serial line, or the program itself.",
 )
 @version_option
 def command(name: str, transport: str) -> None:
-    """Make a driver package in the new folder NAME: driver, emulated hardware, tests, and how to install them.
+    """Create a driver package in the new folder NAME: driver, emulated hardware, tests and instructions.
 
-    It works as it is, for a small device that does not exist: put yours in its place, piece by piece.
+    It works as it is, for a small imaginary device: replace this device by yours, step by step.
 
-    To try something out no package is needed: skin-driver --driver ./my_skin.py takes a driver in a file.
+    For a first test you need no package: skin-driver --driver ./my_skin.py runs a driver in a file.
     """
     from skinware_drivers.new_package import check_name, make_package
 

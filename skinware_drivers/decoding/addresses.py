@@ -30,7 +30,7 @@ class Addresses:
     Args:
         frames: all kinds of frame.
         kinds_of_bus: for each bus, the numbers of those that it carries.
-        tables: what hangs on the buses.
+        tables: what is attached to the buses.
 
     Attributes:
         entry: (n_slots,) int64: 0 to n_modules - 1: a module; then n_patches entries for "some module of this patch";

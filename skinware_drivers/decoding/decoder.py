@@ -49,7 +49,7 @@ class Decoder:
 
     Args:
         layouts: what frames mean, for each bus; None for a bus of which that is not known yet.
-        tables: what hangs on the buses.
+        tables: what is attached to the buses.
         periods_s: nominal time from one cycle to the next, for each bus: without it, cycles that have no counter are
             joined whenever they come (as those of fixed bytes in a test).
 
@@ -343,7 +343,7 @@ class Decoder:
             haste[patch] = _NEVER_AGAIN
             log.warning(
                 "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
-                " apart and are not shown; give the driver the right period (period_ms, period_s); told once",
+                " apart and are not shown; give the driver the right period (period_ms, period_s); logged once",
                 self.tables.structure.patch_name[patch].decode(),
             )
 

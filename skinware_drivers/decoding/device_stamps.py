@@ -73,7 +73,7 @@ class DeviceStamps:
         self._warned.add(patch)
         structure = self._structure
         log.warning(
-            "%s: the clock of %s stands still, or goes far too slowly: its samples have the times of their receipt;"
+            "%s: the clock of %s stands still, or is far too slow: its samples have the times of their receipt;"
             " told once",
             structure.buses[structure.patch_bus[patch]],
             structure.patch_name[patch].decode(),

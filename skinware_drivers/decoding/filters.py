@@ -1,8 +1,8 @@
 """Which identifiers a driver wants to hear at all, for a kernel that can leave out the others.
 
-Compiled from the layout alone, not from what hangs on the bus: a patch that joins later has identifiers of the layout,
-too. What handshakes wait for is added by the link for as long as they wait (:class:`skinware_drivers.link.Link`), so no
-filter can hide an answer, whatever a driver asks.
+Compiled from the layout alone, not from what is attached to the bus: a patch that joins later has identifiers of the
+layout, too. What handshakes wait for is added by the link for as long as they wait
+(:class:`skinware_drivers.link.Link`), so no filter can hide an answer, whatever a driver asks.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class FrameKind:
                 self._told = True
                 log.error(
                     "frame %r: its Expand function raised %s: %s (%s:%d); frames for which it does are not shown, and"
-                    " counted as bad content; told once",
+                    " counted as bad content; logged once",
                     self.frame.name,
                     type(error).__name__,
                     str(error),  # whoever keeps the record does not keep what the traceback refers to

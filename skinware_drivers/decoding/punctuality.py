@@ -26,6 +26,8 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 _NEVER_NS = -(1 << 62)
+_MARGIN = 8
+"""Of the time by which a frame may be early or late, this part is left for what lies between two frames of a cycle."""
 
 
 class Judgement(NamedTuple):
@@ -57,8 +59,9 @@ class Punctuality:
         self._n = len(cycle.members)
         self._all_as_they_should = cycle.order != "given"
         self._period_ns = round(period_s * NS_PER_S)
-        self._soon_ns = round(cycle.maximum_age_s * NS_PER_S)
         self._reach_ns = round(cycle.reach_s * NS_PER_S)
+        self._margin_ns = (self._period_ns - self._reach_ns) // _MARGIN
+        self._soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self._margin_ns
         self._last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
         self._spacing_ns = np.full(n_modules * self._n, self._period_ns, np.int64)
 
@@ -78,7 +81,7 @@ class Punctuality:
         spacing_ns[before_ns == _NEVER_NS] = self._period_ns
         usual_ns[follows] = spacing_ns[follows - 1]
         soon = spacing_ns <= self._soon_ns
-        late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns
+        late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns - self._margin_ns
         held_up = late
         if not self._all_as_they_should and late.any():
             beside_ns = np.abs((spacing_ns + self._period_ns // 2) % self._period_ns - self._period_ns // 2)

@@ -186,7 +186,7 @@ class _Replay(Link):
         return True
 
     async def send(self, identifier: int, payload: bytes, *, timeout_s: float = 0.0) -> None:  # noqa: ARG002
-        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: this only replays what was heard")
+        raise BusSendError(f"{self.bus_name}: frame {identifier:03X} not sent: this bus only replays a recording")
 
     async def listen(self, duration_s: float) -> Counter[Heard]:
         del duration_s

@@ -98,7 +98,7 @@ async def _describe(adapter: AnyAdapter, link: Link, bus_name: str, *, required:
             raise
         return ()
     if not patches and required:
-        raise HandshakeTimeout(f"{bus_name}: no device of this driver answers; is there power, and the right bit rate?")
+        raise HandshakeTimeout(f"{bus_name}: no device of this driver answers; check power and bit rate")
     return patches
 
 

@@ -19,8 +19,8 @@ from skinware_drivers.running.bus_line import BusLine
 class BusChanges:
     """Changes the buses of a running driver, one change at a time. Users see a new generation after each.
 
-    Buses keep their places for ever, and with them the uids of their sensors: the place of one that was removed stays
-    empty, until a bus of the same name is added.
+    Buses keep their places permanently, and with them the uids of their sensors: the place of one that was removed
+    stays empty, until a bus of the same name is added.
 
     Args:
         lines: the driver's buses, by place.

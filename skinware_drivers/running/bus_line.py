@@ -223,7 +223,7 @@ class BusLine:
             self._news.tell(f"bus {self.name}: in order again (was {reason_text(reason)})")
 
     async def describe(self, described: Callable[[], Awaitable[None]]) -> None:
-        """Ask what hangs on it, for as long as it takes.
+        """Ask what is attached to it, for as long as it takes.
 
         Args:
             described: called after every answer, also after an empty one.
@@ -271,7 +271,7 @@ class BusLine:
                 return
 
     def begin_lost(self, error: BusNotAvailable | None = None) -> None:
-        """Wait for a bus that nobody has opened yet as for one that was lost; nothing hangs on it so far.
+        """Wait for a bus that nobody has opened yet as for one that was lost; nothing is attached to it so far.
 
         Args:
             error: why it could not be opened; None: nobody has tried.

@@ -74,7 +74,7 @@ class Generation:
 
     @property
     def tables(self) -> SkinTables:
-        """What hangs on the buses."""
+        """What is attached to the buses."""
         return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:

@@ -68,7 +68,7 @@ class BusLimits:
         self.load = share_of_time(bus, bits, passed_ns)
         fill, bus.fullest = bus.fullest, 0.0
         if self.load is not None and self.load > HIGH_LOAD:
-            self._tell("load", f"about {self.load:.0%} of its time is in use: what has low priority waits")
+            self._tell("load", f"about {self.load:.0%} of its time is in use: frames with low priority wait")
         if fill > HIGH_FILL:
             self._tell("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little processor time")
         if bus.counters.lost > self._lost:
@@ -94,7 +94,7 @@ class BusLimits:
     def _tell(self, what: str, text: str) -> None:
         if what not in self._told:
             self._told.add(what)
-            log.warning("bus %s: %s; told once, see docs/troubleshooting.md", self._name, text)
+            log.warning("bus %s: %s; logged once, see docs/troubleshooting.md", self._name, text)
 
 
 class MachineLimits:
@@ -129,7 +129,7 @@ class MachineLimits:
         if was_none and self.softnet_dropped:
             log.warning(
                 "this machine dropped %d network packets before any socket saw them, CAN frames perhaps among them;"
-                " more room: sysctl net.core.netdev_max_backlog=10000; told once, see docs/troubleshooting.md",
+                " more room: sysctl net.core.netdev_max_backlog=10000; logged once, see docs/troubleshooting.md",
                 self.softnet_dropped,
             )
 

@@ -137,10 +137,12 @@ class PatchCare:
                 )
                 return False
         if not set_ups.begun:
-            log.warning("%s: %s is silent but answers: it has restarted, or was never set up", line.name, patch.name)
+            log.warning(
+                "%s: %s is silent but answers: it has restarted, or was never configured", line.name, patch.name
+            )
         elif set_ups.begun == 1:
             log.warning(
-                "%s: %s answers and was set up, but sends nothing; tried again, more and more rarely",
+                "%s: %s answers and was configured, but sends nothing; it is configured again with growing pauses",
                 line.name,
                 patch.name,
             )
@@ -160,7 +162,7 @@ class PatchCare:
         return True
 
     async def attend(self, pause_s: Callable[[], float]) -> None:
-        """Hear what devices say of themselves, for ever.
+        """Hear what devices say of themselves, indefinitely.
 
         Args:
             pause_s: what to wait after the bus failed.
@@ -173,7 +175,7 @@ class PatchCare:
                 try:
                     with hook("attend", self._line.name):
                         await adapter.attend(self._line.link)
-                    await asyncio.Event().wait()  # for ever: it may still tell something when it is asked
+                    await asyncio.Event().wait()  # indefinitely: it may still tell something when it is asked
                 except BusError as error:
                     self._tell(str(error))
                 await asyncio.sleep(pause_s())

@@ -1,4 +1,4 @@
-"""Runs a driver: all its buses in one event loop, into one writer buffer, for ever."""
+"""Runs a driver: all its buses in one event loop, into one ring, until it is stopped."""
 
 from __future__ import annotations
 
@@ -230,7 +230,7 @@ class Runner:
     # -- structure ------------------------------------------------------------------------------------------------
 
     async def _build(self) -> None:
-        """(Re)build tables, decoder and writer once every bus has been asked what hangs on it."""
+        """(Re)build tables, decoder and writer once every bus has been asked what is attached to it."""
         async with self._built:
             self._rebuild()
 
@@ -253,7 +253,7 @@ class Runner:
                 tables = tables.placed(self._geometry)
                 _warn_of_foreign(tables.structure)
         except StructureError as error:
-            log.error("what was found makes no skin: %s", str(error))
+            log.error("the devices that were found do not form a valid skin: %s", str(error))
             return
         known = self.generation
         is_known = known is not None and (known.tables.structure, known.decoder.layouts) == (

@@ -113,7 +113,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             BusError: it does not answer, says what cannot be, or must not be asked.
         """
         if link.listen_only:
-            raise BusError("a device says how long its messages are only when it is asked: listening cannot find out")
+            raise BusError("a device reports the length of its messages only on request: listening is not enough")
         if self._patch is not None:
             self.change_framing(type(self).framing)
         await self.stop(link)

@@ -1,7 +1,7 @@
 """Driver of patches that speak the open patch protocol: they say themselves what they are.
 
-The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch hangs on
-each serial line.
+The protocol is docs/protocols/patch-serial.md; how to build such a patch, docs/how-to/openpatch.md. One patch is
+attached to each serial line.
 """
 
 from __future__ import annotations

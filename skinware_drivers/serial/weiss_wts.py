@@ -114,7 +114,7 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
             BusError: it does not answer, says what cannot be, or must not be asked.
         """
         if link.listen_only:
-            raise BusError("a sensor says how many cells it has only when it is asked: listening alone cannot find out")
+            raise BusError("a sensor reports its number of cells only on request: listening is not enough")
         await self.stop(link)
         matrix = await self._ask_matrix(link)
         columns, rows, width, height, full_scale = matrix

@@ -136,7 +136,7 @@ class _PassingTime(selectors.EpollSelector):
         self._clock.turns += 1
         self._turns_now += 1
         if self._turns_now > _TURNS_AT_ONE_MOMENT:
-            defect("the driver is busy for ever at one moment: it loops without a wait (await link.sleep)")
+            defect("the driver loops without end and without a wait (await link.sleep)")
         ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
             return ready
@@ -147,7 +147,7 @@ class _PassingTime(selectors.EpollSelector):
         if not moments:  # only another thread can go on
             self._naps += 1
             if self._naps > _NAPS_WITHOUT_TIMER:
-                defect("the driver waits for ever for something that never comes: give the wait a timeout")
+                defect("the driver waits indefinitely: give the wait a timeout")
             return super().select(_NAP_S)
         self._turns_now = self._naps = 0
         self._clock.pass_to(min(moments))
@@ -271,7 +271,7 @@ def _watch(thread: threading.Thread, clock: HandClock) -> None:
         if asleep > _ASLEEP_LOOKS:
             defect(f"the driver blocks, nothing is read from any bus meanwhile; it hangs here:\n{_where(thread)}")
         if used_s - since_s > _LONGEST_TURN_S:
-            defect(f"the driver is busy for ever, here:\n{_where(thread)}")
+            defect(f"the driver loops without end, here:\n{_where(thread)}")
 
 
 def _look_at(thread: threading.Thread) -> tuple[bool, float]:

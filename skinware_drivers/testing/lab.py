@@ -128,26 +128,29 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
     arguments += ["--exec", f"bash -c {shlex.quote(guest_script(flavour, command, folder))}"]
     environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
     # through a pipe: given a file, QEMU opens it anew and overwrites what is in it
-    process = subprocess.Popen(
-        arguments,
-        start_new_session=True,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
-    relay = threading.Thread(target=copy_output, args=(process,), daemon=True)
-    relay.start()
+    process: subprocess.Popen[bytes] | None = None
     try:
-        return process.wait(timeout_s)
+        process = subprocess.Popen(
+            arguments,
+            start_new_session=True,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        relay = threading.Thread(target=copy_output, args=(process,), daemon=True)
+        relay.start()
+        process.wait(timeout_s)
+        relay.join()
+        return process.returncode
     except subprocess.TimeoutExpired:
         sys.stderr.write(f"CAN lab: the guest was still running after {timeout_s:g} s and was stopped\n")
         return 124
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        relay.join()
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 def copy_output(process: subprocess.Popen[bytes]) -> None:

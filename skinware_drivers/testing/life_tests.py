@@ -199,7 +199,7 @@ class LifeTests(Suite):
         require(not left, f"left behind {when}: {', '.join(left)}: what `start` opens, `stop` must close")
 
     def test_memory_does_not_grow(self) -> None:
-        """Data for ever, in the same memory."""
+        """Data indefinitely, in the same memory."""
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)

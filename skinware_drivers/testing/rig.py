@@ -301,7 +301,7 @@ class Running(Rig):
         if self.truth.bursts:
             Comparison(self).require_no_shift()
         else:
-            defect(f"the devices sent no data {within}: did `start` tell them to? It sent: {self.sent_in_words()}")
+            defect(f"the devices sent no data {within}: does `start` start them? It sent: {self.sent_in_words()}")
         missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
         counters = {name: count for name, count in self.counters().items() if count and name in _NOT_TAKEN}
         never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))
@@ -356,11 +356,9 @@ def is_live(frame: DriverFrame) -> bool:
 
 
 def sensor_name(structure: Structure, sensor: int) -> str:
-    """For people."""
-    patch = bytes(structure.patch_name[structure.sensor_patch[sensor]]).decode()
-    module = int(structure.sensor_module[sensor])
+    """For authors, who know their sensors by uid."""
     type_name = next(t.name for t in structure.types if t.id == structure.sensor_type[sensor])
-    return f"sensor {sensor} ({type_name}, {patch!r}, module {module}, uid {int(structure.sensor_uid[sensor]):#x})"
+    return f"{structure.sensor_name(sensor)} ({type_name}, uid {int(structure.sensor_uid[sensor]):#x})"
 
 
 def play(scenario: Callable[[HandClock], Coroutine[Any, Any, T]]) -> T:

@@ -45,6 +45,7 @@ _WHY = dict(
             "no frame of the layout has this identifier, or it names no patch or module",
             "the layout has no frame of this length",
             "its identifier and length are known, its content is that of no frame of the layout",
+            "it is stamped before this machine booted",
         ),
         strict=True,
     )
@@ -198,9 +199,7 @@ def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[
         try:
             return await adapter.describe(link)
         except BusError as error:
-            return defect(
-                f"`describe` asks its devices, and nobody answers: give emulated ones as `devices=` ({error})"
-            )
+            return defect(f"`describe` asks its devices, and none answers: give emulated ones as `devices=` ({error})")
         finally:
             asyncio.get_running_loop().remove_reader(bus.fileno())
             bus.close()

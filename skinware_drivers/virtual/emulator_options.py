@@ -23,26 +23,26 @@ class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     pattern: Annotated[
         Literal["touch", "idle", "cycle"],
-        Meta(description="what is felt: a wandering press, nothing, or each burst's number in every value"),
+        Meta(description="input: a wandering press, nothing, or each burst's number in every value"),
     ] = "touch"
-    seed: Annotated[Count, Meta(description="another seed, another touch and other random faults")] = 0
+    seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
     streaming: Annotated[bool, Meta(description="send from power-up, as if a host had started the devices")] = False
 
-    lose: Annotated[Probability, Meta(description="probability of each data frame to get lost")] = 0.0
-    repeat: Annotated[Probability, Meta(description="probability of each data frame to come twice")] = 0.0
-    truncate: Annotated[Probability, Meta(description="probability of each data frame to end too early")] = 0.0
-    corrupt: Annotated[Probability, Meta(description="probability of each data frame to hold random bytes")] = 0.0
+    lose: Annotated[Probability, Meta(description="probability that a data frame is lost")] = 0.0
+    repeat: Annotated[Probability, Meta(description="probability that a data frame is sent twice")] = 0.0
+    truncate: Annotated[Probability, Meta(description="probability that a data frame is cut short")] = 0.0
+    corrupt: Annotated[Probability, Meta(description="probability that a data frame contains random bytes")] = 0.0
     jitter_us: Annotated[Count, Meta(description="longest random delay of a burst, in microseconds")] = 0
-    foreign_hz: Annotated[float, Meta(ge=0, le=10_000, description="frames a second from other devices on the bus")] = (
-        0.0
-    )
+    foreign_hz: Annotated[
+        float, Meta(ge=0, le=10_000, description="frames per second from other devices on the bus")
+    ] = 0.0
     dead: Annotated[tuple[int, ...], Meta(description="devices that die, after dead_after_s")] = ()
     dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 2.0
     restart: Annotated[
         tuple[int, ...], Meta(description="devices that lose power for a moment, after restart_after_s")
     ] = ()
     restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
-    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted device hears nothing")] = 0.5
+    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted device ignores commands")] = 0.5
 
     def __post_init__(self) -> None:
         check_options(self)

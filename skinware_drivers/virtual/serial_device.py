@@ -17,7 +17,7 @@ _HEARD = "heard"  # in the memory of a device: the beginning of a command whose 
 class SerialEmulatorOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How often a device sends; an emulator adds what the device is."""
 
-    period_ms: Annotated[float, Meta(ge=0.1, description="time between two bursts, unless it is told another, ms")] = 10
+    period_ms: Annotated[float, Meta(ge=0.1, description="time between two bursts until the host changes it, ms")] = 10
 
 
 OptionsT = TypeVar("OptionsT", bound=SerialEmulatorOptions)
@@ -43,7 +43,7 @@ class SerialEmulator(Emulator[OptionsT]):
 
     def __init__(self, options: OptionsT, **more: Any) -> None:
         if options.foreign_hz:
-            raise ConfigurationError("option foreign_hz: nothing else hangs on a serial line")
+            raise ConfigurationError("option foreign_hz: nothing else is attached to a serial line")
         super().__init__(options, **more)
         self.wire.speed = self.speed_mbit_s
 

@@ -195,7 +195,7 @@ def fingertip_trial() -> tuple[list[list[int]], str]:
 
 
 def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any) -> None:
-    """Fingertips of board 1 send the slices, one per cycle, the last one for ever."""
+    """Fingertips of board 1 send the slices, one per cycle, the last one indefinitely."""
     from skinware_drivers.can.socketcan import SocketCanBus
     from skinware_drivers.cli.emulation import Emulation, JsonReport, SignalWatch
     from skinware_drivers.virtual.roboskin.options import RoboskinOptions

@@ -98,7 +98,7 @@ def test_a_person_is_asked_before_anything_is_changed(capsys: pytest.CaptureFixt
 
 def test_a_script_must_say_yes(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
-    assert "say --yes" in configured(capsys, VIRTUAL, "rebaseline", status=2)
+    assert "add --yes" in configured(capsys, VIRTUAL, "rebaseline", status=2)
     assert "type mtb4" in configured(capsys, VIRTUAL, "versions")
 
 

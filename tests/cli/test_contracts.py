@@ -205,7 +205,7 @@ def test_a_name_in_use_is_refused() -> None:
         driver.wait_for("ready")
         result = run("skin-driver", *VIRTUAL)
         assert result.returncode == 1
-        assert "a living driver or service is called 'roboskin'" in result.stderr
+        assert "a running driver or service is called 'roboskin'" in result.stderr
 
 
 def test_nobody_there_is_said() -> None:

@@ -111,7 +111,7 @@ def test_emulated_from_a_file(write: Write, tmp_path: Path, capsys: pytest.Captu
     arguments = ("--driver", write("strip.py", strip), "--bus", bus, "-T", "0.1")
     assert f"emulating strip on {bus}" in told(capsys, emulate.command, *arguments)
     wrong = told(capsys, emulate.command, "--driver", write("finger.py", FINGER), "--bus", bus, status=2)
-    assert "devices of finger hang on a CAN bus; give vcan0 or can0" in wrong
+    assert "devices of finger are attached to a CAN bus; give vcan0 or can0" in wrong
 
 
 @pytest.mark.usefixtures("only_here")

@@ -163,4 +163,4 @@ def test_an_adapter_that_a_driver_has_is_left_to_it(
     owner = RunningDriver("torso", "default", "roboskin", 1, ("slcan:/dev/ttyACM0?bitrate=1000000",))
     monkeypatch.setattr(running, "running_drivers", lambda: [owner])
     assert exit_status(command, ["--raw", "slcan:/dev/ttyACM0"]) == 2
-    assert "driver 'torso' (namespace default, pid 1) has it" in capsys.readouterr().err
+    assert "driver 'torso' (namespace default, pid 1) uses it" in capsys.readouterr().err

@@ -57,7 +57,7 @@ def test_a_package_says_its_name_wherever_it_must(transport: str, tmp_path: Path
 def test_what_is_there_is_left_alone(make: object, tmp_path: Path) -> None:
     assert callable(make)
     make(tmp_path / "hand")
-    with pytest.raises(ConfigurationError, match=r"hand is there already; nothing was changed"):
+    with pytest.raises(ConfigurationError, match=r"hand already exists; nothing was changed"):
         make_package("hand", "can", tmp_path)
     assert [path.name for path in tmp_path.rglob("*")] == ["hand"]
 
@@ -104,6 +104,6 @@ def test_the_command_tells_what_to_do_next(
     told = capsys.readouterr().out
     assert "\n  pip install -e '.[test]'\n  pytest\n  skin-driver --driver palm --bus virtual\n" in told
     assert exit_status(command, ["palm", "--transport", "can"]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "already exists" in capsys.readouterr().err
     assert exit_status(command, ["palm", "--transport", "usb"]) == 2
     assert exit_status(command, ["Palm", "--transport", "can"]) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from skinware import DriverReader, Namespace, Status
 from skinware.cli import _health, _live, _top_app
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
+from skinware.cli._scale import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
@@ -24,17 +26,22 @@ SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
 
 @asynccontextmanager
 async def shown(
-    size: tuple[int, int] = (80, 24), type_name: str | None = None, duration_s: float | None = None
+    size: tuple[int, int] = (80, 24),
+    type_name: str | None = None,
+    duration_s: float | None = None,
+    scale_name: str = CHANGE,
 ) -> AsyncIterator[tuple[SkinTop, Pilot[None]]]:
-    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS)
+    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS, scale_name=scale_name)
     async with app.run_test(size=size) as pilot:
         await pilot.pause()
         yield app, pilot
 
 
 async def until(pilot: Pilot[None], condition: Callable[[], bool]) -> None:
-    """Let the app run until a condition comes true (pytest's timeout ends a wait in vain)."""
+    """Let the app run until a condition comes true; fails the test if it does not in time."""
+    deadline_s = time.monotonic() + 60
     while not condition():
+        assert time.monotonic() < deadline_s, condition
         await pilot.pause(0.02)
 
 
@@ -309,7 +316,7 @@ def test_nothing_is_drawn_again_that_has_not_changed(monkeypatch: pytest.MonkeyP
         with FakeSkin("a", fake_structure(4, 16)) as skin:
             skin.values = skin.status * 0 + 200
             skin.publish()
-            async with shown() as (app, pilot):
+            async with shown(scale_name=RANGE) as (app, pilot):
                 await until(pilot, lambda: bool(line(app, "marks")))
                 skin.values[0] = 10
                 skin.publish()

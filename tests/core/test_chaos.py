@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("process_server")
 
 
 def victim_driver(name: str, board: Path, row: int, state: str, lines: int, fork_until: Path | None = None) -> None:
-    """Everything that a driver does, for ever, until it is killed in the given state."""
+    """Everything that a driver does, until it is killed in the given state."""
     mine = Board(board).rows[row]
     bomb = Bomb(state, lines)
     with bomb.armed("creating"):

@@ -106,7 +106,7 @@ def test_one_late_driver_is_named_and_can_be_left_out() -> None:
         publish(arm)
         wait_until(lambda: len(skin.refresh().drivers) == 2)
         assert skin.read().fresh("pressure", max_age_s=3).tolist() == [True] * 20 + [False] * 20
-        with pytest.raises(ServiceTimeout, match=r"too old: hung \(5\.\d* s\) \(choose others"):
+        with pytest.raises(ServiceTimeout, match=r"too old: hung \([\d.]+ s\) \(choose others"):
             skin.read(max_age_s=3, timeout_s=0)
         with Skin(drivers=["arm"]) as chosen:
             assert chosen.read(max_age_s=3, timeout_s=10).layout.drivers == ("arm",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
-from skinware.errors import StructureChanged
+from skinware.errors import Overrun, StructureChanged
 from tests.core.services import publish
 from tests.core.workers import seeded
 
@@ -59,7 +59,7 @@ def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequ
                 case _:
                     for _ in range(dice.randrange(1, 20)):
                         publish(writer, published := published + 1)
-            if dice.random() < 0.5 and reader.latest is not None and reader.latest != reader._last:
+            if dice.random() < 0.5 and reader.refresh() not in (None, reader._last):
                 newest = int(reader.read().column("values")[0])
                 taken += 1
                 assert reader.lost == newest - first + 1 - taken
@@ -97,21 +97,25 @@ def test_the_count_begins_again_when_the_namespace_was_removed(namespace: Namesp
     reader.close()
 
 
+def overwritten_while_viewed(reader: ServiceReader[Frame], writer: ServiceWriter) -> None:
+    with reader.view() as frame:
+        for _ in range(3):
+            publish(writer, 2)
+        assert not frame.valid
+
+
 def test_a_view_that_became_invalid_was_not_taken() -> None:
     with ServiceWriter("x", COLUMNS, slots=2) as writer, ServiceReader[Frame]("x") as reader:
         publish(writer, 1)
-        with reader.view() as frame:
-            for _ in range(3):
-                publish(writer, 2)
-            assert not frame.valid
+        with pytest.raises(Overrun):
+            overwritten_while_viewed(reader, writer)
         assert (reader.statistics.frames, reader.lost) == (0, 0)
         with reader.view() as frame:
             assert frame.sequence == 4
         assert (reader.statistics.frames, reader.lost) == (1, 0)
         publish(writer, 3)
-        with reader.view() as frame:
-            for _ in range(3):
-                publish(writer, 4)
+        with pytest.raises(Overrun):
+            overwritten_while_viewed(reader, writer)
         with reader.view() as frame:
             assert frame.sequence == 8
         assert (reader.statistics.frames, reader.lost) == (2, 3)

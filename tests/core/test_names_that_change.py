@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, Frame, Namespace, ServiceReader, ServiceWriter, Skin
+from skinware import skin as skin_module
 from skinware.errors import BadServiceFile, PeerGone, StructureChanged
 from skinware.memory import file_layout
 from tests.cli.fake_skin import BUS_COUNTERS, fake_structure
@@ -94,12 +95,12 @@ def attached(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the services that a skin has attached to."""
     names: list[str] = []
 
-    class Counted(DriverReader):
+    class Counted(skin_module._Reader):
         def __init__(self, name: str, **options: Any) -> None:
             names.append(name)
             super().__init__(name, **options)
 
-    monkeypatch.setattr("skinware.skin.DriverReader", Counted)
+    monkeypatch.setattr(skin_module, "_Reader", Counted)
     return names
 
 

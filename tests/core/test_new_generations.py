@@ -181,7 +181,7 @@ def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(monkeypat
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)
         reader = ServiceReader[Frame]("x")
-        with threads.read(reader, lambda frame: seen.append(frame.sequence)) as worker:
+        with threads.start_reader(reader, lambda frame: seen.append(frame.sequence)) as worker:
             wait_until(lambda: seen == [1])
             assert worker.error is None
             assert reader.statistics.overruns == 3

@@ -32,5 +32,5 @@ def test_a_reader_of_plain_frames_needs_no_annotation(tmp_path: Path) -> None:
         "skinware.service._reader.ServiceReader[skinware.memory.ring.Frame]",
         "skinware.memory.ring.Frame",
         "skinware.memory.ring.Frame",
-        "skinware.driver_service.DriverFrame",
+        "skinware.driver_frame.DriverFrame",
     ]

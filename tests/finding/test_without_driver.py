@@ -105,7 +105,7 @@ class Deaf(VirtualCanBus):
 
 def test_a_board_that_did_not_take_its_address_is_a_failure() -> None:
     deaf = Deaf.with_hardware(emulated(boards=(7,)).hardware)
-    with pytest.raises(HandshakeTimeout, match="board 7 was told to be board 9, but none of that address answers"):
+    with pytest.raises(HandshakeTimeout, match="board 7 got the address 9, but no board answers there"):
         done(deaf, "set_address", address=9)
 
 

@@ -183,8 +183,8 @@ def test_it_lives_on_serial_lines_and_has_its_line_for_itself(
 ) -> None:
     monkeypatch.setattr("skinware_drivers.virtual.hardware.load_emulator", lambda name: EmulatedOpenPatch)
     for more, reason in (
-        (["--bus", "vcan0"], "devices of openpatch hang on a serial line; give pty:"),
-        (["--bus", "pty", "--foreign-hz", "5"], "nothing else hangs on a serial line"),
+        (["--bus", "vcan0"], "devices of openpatch are attached to a serial line; give pty:"),
+        (["--bus", "pty", "--foreign-hz", "5"], "nothing else is attached to a serial line"),
     ):
         assert exit_status(command, ["--driver", "openpatch", *more]) == 2
         assert reason in capsys.readouterr().err

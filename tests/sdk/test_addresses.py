@@ -223,7 +223,7 @@ def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
 
 def test_a_wide_key_of_a_module_is_not_taken_for_one_of_the_next_patch() -> None:
     patch, module = Bits(shift=20, width=8), Bits(shift=0, width=20)
-    frame = Frame("f", (Identifier(0, mask=0, extended=True),), (8,), Values(0, "<u2", 2), patch=patch, module=module)
+    frame = Frame("f", (Identifier(EXTENDED_FLAG, mask=0),), (8,), Values(0, "<u2", 2), patch=patch, module=module)
     decoder = Decoder([Layout([frame])], tables_of(patches(0, 1, modules=(1,))))
     foreign = run(
         decoder, [(0, EXTENDED_FLAG | 0x1_0001, numbers(9, 9)), (0, EXTENDED_FLAG | 1 << 20 | 1, numbers(1, 2))]

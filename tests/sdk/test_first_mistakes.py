@@ -56,7 +56,7 @@ from skinware_drivers.registry import load_driver
         ),
         (
             ["--bus", "./port"],
-            r"\./port is a serial line: say with --driver what hangs there. Without it, that is roboskin",
+            r"\./port is a serial line: give its driver with --driver. Without it, that is roboskin",
         ),
         (["--bus", "./port", "--driver", "xela"], r"\./port is a serial line; XelaDriver needs a CAN bus, as vcan0"),
     ],
@@ -71,7 +71,7 @@ def test_skin_driver_says_what_to_do(
 
 def test_an_emulator_on_a_bus_that_nobody_else_can_open_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(emulate.command, ["--bus", "virtual", "--driver", "xela"]) == 2
-    assert "nobody else can open it; give vcan0 or pty:./port" in capsys.readouterr().err
+    assert "no other program can open it; give vcan0 or pty:./port" in capsys.readouterr().err
 
 
 def test_a_path_may_have_an_equals_sign() -> None:

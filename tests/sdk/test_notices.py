@@ -249,7 +249,7 @@ def test_a_patch_that_changed_is_asked_anew_until_what_it_says_makes_sense(
         stage.say(1, Notice.CHANGED)
         wait_until(lambda: "bus0: nothing joined: no answer" in caplog.text)
         stage.say(1, Notice.CHANGED)
-        wait_until(lambda: "what was found makes no skin: " in caplog.text)
+        wait_until(lambda: "the devices that were found do not form a valid skin: " in caplog.text)
         same = read_until(reader, lambda f: f.patch_state.tolist() == [LIVE, LIVE] and f.sequence > first.sequence + 3)
         assert same.generation == first.generation
         stage.say(2, Notice.SUSPECT)

@@ -91,9 +91,10 @@ def oracle(device: Device, sent: Sequence[Sent]) -> tuple[list[list[int]], int]:
         before = history.get((frame.module, frame.place))
         distance = PERIOD_NS if before is None else frame.time_ns - before[0]
         usual = max(PERIOD_NS, 0 if before is None else before[1])
-        if distance <= device.maximum_age_ns:
+        margin_ns = (PERIOD_NS - reach_ns) // 8
+        if distance <= device.maximum_age_ns + margin_ns:
             soon.add(frame.serial)
-        if distance - usual >= usual - reach_ns:
+        if distance - usual >= usual - reach_ns - margin_ns:
             late.add(frame.serial)
             if min(abs(distance - many * PERIOD_NS) for many in range(100)) >= (PERIOD_NS - reach_ns) / 2:
                 odd.add(frame.serial)

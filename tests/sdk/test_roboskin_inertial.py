@@ -184,7 +184,7 @@ def test_a_listener_hears_inertial_data_too() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"inertial": ("gyroscope", "gyroscope")}, "one is there twice"),
+        ({"inertial": ("gyroscope", "gyroscope")}, "one occurs twice"),
         ({"inertial": ("accelerometer", "external_accelerometer")}, "send one message"),
         ({"inertial": ("accelerometer", "imu_gyroscope")}, "either those of an imu or the others"),
         ({"inertial": ("imu_gyroscope",), "inertial_scale": "mtb3"}, "only an MTB4 has it"),

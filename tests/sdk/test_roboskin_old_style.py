@@ -78,7 +78,7 @@ def test_an_mtb4_set_up_the_old_way_sends_everything_every_40_ms_in_class_4() ->
         assert reader.structure.n_modules == 14 + 16
         frame = read_until(reader, lambda f: not f.status.any())
         assert frame.patch_state.tolist() == [PatchState.LIVE] * 2
-        with pytest.raises(RequestFailed, match="board 8 is an MTB4: set up the old way, it sends every 40 ms"):
+        with pytest.raises(RequestFailed, match="board 8 is an MTB4: configured the old way, it sends every 40 ms"):
             reader.call("rate", hz=10)
 
 
@@ -119,7 +119,7 @@ def test_a_listener_hears_old_boards() -> None:
     [
         ({"period_ms": 210}, "a period of 210 ms, the most is 209"),
         ({"special_boards": (SpecialBoards((7,), period_ms=255),)}, "a period of 255 ms"),
-        ({"skin_type": 8}, "skin type 8 came with the new set-up"),
+        ({"skin_type": 8}, "skin type 8 needs the new commands"),
         ({"modules": (Kind(7, (1,), shift=3),)}, "board 7: the old set-up has no shift"),
     ],
 )

@@ -21,15 +21,30 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
     (f.Signed, VALUES, (), r"the unsigned value as if it were signed — look at the sign of the dtype"),
     (f.Signed, "test_extreme_values", (), r"the unsigned value as if it were signed"),
     (f.OneByteEarly, VALUES, (), r"bytes of two values — look at `offset`|one byte off"),
-    (f.NextTaxel, VALUES, (), r"sensor 0 .*shows what sensor 5(?s:.*)sensor 1 .*what sensor 0 .*off by -1"),
+    (
+        f.NextTaxel,
+        VALUES,
+        (),
+        r"taxel 0 .*shows what finger 1, taxel 5(?s:.*)taxel 1 .*what finger 1, taxel 0 .*off by -1",
+    ),
     (
         f.WrongPermutation,
         VALUES,
         (),
-        r"4 of 12 sensors(?s:.*)sensor 0 .*shows what sensor 2 .*look at `offset` and `to`",
+        r"4 of 12 sensors(?s:.*)finger 1, taxel 0 .*shows what finger 1, taxel 2 .*look at `offset` and `to`",
     ),
-    (f.TwoOnOne, VALUES, (), r"2 of 12 declared sensors: was never seen: sensor 2 .*two channels `to` one"),
-    (f.ForgottenFrame, VALUES, (), r"6 of 12 declared sensors: was never seen: sensor 3 .*a frame.*missing"),
+    (
+        f.TwoOnOne,
+        VALUES,
+        (),
+        r"2 of 12 declared sensors: was never seen: finger 1, taxel 2 (?s:.*)two channels `to` one",
+    ),
+    (
+        f.ForgottenFrame,
+        VALUES,
+        (),
+        r"6 of 12 declared sensors: was never seen: finger 1, taxel 3 (?s:.*)a frame.*missing",
+    ),
     (f.HalvesApart, VALUES, (), r"bursts before the rest of its module|not of the same burst"),
     (
         f.TakesForeignFrames,
@@ -118,7 +133,7 @@ def test_a_driver_that_computes_without_end_is_found_by_its_processor_time(monke
     monkeypatch.setattr(clock, "_LONGEST_TURN_S", 0.5)
     suite = TestFingertips()
     suite.driver = f.Computes  # type: ignore[misc]
-    with pytest.raises(pytest.fail.Exception, match=r"busy for ever, here:(?s:.*)fingertips.py(?s:.*)enough"):
+    with pytest.raises(pytest.fail.Exception, match=r"loops without end, here:(?s:.*)fingertips.py(?s:.*)enough"):
         getattr(suite, VALUES)()
     f.Computes.enough.set()
 

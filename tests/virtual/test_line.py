@@ -117,5 +117,5 @@ def test_commands_come_in_pieces_behind_garbage() -> None:
 
 
 def test_nothing_else_hangs_on_a_serial_line() -> None:
-    with pytest.raises(ConfigurationError, match="nothing else hangs on a serial line"):
+    with pytest.raises(ConfigurationError, match="nothing else is attached to a serial line"):
         Strip(SerialEmulatorOptions(foreign_hz=1.0))

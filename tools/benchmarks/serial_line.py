@@ -219,7 +219,7 @@ def line(write: Callable[[int], None]) -> Iterator[str]:
 
 
 def flat_out(stream: bytes) -> Callable[[int], None]:
-    """Write as fast as it goes, for ever."""
+    """Write as fast as it goes, indefinitely."""
 
     def write(fd: int) -> None:
         while True:

@@ -69,7 +69,7 @@ class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknow
 
     modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
     period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
-    serial_number: Annotated[str, Meta(max_length=16, description="by which the patch is known")] = "1"
+    serial_number: Annotated[str, Meta(max_length=16, description="name of the patch")] = "1"
 
 
 class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):

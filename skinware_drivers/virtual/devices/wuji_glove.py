@@ -32,9 +32,9 @@ class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknow
     """What the board is."""
 
     hand: Literal["left", "right"] = "left"
-    period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two frames, unless told another, ms")] = (
-        1e3 / 120
-    )
+    period_ms: Annotated[
+        float, Meta(ge=1, le=1000, description="time between two frames until the host changes it, ms")
+    ] = 1e3 / 120
     invalid: Annotated[tuple[int, ...], Meta(description="cells that send NaN")] = ()
 
 

@@ -26,14 +26,12 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """
 
     boards: Annotated[tuple[int, ...], Meta(description="CAN addresses of the boards, 1-14")] = (7, 8, 9, 10)
-    mtb3: Annotated[
-        tuple[int, ...], Meta(description="which of the boards are of the older kind MTB3; the others are MTB4")
-    ] = ()
+    mtb3: Annotated[tuple[int, ...], Meta(description="boards of the older kind MTB3; the others are MTB4")] = ()
     pattern: Annotated[
         Literal["touch", "idle", "cycle"],
-        Meta(description="what is felt: a wandering press, nothing, or each burst's number modulo 256"),
+        Meta(description="input: a wandering press, nothing, or each burst's number modulo 256"),
     ] = "touch"
-    seed: Annotated[Count, Meta(description="another seed, another touch and other random faults")] = 0
+    seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
     streaming: Annotated[
         bool, Meta(description="stream from power-up, as if a host had configured the boards already")
     ] = False
@@ -45,30 +43,28 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(ge=0, le=7, description="message class of the second frame; 6 in the firmware variant for TLR"),
     ] = 4
 
-    lose: Annotated[Probability, Meta(description="probability of each data frame to get lost")] = 0.0
-    wrong_length: Annotated[
-        Probability, Meta(description="probability of each data frame to have a wrong number of bytes")
-    ] = 0.0
+    lose: Annotated[Probability, Meta(description="probability that a data frame is lost")] = 0.0
+    wrong_length: Annotated[Probability, Meta(description="probability that a data frame has a wrong length")] = 0.0
     jitter_us: Annotated[Count, Meta(description="longest random delay of a burst, in microseconds")] = 0
-    foreign_hz: Annotated[float, Meta(ge=0, le=10_000, description="frames a second from other devices on the bus")] = (
-        0.0
-    )
+    foreign_hz: Annotated[
+        float, Meta(ge=0, le=10_000, description="frames per second from other devices on the bus")
+    ] = 0.0
     dead: Annotated[tuple[int, ...], Meta(description="boards that die, after dead_after_s or dead_after_cycles")] = ()
     dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 0.0
     dead_after_cycles: Annotated[
-        Count | None, Meta(description="bursts that they still send, instead of dead_after_s")
+        Count | None, Meta(description="bursts before their death, instead of dead_after_s")
     ] = None
     restart: Annotated[
         tuple[int, ...], Meta(description="boards that lose power for a moment, after restart_after_s")
     ] = ()
     restart_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the restart")] = 2.0
-    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted board hears nothing")] = 0.5
+    boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted board ignores commands")] = 0.5
     not_connected: Annotated[
         tuple[str, ...], Meta(description="triangles that were never plugged in, as BOARD/TRIANGLE")
     ] = ()
     unplugged: Annotated[tuple[str, ...], Meta(description="triangles that get unplugged, as BOARD/TRIANGLE")] = ()
     unplugged_after_cycles: Annotated[Count, Meta(description="bursts of the board before that")] = 20
-    no_ack: Annotated[tuple[str, ...], Meta(description="triangles that stop to acknowledge, as BOARD/TRIANGLE")] = ()
+    no_ack: Annotated[tuple[str, ...], Meta(description="triangles that stop acknowledging, as BOARD/TRIANGLE")] = ()
     no_ack_after_cycles: Annotated[Count, Meta(description="bursts of the board before that")] = 20
     out_of_range: Annotated[
         tuple[str, ...], Meta(description="broken taxels, far out of range, as BOARD/TRIANGLE/TAXEL")

@@ -122,7 +122,8 @@ class Expand:
     ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
     the row of ``payload``, the channel, and the value.
 
-    It gets what comes over the wire, garbage too. A frame for which it raises is counted as bad content and not shown.
+    It gets what comes over the wire, garbage too. A frame for which it raises, or returns a value that the dtype cannot
+    hold, is counted as bad content and not shown.
     """
 
     function: Callable[

@@ -31,6 +31,7 @@ class FrameKind:
     def __init__(self, frame: Frame, tables: SkinTables) -> None:
         self.frame = frame
         self._told = False
+        self._dtype = tables.structure.dtype
         n_channels = tables.channel_to_sensor.shape[1]
         self._n_modules = tables.structure.n_modules
         self.module_by_byte: Indices | None = None
@@ -78,7 +79,7 @@ class FrameKind:
         """
         try:
             values, found = self._expand(expand, payload, length)
-        except Exception as error:  # noqa: BLE001 - whatever it stumbles over
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever it stumbles over
             if not self._told:
                 self._told = True
                 log.error(
@@ -97,7 +98,7 @@ class FrameKind:
         for row in range(len(payload)):
             try:
                 each[row] = self._expand(expand, payload[row : row + 1], length[row : row + 1])
-            except Exception:  # noqa: BLE001
+            except (Exception, SystemExit):  # noqa: BLE001
                 failed.append(row)
         return np.concatenate([v for v, _ in each]), np.concatenate([f for _, f in each]), np.array(failed, np.int64)
 
@@ -106,9 +107,13 @@ class FrameKind:
         if not len(row) == len(channel) == len(value) or value.dtype.kind not in "biuf":
             raise ValueError(f"it returned {len(row)} rows, {len(channel)} channels, {len(value)} {value.dtype} values")
         inside = (channel >= 0) & (channel < len(self.channels))
-        row, channel = row[inside], channel[inside]
-        values = np.zeros((len(payload), len(self.channels)), value.dtype)
-        values[row, channel] = value[inside]
+        row, channel, value = row[inside], channel[inside], value[inside]
+        with np.errstate(invalid="ignore"):
+            held = value.astype(self._dtype)
+        if self._dtype.kind in "iu" and (held != value).any():
+            raise ValueError(f"it returned {value[held != value][0]}: the driver's dtype {self._dtype} cannot hold it")
+        values = np.zeros((len(payload), len(self.channels)), self._dtype)
+        values[row, channel] = held
         found = np.zeros(values.shape, bool)
         found[row, channel] = True
         return values, found

@@ -198,11 +198,11 @@ class PatchCare:
             return
         if notice is Notice.SUSPECT:
             line.suspects.add(patch.key)
-            with hook("watch", line.name):
+            with hook("Watch.suspect", line.name):
                 generation.watch.suspect(number)
         elif notice is Notice.SOUND:
             line.suspects.discard(patch.key)
-            with hook("watch", line.name):
+            with hook("Watch.forget", line.name):
                 generation.watch.forget(number)
         elif notice is Notice.LOST or self._listen_only:
             generation.publisher.lose(number, PatchState.STALE)
@@ -235,7 +235,7 @@ class PatchCare:
                 generation.publisher.lose(number, PatchState.STALE)
             else:
                 line.suspects.discard(patch.key)
-                with hook("watch", line.name):
+                with hook("Watch.forget", line.name):
                     generation.watch.forget(number)
 
     async def _set_up(self, patch: Patch) -> None:

@@ -29,7 +29,7 @@ from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
-from skinware_drivers.running.guard import end_of_driver, failure
+from skinware_drivers.running.guard import end_of_driver, failure, hook
 from skinware_drivers.running.intake import DEFAULT_LATENCY_S, Intake
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
@@ -312,7 +312,8 @@ class Runner:
         elif set_up:
             for number in (generation.number_of(line, patch) for patch in patches):
                 if number is not None:
-                    generation.watch.forget(number)
+                    with hook("Watch.forget", line.name):
+                        generation.watch.forget(number)
 
     # -- data -----------------------------------------------------------------------------------------------------
 

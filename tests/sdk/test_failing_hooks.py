@@ -231,6 +231,22 @@ def test_a_watch_that_fails_ends_the_driver(when: str) -> None:
         pass
 
 
+def test_a_watch_that_fails_after_an_operation_is_named() -> None:
+    class Unforgiving(Watch):
+        def forget(self, patch: int) -> None:
+            raise KeyError("oops")
+
+    class Watched(RoboskinDriver):
+        @classmethod
+        def watch(cls, tables: SkinTables) -> Watch:
+            return Unforgiving(tables)
+
+    words = "^bus bus0: `Watch.forget` failed: KeyError: 'oops'"
+    with fails(words, driving(emulated(boards=(7,)), driver=Watched)), DriverReader("roboskin") as reader:
+        with contextlib.suppress(PeerGone, RequestFailed):
+            reader.call("rebaseline")
+
+
 @pytest.mark.parametrize(
     ("where", "error"),
     [("a take", KeyError), ("a take", SystemExit), ("a publication", KeyError), ("requests", KeyError)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -322,8 +323,11 @@ def test_half_a_cycle_that_cannot_be_expanded_shows_nothing() -> None:
         lambda payload, length: (np.array([9]), np.array([0]), np.array([1])),
         lambda payload, length: (np.array([0]), np.array([0]), np.array(["one"])),
         lambda payload, length: None,
+        lambda payload, length: (np.array([0]), np.array([0]), np.array([256])),
+        lambda payload, length: (np.array([0]), np.array([0]), np.array([0.5])),
+        lambda payload, length: sys.exit(7),
     ],
-    ids=["unequal", "no such row", "no number", "nothing"],
+    ids=["unequal", "no such row", "no number", "nothing", "wider than the dtype", "a fraction", "the end"],
 )
 def test_what_an_expand_must_not_return_is_counted(wrong: Any, caplog: pytest.LogCaptureFixture) -> None:
     decoder = decode(one(Expand(wrong)), [Module(taxels(1))], "u1", [(0x100, bytes(8))])

@@ -202,6 +202,7 @@ class Cycle:
             than a period (``any``: half a period), or so many periods as the counter has values.
         counter: the number that all frames of a cycle share, and that is another in the next: of the module's cycles,
             or of the patch's. One field that all members have, or one for each.
+        period_s: nominal time from one cycle to the next, of the modules that are the fastest; default: the driver's.
     """
 
     members: Sequence[str]
@@ -209,6 +210,7 @@ class Cycle:
     within: Literal["patch", "module"] = "module"
     order: Literal["given", "any", "ends_with"] = "given"
     counter: SequenceNumber | Sequence[SequenceNumber] | None = None
+    period_s: float | None = None
 
     @property
     def counters(self) -> Sequence[SequenceNumber]:

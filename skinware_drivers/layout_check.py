@@ -28,7 +28,7 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
         ConfigurationError: it does not fit; the message says what to do.
     """
     if layout.cycle is not None:
-        _check_age(layout.cycle, period_s)
+        _check_age(layout.cycle, layout.cycle.period_s or period_s)
         _check_members([frame for frame in layout.frames if frame.name in layout.cycle.members])
     n_channels = [len(module.channels) for patch in patches for module in patch.modules]
     names = [patch.name for patch in patches for _ in patch.modules]

@@ -88,7 +88,7 @@ def make_layout(options: RoboskinOptions, shortest_period_s: float) -> Layout:
             Flag(Status.NOT_CONNECTED, offset=6, dtype=">u2", mask=0x2),
         ),
     )
-    pair = Cycle(("head", "tail"), within="patch", maximum_age_s=shortest_period_s / 2)
+    pair = Cycle(("head", "tail"), shortest_period_s / 2, within="patch", period_s=shortest_period_s)
     return Layout(frames=(head, tail, *_inertial_frames(options)), cycle=pair)
 
 

@@ -67,7 +67,7 @@ class CompiledCycle:
         self._group_of_entry = groups.astype(np.uint16)
         self._punctuality: Punctuality | None = None
         if period_s is not None and not self._counters:
-            self._punctuality = Punctuality(cycle, period_s, structure.n_modules)
+            self._punctuality = Punctuality(cycle, cycle.period_s or period_s, structure.n_modules)
         self._pairing = Pairing(cycle, places, self._punctuality)
 
     def find(

@@ -26,7 +26,7 @@ class Pairs:
         rows: (n, members) rows of whole cycles, in the order of the members; or all the same row, of an orphan: a
             frame that will never be part of a cycle. In order of arrival of the last row of each.
         whole: (n,) bool, which of them are whole.
-        late: first rows of cycles that took too long (their rows are orphans too).
+        late: first rows of cycles that took too long, or came out of the device's rhythm (their rows are orphans too).
         waiting: rows that may become a cycle with what comes next, ascending.
         soon: rows that came too soon after those before them to be told from them (orphans too).
     """
@@ -83,16 +83,16 @@ class Pairing:
             judged = self._punctuality.judge(kinds, time_ns[members])
             soon[members], doubtful[members] = judged.soon, judged.doubtful
             out_of_time[members] = judged.soon | judged.held_up
-        starts = self._find_cycles(shared, place, out_of_time, doubtful)
+        starts, untrusted = self._find_cycles(shared, place, out_of_time, doubtful)
         in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._maximum_age_ns
         used = np.zeros(len(order), bool)
-        too_late, starts = starts[~in_time], self._apart(starts[in_time])
+        late, starts = np.union1d(starts[~in_time], untrusted), self._apart(starts[in_time])
         windows = starts[:, None] + np.arange(n)
         used[windows] = True
-        too_late = self._apart(too_late[~used[too_late[:, None] + np.arange(n)].any(axis=1)])
         waiting = self._still_hoping(shared, place, group, used)
         is_orphan = is_member & ~used
         is_orphan[waiting] = False
+        late = self._apart(late[is_orphan[late[:, None] + np.arange(n)].all(axis=1)])
         if self._punctuality is not None and judged is not None:
             is_waiting = np.zeros(len(place), bool)
             is_waiting[waiting] = True
@@ -105,17 +105,23 @@ class Pairing:
         orphans = order[is_orphan]
         by_arrival = np.argsort(np.concatenate([last, orphans]), kind="stable")
         rows = np.concatenate([rows, np.repeat(orphans[:, None], n, axis=1)])[by_arrival]
-        return Pairs(rows, by_arrival < len(last), order[too_late], np.sort(order[waiting]), order[soon & is_orphan])
+        return Pairs(rows, by_arrival < len(last), order[late], np.sort(order[waiting]), order[soon & is_orphan])
 
-    def _find_cycles(self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags) -> Indices:
-        """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap."""
+    def _find_cycles(
+        self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags
+    ) -> tuple[Indices, Indices]:
+        """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap.
+
+        Returns:
+            Those that can be trusted; and those whose frames came out of time.
+        """
         n = self._n
         m = max(0, len(shared) - n + 1)
-        whole, all_doubtful = np.ones(m, bool), np.ones(m, bool)
+        whole, all_doubtful, some_out = np.ones(m, bool), np.ones(m, bool), np.zeros(m, bool)
         seen = np.zeros(m, np.uint32)
         for j in range(n):
             whole &= shared[j : m + j] == shared[:m]
-            whole &= ~out_of_time[j : m + j]
+            some_out |= out_of_time[j : m + j]
             all_doubtful &= doubtful[j : m + j]
             if self._order == "given":
                 whole &= place[j : m + j] == j
@@ -125,7 +131,8 @@ class Pairing:
             whole &= seen == (1 << n) - 1
         if self._order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
-        return np.flatnonzero(whole & ~all_doubtful)
+        untrusted = some_out | all_doubtful
+        return np.flatnonzero(whole & ~untrusted), np.flatnonzero(whole & untrusted)
 
     def _apart(self, starts: Indices) -> Indices:
         """Of runs that overlap, the first."""

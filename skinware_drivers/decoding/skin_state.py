@@ -16,8 +16,9 @@ BUS_COUNTERS = ("unknown", "bad_length", "bad_content", "before_boot")
 """Per bus: identifiers that are none of ours, wrong payload lengths, known identifiers with unknown content; frames
 stamped before this machine booted."""
 PATCH_COUNTERS = ("updates", "orphans", "late", "sequence_lost", "sequence_repeated", "sequence_back")
-"""Per patch: module updates decoded; frames without their partners; of those, partners that came too late; what
-sequence numbers skipped; how often one came again, and how often they went back (out of order, or a restart)."""
+"""Per patch: module updates decoded; frames without their partners; of those, cycles whose frames came too late, or out
+of the device's rhythm; what sequence numbers skipped; how often one came again, and how often they went back (out of
+order, or a restart)."""
 
 
 @dataclass(slots=True)

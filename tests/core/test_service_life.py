@@ -81,7 +81,7 @@ def test_a_stopped_process_is_alive_but_silent() -> None:
     with lone_writer() as process, ServiceReader[Frame]("x") as reader:
         os.kill(process.pid, signal.SIGSTOP)
         frame = reader.read()
-        with pytest.raises(ServiceTimeout, match="lives, but is silent"):
+        with pytest.raises(ServiceTimeout, match="is running, but is silent"):
             reader.read(newer_than=frame, timeout_s=0.1)
         kill(process)
     ServiceWriter("x", SMALL).close()

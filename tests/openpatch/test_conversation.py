@@ -149,5 +149,5 @@ def test_another_patch_in_its_place_is_not_started() -> None:
 
 def test_listening_alone_is_refused_with_the_reason() -> None:
     link = Link(SerialBus("/dev/ttyNOWHERE", listen_only=True))
-    with pytest.raises(BusError, match="only on request"):
+    with pytest.raises(BusError, match="only when it is asked"):
         asyncio.run(OpenPatchDriver(OpenPatchOptions()).describe(link))

@@ -21,7 +21,7 @@ SAID = wire.Said(modules=[(0, 1), (0, 1)])  # as the header says it: each by its
 
 def vectors() -> list[tuple[str, str]]:
     """(word, rest) of every line."""
-    block = re.search(r"## Vectors.*?```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    block = re.search(r"## Test vectors.*?```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
     assert block
     return [(word, rest.strip()) for word, _, rest in (line.partition(" ") for line in block[1].splitlines())]
 

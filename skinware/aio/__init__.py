@@ -31,7 +31,30 @@ from skinware.snapshot import Snapshot
 _ANSWER_POLL_S = 0.005
 
 
-class Reader(Generic[FrameT]):
+class _Awaited:
+    """What is awaited shares one thread with all others until it is closed."""
+
+    sync: ServiceReader[Any] | skinware.skin.Skin
+
+    def __init__(self) -> None:
+        self._wakeups = wakeups()
+        self._closed = False
+
+    def close(self) -> None:
+        """Close what is awaited. Idempotent."""
+        self.sync.close()
+        if not self._closed:
+            self._closed = True
+            self._wakeups.leave()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class Reader(_Awaited, Generic[FrameT]):
     """A reader of one service, awaited.
 
     Args:
@@ -43,8 +66,7 @@ class Reader(Generic[FrameT]):
 
     def __init__(self, reader: ServiceReader[FrameT]) -> None:
         self.sync: ServiceReader[FrameT] = reader
-        self._wakeups = wakeups()
-        self._closed = False
+        super().__init__()
 
     async def read(
         self,
@@ -103,21 +125,8 @@ class Reader(Generic[FrameT]):
         finally:
             pending.cancel()  # if it was not answered
 
-    def close(self) -> None:
-        """Close the reader. Idempotent."""
-        self.sync.close()
-        if not self._closed:
-            self._closed = True
-            self._wakeups.leave()
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.close()
-
-
-class Skin:
+class Skin(_Awaited):
     """All living drivers as one skin, awaited.
 
     Args:
@@ -129,8 +138,7 @@ class Skin:
 
     def __init__(self, skin: skinware.skin.Skin | None = None) -> None:
         self.sync: skinware.skin.Skin = skinware.skin.Skin() if skin is None else skin
-        self._wakeups = wakeups()
-        self._closed = False
+        super().__init__()
 
     async def read(
         self,
@@ -173,19 +181,6 @@ class Skin:
 
     def _words(self) -> list[WakeWord]:
         return [wake_word_of(self.sync.reader(driver)) for driver in self.sync.layout.drivers]
-
-    def close(self) -> None:
-        """Close the skin. Idempotent."""
-        self.sync.close()
-        if not self._closed:
-            self._closed = True
-            self._wakeups.leave()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.close()
 
 
 def _deadline_ns(timeout_s: float | None) -> int | None:

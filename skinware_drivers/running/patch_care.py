@@ -14,6 +14,7 @@ from skinware.status import PatchState
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.description import Patch
 from skinware_drivers.notice import Notice
+from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import hook
@@ -22,7 +23,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
 _DATA_CHECKS_HZ = 100
-_FIRST_PAUSE_NS, _LONGEST_PAUSE_NS = NS_PER_S, 60 * NS_PER_S
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
 Beside = Callable[[Coroutine[Any, Any, None]], asyncio.Task[None]]
 
@@ -32,7 +33,8 @@ class _SetUps:
 
     def __init__(self) -> None:
         self.begun = 0
-        self._pause_ns = self._not_before_ns = 0
+        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
+        self._not_before_ns = 0
 
     @property
     def are_due(self) -> bool:
@@ -40,12 +42,11 @@ class _SetUps:
 
     def begin(self) -> None:
         self.begun += 1
-        self._pause_ns = min(max(2 * self._pause_ns, _FIRST_PAUSE_NS), _LONGEST_PAUSE_NS)
-        self._not_before_ns = now_ns() + self._pause_ns
+        self._not_before_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
 
     def put_off(self) -> None:
         """The longest pause comes first."""
-        self._not_before_ns = now_ns() + _LONGEST_PAUSE_NS
+        self._not_before_ns = now_ns() + round(_LONGEST_PAUSE_S * NS_PER_S)
 
 
 class PatchCare:

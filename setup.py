@@ -22,7 +22,7 @@ HEADERS = [str(header) for header in Path().glob("skinware*/native/*.h")]
 def native(package: str) -> Extension:
     """What the C sources of a package make: optional, since all that it does is there in Python too."""
     sources = [str(source) for source in sorted(Path(package, "native").glob("*.c"))]
-    return Extension(f"{package}.native.lib{package}_native", sources, depends=HEADERS, optional=True)
+    return Extension(f"{package}.native.lib{package}", sources, depends=HEADERS, optional=True)
 
 
 class SharedLibraries(build_ext):

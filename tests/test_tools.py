@@ -84,15 +84,24 @@ def test_who_may_not_install_is_told_the_line_to_type(fake: Path, user: str, may
 # -- the environment ----------------------------------------------------------------------------------------------
 
 
+INSTALLED = [
+    "pyproject.toml",
+    "setup.py",
+    "skinware/native/ring.c",
+    "skinware/native/ring.h",
+    "skinware/include/skinware.h",
+]
+
+
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """One with a tool, something to compile, and an environment whose Python notes what it is asked for."""
     project = tmp_path / "a project"
-    for folder in (native := project / "skinware/native", project / "tools", project / ".venv/bin"):
-        folder.mkdir(parents=True)
+    for folder in ("skinware/native", "skinware/include", "tools", ".venv/bin"):
+        (project / folder).mkdir(parents=True)
     shutil.copy(TOOLS / "_environment.sh", project / "tools")
-    for file in (project / "pyproject.toml", project / "setup.py", native / "ring.c", native / "ring.h"):
-        file.write_text("as it was")
+    for file in INSTALLED:
+        (project / file).write_text("as it was")
     put(project / ".venv/bin/python", f'echo "$@" >>"{project}/asked"')
     return project
 
@@ -106,7 +115,7 @@ def installs(project: Path, compiler: str = "true") -> bool:
     return "-m pip install" in asked.read_text()
 
 
-@pytest.mark.parametrize("changed", ["pyproject.toml", "setup.py", "skinware/native/ring.c", "skinware/native/ring.h"])
+@pytest.mark.parametrize("changed", INSTALLED)
 def test_what_has_changed_is_installed_again(project: Path, changed: str) -> None:
     assert installs(project)
     assert not installs(project)

@@ -16,8 +16,8 @@ from tests.outside.stranger import Stranger
 from tests.wheel import NO_COMPILER, ROOT, built_wheel, copy_sources, pip_in
 
 LIBRARIES = {
-    "skinware/native/libskinware_native.so",
-    "skinware_drivers/native/libskinware_drivers_native.so",
+    "skinware/native/libskinware.so",
+    "skinware_drivers/native/libskinware_drivers.so",
 }
 SOURCES = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("skinware*/native/*.[ch]")}
 TOLD = "did not compile the native data path: Python runs instead"

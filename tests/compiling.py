@@ -25,8 +25,17 @@ LANGUAGES: dict[str, tuple[str, ...]] = {
 """Compiler and options, by what a test calls them."""
 
 
+def need_compiler(compiler: str) -> None:
+    """Skips the test where a compiler is not there, fails it in CI."""
+    if shutil.which(compiler) is None:
+        message = f"no {compiler} here (Debian and Ubuntu: apt install g++)"
+        if os.environ.get("CI") == "true":
+            pytest.fail(message)
+        pytest.skip(message)
+
+
 def compiled(source: Path, language: str, folder: pytest.TempPathFactory, options: Sequence[str] = ()) -> Path:
-    """The program that a source file makes; skips the test where there is no compiler, fails it in CI.
+    """The program that a source file makes; needs its compiler.
 
     Args:
         source: one source file.
@@ -35,11 +44,7 @@ def compiled(source: Path, language: str, folder: pytest.TempPathFactory, option
         options: more of them.
     """
     compiler, *language_options = LANGUAGES[language]
-    if shutil.which(compiler) is None:
-        message = f"no {compiler} here (Debian and Ubuntu: apt install g++)"
-        if os.environ.get("CI") == "true":
-            pytest.fail(message)
-        pytest.skip(message)
+    need_compiler(compiler)
     command = [compiler, *language_options, *_WARNINGS, *options, f"-I{skinware.get_include()}", str(source)]
     digest = hashlib.sha256("\0".join((*command, source.read_text())).encode()).hexdigest()
 

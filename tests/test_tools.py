@@ -1,14 +1,17 @@
-"""What the tools do to the machine that they run on: packages are installed as root, behind any other apt, or named."""
+"""What the tools do to the machine that they run on: packages are installed as root, behind any other apt, or named;
+the environment is made anew when what is in it has changed."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
-PACKAGES = Path(__file__).parent.parent / "tools/_packages.sh"
+TOOLS = Path(__file__).parent.parent / "tools"
+PACKAGES = TOOLS / "_packages.sh"
 
 
 @pytest.fixture
@@ -76,3 +79,53 @@ def test_who_may_not_install_is_told_the_line_to_type(fake: Path, user: str, may
         "    sudo apt-get update && sudo apt-get install --no-install-recommends one two",
     ]
     assert asked(fake) == []
+
+
+# -- the environment ----------------------------------------------------------------------------------------------
+
+
+INSTALLED = [
+    "pyproject.toml",
+    "setup.py",
+    "skinware/native/ring.c",
+    "skinware/native/ring.h",
+    "skinware/include/skinware.h",
+]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """One with a tool, something to compile, and an environment whose Python notes what it is asked for."""
+    project = tmp_path / "a project"
+    for folder in ("skinware/native", "skinware/include", "tools", ".venv/bin"):
+        (project / folder).mkdir(parents=True)
+    shutil.copy(TOOLS / "_environment.sh", project / "tools")
+    for file in INSTALLED:
+        (project / file).write_text("as it was")
+    put(project / ".venv/bin/python", f'echo "$@" >>"{project}/asked"')
+    return project
+
+
+def installs(project: Path, compiler: str = "true") -> bool:
+    """Whether the environment was installed anew."""
+    asked = project / "asked"
+    asked.unlink(missing_ok=True)
+    prepare = f'source "{project}/tools/_environment.sh"; prepare_environment test'
+    subprocess.run(["bash", "-euc", prepare], env={**os.environ, "CC": compiler}, check=True, capture_output=True)
+    return "-m pip install" in asked.read_text()
+
+
+@pytest.mark.parametrize("changed", INSTALLED)
+def test_what_has_changed_is_installed_again(project: Path, changed: str) -> None:
+    assert installs(project)
+    assert not installs(project)
+    (project / changed).write_text("new")
+    assert installs(project)
+    assert not installs(project)
+
+
+def test_a_compiler_that_comes_later_compiles(project: Path) -> None:
+    assert installs(project, compiler="no-such-compiler")
+    assert not installs(project, compiler="no-such-compiler")
+    assert installs(project, compiler="true")
+    assert not installs(project, compiler="true")

@@ -19,7 +19,8 @@ find_python() {
 
 prepare_environment() {
     local extra=$1 wanted stamp
-    wanted=$(cksum <"$project/pyproject.toml")
+    # what is installed, and with which compiler: one that comes later counts too
+    wanted=$(cat "$project"/{pyproject.toml,setup.py,skinware*/native/*.[ch],skinware/include/*.h} | cksum)$(command -v ${CC:-cc} || true)
     stamp=$venv/installed-$extra
     if [ -x "$venv/bin/python" ] && [ "$(cat "$stamp" 2>/dev/null)" = "$wanted" ] &&
         "$venv/bin/python" -c 'import skinware' 2>/dev/null; then
@@ -37,5 +38,7 @@ prepare_environment() {
     fi
     echo "installing skinware[$extra]" >&2
     "$venv/bin/python" -m pip install --quiet --editable "$project[$extra]"
+    [ -e "$project/skinware_drivers/native/libskinware_drivers.so" ] ||
+        echo "the native data path is not compiled: Python runs instead (Debian and Ubuntu: apt install gcc libc6-dev)" >&2
     echo "$wanted" >"$stamp"
 }

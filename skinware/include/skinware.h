@@ -48,8 +48,8 @@
  * Copyright: the Skinware authors. SPDX-License-Identifier: Apache-2.0
  */
 
-/* Before any system header: openat, O_PATH, syscall. Only where the implementation is. */
-#if defined(SKINWARE_IMPLEMENTATION) && !defined(_GNU_SOURCE)
+/* Before any system header: openat, O_PATH, syscall. Only where the implementation is, or the ring alone. */
+#if (defined(SKINWARE_IMPLEMENTATION) || defined(SKINWARE_RING)) && !defined(_GNU_SOURCE)
 #define _GNU_SOURCE 1
 #endif
 
@@ -353,8 +353,12 @@ const char *skinware_reason(void);
 
 /* ================================================================================================================= */
 
-#if defined(SKINWARE_IMPLEMENTATION) && !defined(SKINWARE_IMPLEMENTED)
-#define SKINWARE_IMPLEMENTED
+/*
+ * The ring: where its words are, and how a slot is read while the writer goes on. Skinware's own native code defines
+ * SKINWARE_RING to share this part; programs have no use for it.
+ */
+#if (defined(SKINWARE_IMPLEMENTATION) || defined(SKINWARE_RING)) && !defined(SKINWARE_RING_INCLUDED)
+#define SKINWARE_RING_INCLUDED
 
 #ifndef __GNUC__
 #error "skinware.h needs the __atomic builtins of GCC or Clang"
@@ -367,15 +371,123 @@ const char *skinware_reason(void);
 #endif
 
 #include <errno.h>
-#include <fcntl.h>
-#include <pwd.h>
-#include <stdlib.h>
 #include <string.h>
-#include <sys/mman.h>
-#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
+
+/* The header of a slot. Every member lies on a multiple of its size: there are no hidden gaps on any processor. */
+typedef struct skinware__slot {
+    uint64_t sequence;
+    int64_t acquired_ns;
+    int64_t published_ns;
+    uint64_t flags;
+    unsigned char reserved[32];
+} skinware__slot;
+
+typedef char skinware__slot_has_64_bytes[sizeof(skinware__slot) == 64 ? 1 : -1];
+
+enum { SKINWARE__LATEST_OFFSET = 512, SKINWARE__WAKE_WORD_OFFSET = 520, SKINWARE__STATE_OFFSET = 524 };
+
+/* A mapped file, and where its slots are. */
+typedef struct skinware__ring {
+    const unsigned char *map;
+    uint64_t slot_offset;
+    uint64_t slot_stride;
+    uint64_t slot_count;
+} skinware__ring;
+
+/* Words of 8 bytes lie on multiples of 8, also where the compiler expects no more than 4. */
+typedef uint64_t skinware__word __attribute__((aligned(8)));
+
+static inline uint64_t skinware__load_64(const unsigned char *at) {
+    return __atomic_load_n((const skinware__word *)(const void *)at, __ATOMIC_ACQUIRE);
+}
+
+static inline uint32_t skinware__load_32(const unsigned char *at) {
+    return __atomic_load_n((const uint32_t *)(const void *)at, __ATOMIC_ACQUIRE);
+}
+
+static inline uint64_t skinware__latest(const skinware__ring *ring) {
+    return skinware__load_64(ring->map + SKINWARE__LATEST_OFFSET);
+}
+
+static inline const unsigned char *skinware__slot_at(const skinware__ring *ring, uint64_t sequence) {
+    return ring->map + ring->slot_offset + (sequence % ring->slot_count) * ring->slot_stride;
+}
+
+/* The second look at a slot's sequence: everything that was read before this call was read before this load. */
+static inline int skinware__still(const unsigned char *slot, uint64_t sequence) {
+    __atomic_thread_fence(__ATOMIC_ACQUIRE);
+    return __atomic_load_n((const skinware__word *)(const void *)slot, __ATOMIC_RELAXED) == sequence;
+}
+
+/*
+ * Copies what the writer may overwrite meanwhile: a race that the sequence decides afterwards, which no checker of
+ * races can know. For it the words are copied one by one, so that it still finds all others.
+ */
+static inline void skinware__copy_bytes(unsigned char *to, const unsigned char *from, uint64_t size) {
+#ifdef __SANITIZE_THREAD__
+    uint64_t i;
+    for (i = 0; i < size; i += 8) { /* strides are multiples of 64 */
+        const uint64_t word = __atomic_load_n((const skinware__word *)(const void *)(from + i), __ATOMIC_RELAXED);
+        memcpy(to + i, &word, 8);
+    }
+#else
+    memcpy(to, from, (size_t)size);
+#endif
+}
+
+/* Copies the slot of a frame, its header first; 1 if the copy is that frame and whole, 0 if it is not in the ring. */
+static inline int skinware__copy(const skinware__ring *ring, uint64_t sequence, unsigned char *to) {
+    const unsigned char *slot = skinware__slot_at(ring, sequence);
+    if (skinware__load_64(slot) != sequence)
+        return 0;
+    skinware__copy_bytes(to, slot, ring->slot_stride);
+    return skinware__still(slot, sequence);
+}
+
+/* Copies the newest frame: its sequence, 0 if nothing was published yet, UINT64_MAX if the writer was always faster. */
+static inline uint64_t skinware__copy_newest(const skinware__ring *ring, unsigned char *to, int attempts) {
+    while (attempts-- > 0) {
+        const uint64_t sequence = skinware__latest(ring);
+        if (sequence == 0 || skinware__copy(ring, sequence, to))
+            return sequence;
+    }
+    return UINT64_MAX;
+}
+
+/* Sleep until the word is woken or differs from expected, or the time is up. 0, or the number of an error. */
+static inline int skinware__sleep(const unsigned char *word, uint32_t expected, int64_t timeout_ns) {
+#ifdef SYS_futex
+    struct {
+        long seconds, nanoseconds; /* the kernel's old timespec, whatever the C library's is */
+    } timeout;
+    const long call = SYS_futex;
+    timeout.seconds = (long)(timeout_ns / 1000000000);
+    timeout.nanoseconds = (long)(timeout_ns % 1000000000);
+#else
+    struct {
+        int64_t seconds, nanoseconds;
+    } timeout;
+    const long call = SYS_futex_time64;
+    timeout.seconds = timeout_ns / 1000000000;
+    timeout.nanoseconds = timeout_ns % 1000000000;
+#endif
+    /* FUTEX_WAIT without FUTEX_PRIVATE_FLAG: the writer is another process */
+    return syscall(call, word, 0, expected, &timeout, NULL, 0) < 0 ? errno : 0;
+}
+
+#endif /* the ring */
+
+#if defined(SKINWARE_IMPLEMENTATION) && !defined(SKINWARE_IMPLEMENTED)
+#define SKINWARE_IMPLEMENTED
+
+#include <fcntl.h>
+#include <pwd.h>
+#include <stdlib.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
 
 #ifndef O_CLOEXEC
 #error "define SKINWARE_IMPLEMENTATION and include skinware.h before any other header, or define _GNU_SOURCE"
@@ -389,7 +501,7 @@ const char *skinware_reason(void);
 #define SKINWARE__FOLDER_FLAGS (O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC)
 #endif
 
-/* Header, column table and slot header, as docs/reference/shared-memory.md has them. Every member lies on a multiple of
+/* Header and column table, as docs/reference/shared-memory.md has them. Every member lies on a multiple of
  * its size, so that these structures have no hidden gaps on any processor. */
 
 typedef struct skinware__header {
@@ -423,18 +535,7 @@ typedef struct skinware__row {
     unsigned char reserved[12];
 } skinware__row;
 
-typedef struct skinware__slot {
-    uint64_t sequence;
-    int64_t acquired_ns;
-    int64_t published_ns;
-    uint64_t flags;
-    unsigned char reserved[32];
-} skinware__slot;
-
 enum {
-    SKINWARE__LATEST_OFFSET = 512,
-    SKINWARE__WAKE_WORD_OFFSET = 520,
-    SKINWARE__STATE_OFFSET = 524,
     SKINWARE__COLUMN_OFFSET = 1152,
     SKINWARE__MAX_COLUMNS = 256,
     SKINWARE__MIN_SLOTS = 2,
@@ -448,7 +549,6 @@ static const int64_t skinware__slice_ns = 50000000;
 
 typedef char skinware__header_has_512_bytes[sizeof(skinware__header) == 512 ? 1 : -1];
 typedef char skinware__row_has_64_bytes[sizeof(skinware__row) == 64 ? 1 : -1];
-typedef char skinware__slot_has_64_bytes[sizeof(skinware__slot) == 64 ? 1 : -1];
 typedef char skinware__files_have_64_bit_offsets[sizeof(off_t) == 8 ? 1 : -1]; /* else: -D_FILE_OFFSET_BITS=64 */
 
 struct skinware_reader {
@@ -457,7 +557,7 @@ struct skinware_reader {
     int fd; /* asks whether the writer's lock is held; takes none */
     dev_t device;
     ino_t inode;
-    const unsigned char *map;
+    skinware__ring ring;
     size_t map_size;
     skinware__header header; /* a private copy: what was checked stays so */
     skinware__row rows[SKINWARE__MAX_COLUMNS];
@@ -478,55 +578,12 @@ static skinware_result skinware__fail(skinware_result result, const char *reason
 
 /* -- shared memory ------------------------------------------------------------------------------------------------ */
 
-/* Words of 8 bytes lie on multiples of 8, also where the compiler expects no more than 4. */
-typedef uint64_t skinware__word __attribute__((aligned(8)));
-
-static uint64_t skinware__load_64(const unsigned char *at) {
-    return __atomic_load_n((const skinware__word *)(const void *)at, __ATOMIC_ACQUIRE);
-}
-
-static uint32_t skinware__load_32(const unsigned char *at) {
-    return __atomic_load_n((const uint32_t *)(const void *)at, __ATOMIC_ACQUIRE);
-}
-
-/* The second look at a slot's sequence: everything that was read before this call was read before this load. */
-static int skinware__still(const unsigned char *slot, uint64_t sequence) {
-    __atomic_thread_fence(__ATOMIC_ACQUIRE);
-    return __atomic_load_n((const skinware__word *)(const void *)slot, __ATOMIC_RELAXED) == sequence;
-}
-
-static const unsigned char *skinware__slot_at(const skinware_reader *reader, uint64_t sequence) {
-    return reader->map + reader->header.slot_offset +
-           (sequence % reader->header.slot_count) * reader->header.slot_stride;
-}
-
 static int skinware__is_locked(int fd) {
     struct flock lock;
     memset(&lock, 0, sizeof lock);
     lock.l_type = F_RDLCK;
     lock.l_whence = SEEK_SET;
     return fcntl(fd, F_OFD_GETLK, &lock) == 0 && lock.l_type == F_WRLCK;
-}
-
-/* Sleep until the word is woken or differs from expected, or the time is up. 0, or the number of an error. */
-static int skinware__sleep(const unsigned char *word, uint32_t expected, int64_t timeout_ns) {
-#ifdef SYS_futex
-    struct {
-        long seconds, nanoseconds; /* the kernel's old timespec, whatever the C library's is */
-    } timeout;
-    const long call = SYS_futex;
-    timeout.seconds = (long)(timeout_ns / 1000000000);
-    timeout.nanoseconds = (long)(timeout_ns % 1000000000);
-#else
-    struct {
-        int64_t seconds, nanoseconds;
-    } timeout;
-    const long call = SYS_futex_time64;
-    timeout.seconds = timeout_ns / 1000000000;
-    timeout.nanoseconds = timeout_ns % 1000000000;
-#endif
-    /* FUTEX_WAIT without FUTEX_PRIVATE_FLAG: the writer is another process */
-    return syscall(call, word, 0, expected, &timeout, NULL, 0) < 0 ? errno : 0;
 }
 
 /* -- checking ----------------------------------------------------------------------------------------------------- */
@@ -667,7 +724,7 @@ static int skinware__is(const skinware_column *column, char kind, uint32_t items
 static const unsigned char *skinware__table(const skinware_reader *reader, const char *name, char kind,
                                             uint32_t itemsize, uint64_t count) {
     const skinware_column *table = skinware_find_table(reader, name);
-    return skinware__is(table, kind, itemsize, count) ? reader->map + table->offset : NULL;
+    return skinware__is(table, kind, itemsize, count) ? reader->ring.map + table->offset : NULL;
 }
 
 static uint64_t skinware__rows(const skinware_reader *reader, const char *name) {
@@ -854,7 +911,10 @@ static skinware_result skinware__open(skinware_reader *reader) {
     map = mmap(NULL, (size_t)reader->header.file_size, PROT_READ, MAP_SHARED, reader->fd, 0);
     if (map == MAP_FAILED)
         return skinware__fail(SKINWARE_NO_MEMORY, "the file cannot be mapped");
-    reader->map = (const unsigned char *)map;
+    reader->ring.map = (const unsigned char *)map;
+    reader->ring.slot_offset = reader->header.slot_offset;
+    reader->ring.slot_stride = reader->header.slot_stride;
+    reader->ring.slot_count = reader->header.slot_count;
     reader->map_size = (size_t)reader->header.file_size;
     reader->device = info.st_dev;
     reader->inode = info.st_ino;
@@ -862,8 +922,8 @@ static skinware_result skinware__open(skinware_reader *reader) {
 }
 
 static void skinware__release(skinware_reader *reader) {
-    if (reader->map != NULL)
-        munmap((void *)(uintptr_t)reader->map, reader->map_size);
+    if (reader->ring.map != NULL)
+        munmap((void *)(uintptr_t)reader->ring.map, reader->map_size);
     if (reader->fd >= 0)
         close(reader->fd);
     free(reader->types);
@@ -940,7 +1000,7 @@ skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *new
     int look_around = 0; /* at the rare things, which cost system calls: after a slice without news, and at the end */
     for (;;) {
         /* the wake word first: whatever is published after it was read ends the sleep */
-        const uint32_t wake_word = skinware__load_32(reader->map + SKINWARE__WAKE_WORD_OFFSET);
+        const uint32_t wake_word = skinware__load_32(reader->ring.map + SKINWARE__WAKE_WORD_OFFSET);
         const uint32_t state = skinware_state(reader);
         const uint64_t latest = skinware_latest(reader);
         int64_t remaining_ns;
@@ -964,7 +1024,7 @@ skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *new
         }
         remaining_ns = deadline_ns == SKINWARE_FOREVER ? skinware__slice_ns : deadline_ns - skinware_now_ns();
         if (remaining_ns > 0) {
-            error = skinware__sleep(reader->map + SKINWARE__WAKE_WORD_OFFSET, wake_word,
+            error = skinware__sleep(reader->ring.map + SKINWARE__WAKE_WORD_OFFSET, wake_word,
                                     remaining_ns < skinware__slice_ns ? remaining_ns : skinware__slice_ns);
             if (error == EINTR)
                 return SKINWARE_INTERRUPTED;
@@ -994,7 +1054,7 @@ static void skinware__fill(const skinware_reader *reader, skinware_frame *frame,
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
     const size_t size = (size_t)reader->header.slot_stride;
     const int alive = skinware_is_alive(reader);
-    int attempt;
+    uint64_t sequence;
     if (skinware_latest(reader) == 0)
         return SKINWARE_EMPTY;
     if (frame->capacity < size) {
@@ -1005,18 +1065,12 @@ skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
         frame->buffer = buffer;
         frame->capacity = size;
     }
-    for (attempt = 0; attempt < SKINWARE__ATTEMPTS; attempt++) {
-        const uint64_t sequence = skinware_latest(reader);
-        const unsigned char *slot = skinware__slot_at(reader, sequence);
-        if (sequence == 0)
-            return SKINWARE_EMPTY;
-        if (skinware__load_64(slot) != sequence)
-            continue;
-        memcpy(frame->buffer, slot, size);
-        if (skinware__still(slot, sequence)) {
-            skinware__fill(reader, frame, frame->buffer, sequence, alive);
-            return SKINWARE_OK;
-        }
+    sequence = skinware__copy_newest(&reader->ring, frame->buffer, SKINWARE__ATTEMPTS);
+    if (sequence == 0)
+        return SKINWARE_EMPTY;
+    if (sequence != UINT64_MAX) {
+        skinware__fill(reader, frame, frame->buffer, sequence, alive);
+        return SKINWARE_OK;
     }
     frame->bytes = NULL; /* half of one frame, half of another */
     frame->generation = frame->sequence = 0;
@@ -1028,7 +1082,7 @@ skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame) {
     int attempt;
     for (attempt = 0; attempt < SKINWARE__ATTEMPTS; attempt++) {
         const uint64_t sequence = skinware_latest(reader);
-        const unsigned char *slot = skinware__slot_at(reader, sequence);
+        const unsigned char *slot = skinware__slot_at(&reader->ring, sequence);
         skinware_frame seen = *frame;
         if (sequence == 0)
             return SKINWARE_EMPTY;
@@ -1083,7 +1137,7 @@ const skinware_column *skinware_find_table(const skinware_reader *reader, const 
 const void *skinware_table_data(const skinware_reader *reader, const skinware_column *table) {
     if (table < reader->columns || table >= reader->columns + reader->header.column_count || table->in_slot)
         return NULL;
-    return reader->map + table->offset;
+    return reader->ring.map + table->offset;
 }
 
 size_t skinware_column_count(const skinware_reader *reader) {
@@ -1213,11 +1267,11 @@ int skinware_is_alive(const skinware_reader *reader) {
 }
 
 uint32_t skinware_state(const skinware_reader *reader) {
-    return skinware__load_32(reader->map + SKINWARE__STATE_OFFSET);
+    return skinware__load_32(reader->ring.map + SKINWARE__STATE_OFFSET);
 }
 
 uint64_t skinware_latest(const skinware_reader *reader) {
-    return skinware__load_64(reader->map + SKINWARE__LATEST_OFFSET);
+    return skinware__latest(&reader->ring);
 }
 
 uint64_t skinware_generation(const skinware_reader *reader) {

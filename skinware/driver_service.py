@@ -86,6 +86,15 @@ class DriverWriter:
         return self._service.sequence
 
     @property
+    def ring_address(self) -> int | None:
+        """Of the ring's ``skinware_ring_writer``, for C code that publishes through it; None where Python does."""
+        return self._service.ring_address
+
+    def column_offsets(self) -> dict[str, int]:
+        """Where each column begins, bytes from the beginning of a slot."""
+        return self._service.column_offsets()
+
+    @property
     def position(self) -> tuple[int, int]:
         """(generation, sequence) of the newest frame."""
         return self._service.position

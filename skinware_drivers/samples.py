@@ -24,12 +24,12 @@ class Samples:
 
     def __init__(self) -> None:
         self.rows: npt.NDArray[np.void] = np.zeros((len(Unused), SAMPLES_OF_A_KIND), SAMPLE).reshape(-1)
-        self._next_ns = [0] * (len(Unused) + 1)
+        self.next_ns = [0] * (len(Unused) + 1)
         self._taken = [0] * (len(Unused) + 1)
 
     def wants(self, why: Unused) -> bool:
         """Whether it is time to look at frames of a kind again."""
-        return now_ns() >= self._next_ns[why]
+        return now_ns() >= self.next_ns[why]
 
     def take(self, why: Unused, wire: npt.NDArray[Any]) -> None:
         """Keep one of these frames, if it is time to, and one has an identifier that was not kept yet.
@@ -40,7 +40,7 @@ class Samples:
         """
         if not len(wire) or not self.wants(why):
             return
-        self._next_ns[why] = now_ns() + _PAUSE_NS
+        self.next_ns[why] = now_ns() + _PAUSE_NS
         kept = self.rows.reshape(len(Unused), SAMPLES_OF_A_KIND)[why - 1]
         known = kept["identifier"][kept["why"] != 0]
         new = np.flatnonzero(~np.isin(wire["identifier"], known))
@@ -51,7 +51,7 @@ class Samples:
     def note(self, why: Unused, identifier: int, payload: bytes) -> None:
         """Keep one frame that comes alone, if it is time to."""
         if self.wants(why):
-            self._next_ns[why] = now_ns() + _PAUSE_NS
+            self.next_ns[why] = now_ns() + _PAUSE_NS
             kept = self.rows.reshape(len(Unused), SAMPLES_OF_A_KIND)[why - 1]
             self._keep(kept, why, identifier, len(payload), payload)
 

@@ -45,7 +45,7 @@ class Addresses:
         self.nobody: int = len(kinds_of_bus) * STANDARD_IDENTIFIERS
         entries = [self._n_modules + tables.structure.n_patches] * (self.nobody + 1)
         possible: list[tuple[int, ...]] = [()] * (self.nobody + 1)
-        self._forms: list[_Form] = []
+        self.forms: list[_Form] = []
         for bus, kinds in enumerate(kinds_of_bus):
             for number in kinds:
                 frame = frames[number]
@@ -58,9 +58,9 @@ class Addresses:
                         entries[slot] = entry
                         possible[slot] = (*possible[slot], number)
             for same in _of_one_address(frames, (number for number in kinds if frames[number].extended)):
-                self._forms.append(_Form(bus, frames[same[0]], tables, len(entries)))
-                entries += self._forms[-1].entries
-                possible += [same] * len(self._forms[-1].entries)
+                self.forms.append(_Form(bus, frames[same[0]], tables, len(entries)))
+                entries += self.forms[-1].entries
+                possible += [same] * len(self.forms[-1].entries)
         self.entry: npt.NDArray[np.int64] = np.array(entries, np.int64)
         sets = {kinds: row for row, kinds in enumerate(dict.fromkeys(possible))}
         self.candidates: npt.NDArray[np.uint16] = np.array([sets[kinds] for kinds in possible], np.uint16)
@@ -74,7 +74,7 @@ class Addresses:
         if len(identifier) and identifier.max() >= STANDARD_IDENTIFIERS:
             rows = np.flatnonzero(identifier >= STANDARD_IDENTIFIERS)
             slots[rows] = self.nobody
-            for form in self._forms:
+            for form in self.forms:
                 form.look_up(bus[rows], identifier[rows].astype(np.int64), slots, rows)
         return slots
 
@@ -126,9 +126,9 @@ class _Form:
     """29-bit identifiers of one bus that are built alike."""
 
     def __init__(self, bus: int, frame: Frame, tables: SkinTables, first_slot: int) -> None:
-        self._bus = bus
-        self._conditions = [c for c in frame.when if isinstance(c, Identifier)]
-        self._patch, self._module = _Field.of(frame.patch), _Field.of(frame.module)
+        self.bus = bus
+        self.conditions = [c for c in frame.when if isinstance(c, Identifier)]
+        self.patch, self.module = _Field.of(frame.patch), _Field.of(frame.module)
         by_byte = frame.module_byte is not None
         known: dict[int, int] = {}
         self._anyone: dict[int, int] = {}  # patch key -> slot of "some module of this patch"
@@ -142,21 +142,21 @@ class _Form:
                 if of_patch == patch and not by_byte:
                     known[patch_key << _FIELD_BITS | module_key] = first_slot + len(self.entries)
                     self.entries.append(module)
-        self._codes, self._slots = _sorted(known)
-        self._patch_codes, self._patch_slots = _sorted(self._anyone)
+        self.codes, self.slots = _sorted(known)
+        self.patch_codes, self.patch_slots = _sorted(self._anyone)
 
     def look_up(self, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
         """Fill in the slots of those of ``rows`` whose identifiers are of this form."""
-        match = bus == self._bus
+        match = bus == self.bus
         match &= (identifier & EXTENDED_FLAG) != 0
-        for condition in self._conditions:
+        for condition in self.conditions:
             match &= identifier & condition.mask == condition.value
         hits = np.flatnonzero(match)
         if not len(hits):
             return
-        patch_key = self._patch.take(identifier[hits])
-        code = patch_key << _FIELD_BITS | self._module.take(identifier[hits])
-        for codes, found, key in ((self._patch_codes, self._patch_slots, patch_key), (self._codes, self._slots, code)):
+        patch_key = self.patch.take(identifier[hits])
+        code = patch_key << _FIELD_BITS | self.module.take(identifier[hits])
+        for codes, found, key in ((self.patch_codes, self.patch_slots, patch_key), (self.codes, self.slots, code)):
             if len(codes):
                 at = np.minimum(np.searchsorted(codes, key), len(codes) - 1)
                 known = codes[at] == key

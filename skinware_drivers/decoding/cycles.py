@@ -51,8 +51,8 @@ class CompiledCycle:
     ) -> None:
         self.members = members
         self.assembly = assembly
-        self._counters = cycle.counters
-        sequences: Sequence[SequenceNumber | None] = self._counters or [frames[n].sequence for n in members]
+        self.counters = cycle.counters
+        sequences: Sequence[SequenceNumber | None] = self.counters or [frames[n].sequence for n in members]
         self.sequence: tuple[int, SequenceNumber] | None = next(
             ((member, each) for member, each in enumerate(sequences) if each is not None), None
         )
@@ -64,11 +64,11 @@ class CompiledCycle:
             groups = np.concatenate([structure.module_patch, patches])
         else:
             groups = np.minimum(np.arange(structure.n_modules + structure.n_patches + 1), 0xFFFF)
-        self._group_of_entry = groups.astype(np.uint16)
-        self._punctuality: Punctuality | None = None
-        if period_s is not None and not self._counters:
-            self._punctuality = Punctuality(cycle, cycle.period_s or period_s, structure.n_modules)
-        self._pairing = Pairing(cycle, places, self._punctuality)
+        self.group_of_entry = groups.astype(np.uint16)
+        self.punctuality: Punctuality | None = None
+        if period_s is not None and not self.counters:
+            self.punctuality = Punctuality(cycle, cycle.period_s or period_s, structure.n_modules)
+        self.pairing = Pairing(cycle, places, self.punctuality)
 
     def find(
         self, entry: Indices, kind: Bytes, payload: Bytes, time_ns: Indices, is_module: Flags, severed: Flags
@@ -84,14 +84,14 @@ class CompiledCycle:
             severed: (m,) bool: the frame has waited for partners, and it is known that frames were lost since.
         """
         shared = entry
-        if self._counters:
+        if self.counters:
             shared = entry << _COUNTER_BITS
-            for number, counter in zip(self.members, self._counters, strict=True):
+            for number, counter in zip(self.members, self.counters, strict=True):
                 rows = np.flatnonzero((kind == number) & is_module)
                 shared[rows] |= read_numbers(payload[rows], counter) & _COUNTER_MASK
-        return self._pairing.find(shared, self._group_of_entry[entry], kind, time_ns, is_module, severed)
+        return self.pairing.find(shared, self.group_of_entry[entry], kind, time_ns, is_module, severed)
 
     def forget(self, modules: Indices) -> None:
         """These modules have restarted: their rhythm begins anew."""
-        if self._punctuality is not None:
-            self._punctuality.forget(modules)
+        if self.punctuality is not None:
+            self.punctuality.forget(modules)

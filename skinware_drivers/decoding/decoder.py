@@ -70,7 +70,7 @@ class Decoder:
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
         self._module_patch = structure.module_patch.astype(np.intp)
-        self._frames: list[Frame] = []
+        self.frames: list[Frame] = []
         # different layouts (and periods), and the number of the first kind of each
         first_of: list[tuple[Layout, float | None, int]] = []
         kinds_of_bus = []
@@ -80,37 +80,43 @@ class Decoder:
                 continue
             first = next((first for *known, first in first_of if known == [layout, period_s]), None)
             if first is None:
-                first = len(self._frames)
+                first = len(self.frames)
                 first_of.append((layout, period_s, first))
-                self._frames += layout.frames
+                self.frames += layout.frames
             kinds_of_bus.append(range(first, first + len(layout.frames)))
-        if len(self._frames) > MOST_FRAMES:
+        if len(self.frames) > MOST_FRAMES:
             raise ConfigurationError(
-                f"the buses have {len(self._frames)} kinds of frame, a driver takes {MOST_FRAMES}: run several drivers"
+                f"the buses have {len(self.frames)} kinds of frame, a driver takes {MOST_FRAMES}: run several drivers"
             )
-        self._addresses = Addresses(self._frames, kinds_of_bus, tables)
-        self._kinds = [FrameKind(frame, tables) for frame in self._frames]
+        self.addresses = Addresses(self.frames, kinds_of_bus, tables)
+        self.kinds = [FrameKind(frame, tables) for frame in self.frames]
         # frames whose payload may name the module; if the identifier does, to no avail, it is just unknown
-        by_payload = np.array([kind.module_by_byte is not None for kind in self._kinds], bool)
-        self._payload_names: Flags = self._addresses.sets @ by_payload
+        by_payload = np.array([kind.module_by_byte is not None for kind in self.kinds], bool)
+        self.payload_names: Flags = self.addresses.sets @ by_payload
         self._compile_assemblies(first_of)
-        longest = max((max(frame.length) for frame in self._frames), default=0)
-        self._length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
-        for kind, frame in enumerate(self._frames):
-            self._length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
-        self._header = self._compile_header()
+        longest = max((max(frame.length) for frame in self.frames), default=0)
+        self.length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
+        for kind, frame in enumerate(self.frames):
+            self.length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
+        self.header = self._compile_header()
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
-        self._sequences = Sequences(structure)
-        self._haste = np.zeros(self._n_patches, np.int64)
-        self.device_stamps: DeviceStamps = DeviceStamps(self._frames, structure)
+        self.sequences = Sequences(structure)
+        self.haste = np.zeros(self._n_patches, np.int64)
+        self.device_stamps: DeviceStamps = DeviceStamps(self.frames, structure)
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(
             (len(structure.buses), STANDARD_IDENTIFIERS), np.int64
         )
 
+    def columns_of(self, kind: int) -> slice:
+        """Where the values of a kind of frame are among those of its update."""
+        if kind in self.alone:
+            return self.alone[kind].columns[0]
+        return next(c.assembly.columns[c.members.index(kind)] for c in self.cycles if kind in c.members)
+
     @property
     def headroom(self) -> int:
         """Rows that a batch must keep free in front for frames that wait for their partners."""
-        longest = max((len(cycle.members) for cycle in self._cycles), default=1)
+        longest = max((len(cycle.members) for cycle in self.cycles), default=1)
         return max(self._n_modules, self._n_patches) * (longest - 1)
 
     def put_back(self, batch: FrameBatch) -> None:
@@ -147,15 +153,15 @@ class Decoder:
         is_foreign[wrong] = False
         foreign = np.flatnonzero(is_foreign)
         parts = []
-        for number, assembly in self._alone.items():
+        for number, assembly in self.alone.items():
             rows = np.flatnonzero((kind == number) & is_module)
             if len(rows):
                 parts.append(self._read(assembly, batch, rows[:, None], entry[rows]))
-                self._compare(self._frames[number].sequence, payload[rows], entry[rows])
+                self._compare(self.frames[number].sequence, payload[rows], entry[rows])
         severed = np.zeros(len(bus), bool)
         if interrupted:
             severed[: new.start] = np.isin(bus[: new.start], interrupted)
-        for cycle in self._cycles:
+        for cycle in self.cycles:
             parts += self._pair(batch, cycle, entry, is_module, kind, severed)
         if not parts:
             return self._no_updates, foreign + first
@@ -175,10 +181,10 @@ class Decoder:
         """
         wire, bus = batch.wire[batch.start : batch.stop], batch.bus[batch.start : batch.stop]
         payload = wire["payload"]
-        slots = self._addresses.slots(bus, wire["identifier"])
-        entry = self._addresses.entry[slots]
+        slots = self.addresses.slots(bus, wire["identifier"])
+        entry = self.addresses.entry[slots]
         kind, wrong = self._tell_kinds(slots, entry, wire, bus)
-        for number, compiled in enumerate(self._kinds):
+        for number, compiled in enumerate(self.kinds):
             if compiled.module_by_byte is not None:
                 rows = np.flatnonzero(kind == number)
                 entry[rows] = compiled.name_modules(entry[rows], payload[rows])
@@ -186,16 +192,16 @@ class Decoder:
 
     def forget(self, patch: int) -> None:
         """A patch has restarted: its sequence numbers, its rhythm and its clock begin anew."""
-        self._sequences.forget(patch)
+        self.sequences.forget(patch)
         self.device_stamps.forget(patch)
-        for cycle in self._cycles:
+        for cycle in self.cycles:
             cycle.forget(np.flatnonzero(self._module_patch == patch))
 
     def count_unknown(self, batch: FrameBatch, rows: Indices) -> None:
         """Count frames of a batch as unknown identifiers."""
         bus, identifier = batch.bus[rows], batch.wire["identifier"][rows]
         self.state.bus_counters[:, 0] += np.bincount(bus, minlength=len(self.state.bus_counters))
-        self._keep_samples(Unused.UNKNOWN, batch.bus, batch.wire, rows)
+        self.keep_samples(Unused.UNKNOWN, batch.bus, batch.wire, rows)
         standard = identifier < STANDARD_IDENTIFIERS
         np.add.at(self.unknown_identifiers, (bus[standard], identifier[standard]), 1)
 
@@ -206,9 +212,10 @@ class Decoder:
             time_ns[early] = _EARLIEST_NS
             self.state.bus_counters[:, 3] += np.bincount(bus[early], minlength=len(self.state.bus_counters))
 
-    def _keep_samples(
+    def keep_samples(
         self, why: Unused, bus: npt.NDArray[np.uint16], wire: npt.NDArray[np.void], rows: Indices
     ) -> None:
+        """Keep some of these rows of a batch, which cannot be used."""
         if len(rows):
             for ordinal, samples in enumerate(self.samples):
                 if samples.wants(why):
@@ -222,33 +229,33 @@ class Decoder:
             names = [frame.name for frame in layout.frames]
             members_of.append([first + names.index(name) for name in layout.cycle.members] if layout.cycle else [])
         in_cycles = {number for members in members_of for number in members}
-        alone = [number for number in range(len(self._frames)) if number not in in_cycles]
+        alone = [number for number in range(len(self.frames)) if number not in in_cycles]
         groups = [[number] for number in alone] + [members for members in members_of if members]
-        width = max((sum(len(self._kinds[number].channels) for number in group) for group in groups), default=0)
-        made = [Assembly([self._kinds[n] for n in group], self.tables, width) for group in groups]
-        self._alone = dict(zip(alone, made, strict=False))
+        width = max((sum(len(self.kinds[number].channels) for number in group) for group in groups), default=0)
+        made = [Assembly([self.kinds[n] for n in group], self.tables, width) for group in groups]
+        self.alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
-        self._cycles = [
-            CompiledCycle(layout.cycle, self._frames, members, next(of_cycles), self.tables, period_s)
+        self.cycles = [
+            CompiledCycle(layout.cycle, self.frames, members, next(of_cycles), self.tables, period_s)
             for (layout, period_s, _), members in zip(layouts, members_of, strict=True)
             if layout.cycle is not None
         ]
-        self._width = width
+        self.width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
         self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
-        conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self._frames]
+        conditions = [[c for c in frame.when if isinstance(c, Byte)] for frame in self.frames]
         if not conditions or not all(len(c) == 1 and c[0].mask == 0xFF for c in conditions):
             return None
         if len({(c[0].offset) for c in conditions}) > 1 or len({c[0].value for c in conditions}) < len(conditions):
             return None
-        if not self._addresses.sets[1:].all():
+        if not self.addresses.sets[1:].all():
             return None  # which kinds it can be depends on bus and identifier
         offset = conditions[0][0].offset
-        table = np.full((256, self._length_ok.shape[1]), _NO_KIND, np.uint8)
-        for number, (frame, condition) in enumerate(zip(self._frames, conditions, strict=True)):
+        table = np.full((256, self.length_ok.shape[1]), _NO_KIND, np.uint8)
+        for number, (frame, condition) in enumerate(zip(self.frames, conditions, strict=True)):
             # what lies behind the end of a payload means nothing
             table[condition[0].value, [length for length in frame.length if length > offset]] = number
         return offset, table
@@ -264,8 +271,8 @@ class Decoder:
         """
         n_buses, length, payload = len(self.state.bus_counters), wire["length"], wire["payload"]
         ours = entry < self._n_modules + self._n_patches
-        if self._header is not None:
-            at, table = self._header
+        if self.header is not None:
+            at, table = self.header
             kind = table[payload[:, at], length]
             kind[~ours] = _NO_KIND
         else:
@@ -274,21 +281,21 @@ class Decoder:
         wrong &= ours
         rows = np.flatnonzero(wrong)
         if len(rows):
-            rows = rows[(entry[rows] < self._n_modules) | self._payload_names[self._addresses.candidates[slots[rows]]]]
+            rows = rows[(entry[rows] < self._n_modules) | self.payload_names[self.addresses.candidates[slots[rows]]]]
             likely = self._match_kinds(slots[rows], payload[rows], length[rows], check_length=False)
             ours_too = self._name_known_modules(likely, entry[rows], payload[rows], length[rows])
             rows, likely = rows[ours_too], likely[ours_too]
-            is_length = ~self._length_ok[likely, length[rows]]
+            is_length = ~self.length_ok[likely, length[rows]]
             self.state.bus_counters[:, 1] += np.bincount(bus[rows[is_length]], minlength=n_buses)
             self.state.bus_counters[:, 2] += np.bincount(bus[rows[~is_length]], minlength=n_buses)
-            self._keep_samples(Unused.BAD_LENGTH, bus, wire, rows[is_length])
-            self._keep_samples(Unused.BAD_CONTENT, bus, wire, rows[~is_length])
+            self.keep_samples(Unused.BAD_LENGTH, bus, wire, rows[is_length])
+            self.keep_samples(Unused.BAD_CONTENT, bus, wire, rows[~is_length])
         return kind, rows
 
     def _name_known_modules(self, kind: Bytes, entry: Indices, payload: Bytes, length: Bytes) -> Flags:
         """(n,) False for frames whose payload names a module, and one that is not known."""
         known = np.ones(len(kind), bool)
-        for number, compiled in enumerate(self._kinds):
+        for number, compiled in enumerate(self.kinds):
             bits = compiled.frame.module_byte
             if bits is not None and bits.byte is not None:
                 rows = np.flatnonzero((kind == number) & (length > bits.byte))
@@ -298,16 +305,16 @@ class Decoder:
     def _match_kinds(self, slots: Indices, payload: Bytes, length: Bytes, check_length: bool = True) -> Bytes:
         """(n,) the last kind whose conditions hold, and (if ``check_length``) whose length is right; 255 for none."""
         kind = np.full(len(slots), _NO_KIND, np.uint8)
-        candidates = self._addresses.candidates[slots]
-        for number, frame in enumerate(self._frames):
-            match = self._addresses.sets[:, number][candidates]
+        candidates = self.addresses.candidates[slots]
+        for number, frame in enumerate(self.frames):
+            match = self.addresses.sets[:, number][candidates]
             for condition in frame.when:
                 if isinstance(condition, Byte):
                     match &= payload[:, condition.offset] & condition.mask == condition.value
                     match &= length > condition.offset
             kind[match] = number
         if check_length:
-            kind[~self._length_ok[kind, length]] = _NO_KIND
+            kind[~self.length_ok[kind, length]] = _NO_KIND
         return kind
 
     def _pair(
@@ -323,24 +330,28 @@ class Decoder:
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
         self._count_patches(1, module[~whole])
         self._count_patches(2, entry[pairs.late])
-        self._tell_of_haste(entry[pairs.soon], module[whole])
+        self._count_haste(entry[pairs.soon], module[whole])
         if cycle.sequence is not None:
             member, sequence = cycle.sequence
             self._compare(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
 
-    def _tell_of_haste(self, soon: Indices, whole: Indices) -> None:
+    def _count_haste(self, soon: Indices, whole: Indices) -> None:
         """A patch whose frames always come too soon is not shown at all: say why, once.
 
         Args:
             soon: modules whose frames did.
             whole: modules of which whole cycles came.
         """
-        haste = self._haste
+        haste = self.haste
         haste += np.bincount(self._module_patch[soon], minlength=self._n_patches)
         haste[self._module_patch[whole]] = np.minimum(haste[self._module_patch[whole]], 0)
-        for patch in np.flatnonzero(haste > _MUCH_HASTE).tolist():
-            haste[patch] = _NEVER_AGAIN
+        self.tell_of_haste()
+
+    def tell_of_haste(self) -> None:
+        """Tell of patches that send too fast, once of each."""
+        for patch in np.flatnonzero(self.haste > _MUCH_HASTE).tolist():
+            self.haste[patch] = _NEVER_AGAIN
             log.warning(
                 "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be told"
                 " apart and are not shown; give the driver the right period (period_ms, period_s); logged once",
@@ -359,8 +370,8 @@ class Decoder:
     ) -> tuple[Updates, Indices]:
         """Updates, and the last row of each."""
         wire, time_ns = batch.wire[batch.start : batch.stop], batch.time_ns[batch.start : batch.stop]
-        values = np.zeros((len(rows), self._width), self.state.values.dtype)
-        status = np.zeros((len(rows), self._width), np.uint8)
+        values = np.zeros((len(rows), self.width), self.state.values.dtype)
+        status = np.zeros((len(rows), self.width), np.uint8)
         if whole is None:
             whole = np.ones(len(rows), bool)
         sensors, unreadable = assembly.read(wire, rows, module, np.flatnonzero(~whole), values, status)
@@ -394,5 +405,5 @@ class Decoder:
 
     def _compare(self, sequence: SequenceNumber | None, payload: Bytes, module: Indices) -> None:
         if sequence is not None and len(module):
-            for counter, found in enumerate(self._sequences.compare(sequence, payload, module), start=3):
+            for counter, found in enumerate(self.sequences.compare(sequence, payload, module), start=3):
                 self.state.patch_counters[:, counter] += found

@@ -37,6 +37,11 @@ class DeviceStamps:
         self._warned: set[int] = set()
         self.clocks: dict[int, DeviceClock] = {}
 
+    @property
+    def are_told(self) -> bool:
+        """Whether there is anything to tell."""
+        return bool(self._times)
+
     def tell(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
         """Replace the times at which frames were received by those at which they were stamped.
 

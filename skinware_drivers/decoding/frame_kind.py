@@ -203,18 +203,18 @@ class Assembly:
     def __init__(self, kinds: list[FrameKind], tables: SkinTables, width: int) -> None:
         self._kinds = kinds
         self._sink = tables.structure.n_sensors
-        self._channels = np.full(width, -1, np.int64)
-        self._columns: list[slice] = []
+        self.channels = np.full(width, -1, np.int64)
+        self.columns: list[slice] = []
         end = 0
         for kind in kinds:
             columns = slice(end, end + len(kind.channels))
-            self._columns.append(columns)
-            self._channels[columns] = kind.channels
+            self.columns.append(columns)
+            self.channels[columns] = kind.channels
             end = columns.stop
         # one column more for what is dropped, one row more for updates that are not shown
         table = np.full((len(tables.channel_to_sensor) + 1, tables.channel_to_sensor.shape[1] + 1), self._sink)
         table[:-1, :-1] = tables.channel_to_sensor
-        self._destination = np.ascontiguousarray(table[:, self._channels])
+        self.destination = np.ascontiguousarray(table[:, self.channels])
 
     def read(
         self,
@@ -239,9 +239,9 @@ class Assembly:
             (n, width) int64: the sensor that each value belongs to; and for each frame that cannot be read after
             all, the update that it belongs to.
         """
-        sensors = self._destination[module]
+        sensors = self.destination[module]
         unreadable = orphans[:0]
-        for member, (kind, columns) in enumerate(zip(self._kinds, self._columns, strict=True)):
+        for member, (kind, columns) in enumerate(zip(self._kinds, self.columns, strict=True)):
             taken = wire[rows[:, member]]
             payload, length = taken["payload"], taken["length"]
             payload[orphans] = 0
@@ -257,7 +257,7 @@ class Assembly:
             else:
                 raw = kind.read(payload)
             values[:, columns] = raw
-            kind.flag(payload, length, raw, status, columns, self._channels)
+            kind.flag(payload, length, raw, status, columns, self.channels)
         nowhere = np.append(orphans, unreadable) if len(unreadable) else orphans
         sensors[nowhere] = self._sink
         status[nowhere] = 0

@@ -49,8 +49,8 @@ class Pairing:
 
     def __init__(self, cycle: Cycle, places: Places, punctuality: Punctuality | None = None) -> None:
         self._n = len(cycle.members)
-        self._order: Literal["given", "any", "ends_with"] = cycle.order
-        self._maximum_age_ns = round(cycle.maximum_age_s * NS_PER_S)
+        self.order: Literal["given", "any", "ends_with"] = cycle.order
+        self.maximum_age_ns = round(cycle.maximum_age_s * NS_PER_S)
         self._places = places
         self._punctuality = punctuality
 
@@ -84,7 +84,7 @@ class Pairing:
             soon[members], doubtful[members] = judged.soon, judged.doubtful
             out_of_time[members] = judged.soon | judged.held_up
         starts, untrusted = self._find_cycles(shared, place, out_of_time, doubtful)
-        in_time = time_ns[starts + n - 1] - time_ns[starts] <= self._maximum_age_ns
+        in_time = time_ns[starts + n - 1] - time_ns[starts] <= self.maximum_age_ns
         used = np.zeros(len(order), bool)
         late, starts = np.union1d(starts[~in_time], untrusted), self._apart(starts[in_time])
         windows = starts[:, None] + np.arange(n)
@@ -100,7 +100,7 @@ class Pairing:
             self._punctuality.remember(kinds[over], time_ns[members][over], judged.spacing_ns[over])
         rows = order[windows]
         last = rows[:, -1]
-        if self._order != "given":
+        if self.order != "given":
             rows = np.take_along_axis(rows, np.argsort(place[windows], axis=1), axis=1)
         orphans = order[is_orphan]
         by_arrival = np.argsort(np.concatenate([last, orphans]), kind="stable")
@@ -123,13 +123,13 @@ class Pairing:
             whole &= shared[j : m + j] == shared[:m]
             some_out |= out_of_time[j : m + j]
             all_doubtful &= doubtful[j : m + j]
-            if self._order == "given":
+            if self.order == "given":
                 whole &= place[j : m + j] == j
             else:
                 seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
-        if self._order != "given":
+        if self.order != "given":
             whole &= seen == (1 << n) - 1
-        if self._order == "ends_with":
+        if self.order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
         untrusted = some_out | all_doubtful
         return np.flatnonzero(whole & ~untrusted), np.flatnonzero(whole & untrusted)
@@ -161,7 +161,7 @@ class Pairing:
             for j in range(length):
                 at = np.maximum(first + j, 0)
                 fits &= (shared[at] == shared[ends]) & ~used[at] & (place[at] < n)
-                if self._order == "given":
+                if self.order == "given":
                     fits &= place[at] == j
                 bit = np.left_shift(np.uint32(1), place[at].astype(np.uint32))
                 fits &= (seen & bit) == 0

@@ -57,13 +57,13 @@ class Punctuality:
 
     def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
         self._n = len(cycle.members)
-        self._all_as_they_should = cycle.order != "given"
-        self._period_ns = round(period_s * NS_PER_S)
-        self._reach_ns = round(cycle.reach_s * NS_PER_S)
-        self._margin_ns = (self._period_ns - self._reach_ns) // _MARGIN
-        self._soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self._margin_ns
-        self._last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
-        self._spacing_ns = np.full(n_modules * self._n, self._period_ns, np.int64)
+        self.all_as_they_should = cycle.order != "given"
+        self.period_ns = round(period_s * NS_PER_S)
+        self.reach_ns = round(cycle.reach_s * NS_PER_S)
+        self.margin_ns = (self.period_ns - self.reach_ns) // _MARGIN
+        self.soon_ns = round(cycle.maximum_age_s * NS_PER_S) + self.margin_ns
+        self.last_ns = np.full(n_modules * self._n, _NEVER_NS, np.int64)
+        self.spacings_ns = np.full(n_modules * self._n, self.period_ns, np.int64)
 
     def judge(self, kind: Indices, time_ns: Indices) -> Judgement:
         """Tell how frames come.
@@ -75,28 +75,28 @@ class Punctuality:
         order = np.argsort(kind, kind="stable")
         kind, time_ns = kind[order], time_ns[order]
         follows = np.flatnonzero(kind[1:] == kind[:-1]) + 1
-        before_ns, usual_ns = self._last_ns[kind], self._spacing_ns[kind]
+        before_ns, usual_ns = self.last_ns[kind], self.spacings_ns[kind]
         before_ns[follows] = time_ns[follows - 1]
         spacing_ns = time_ns - before_ns
-        spacing_ns[before_ns == _NEVER_NS] = self._period_ns
+        spacing_ns[before_ns == _NEVER_NS] = self.period_ns
         usual_ns[follows] = spacing_ns[follows - 1]
-        soon = spacing_ns <= self._soon_ns
-        late = spacing_ns >= 2 * np.maximum(usual_ns, self._period_ns) - self._reach_ns - self._margin_ns
+        soon = spacing_ns <= self.soon_ns
+        late = spacing_ns >= 2 * np.maximum(usual_ns, self.period_ns) - self.reach_ns - self.margin_ns
         held_up = late
-        if not self._all_as_they_should and late.any():
-            beside_ns = np.abs((spacing_ns + self._period_ns // 2) % self._period_ns - self._period_ns // 2)
-            held_up = late & (2 * beside_ns >= self._period_ns - self._reach_ns)
+        if not self.all_as_they_should and late.any():
+            beside_ns = np.abs((spacing_ns + self.period_ns // 2) % self.period_ns - self.period_ns // 2)
+            held_up = late & (2 * beside_ns >= self.period_ns - self.reach_ns)
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         return Judgement(soon[back], held_up[back], late[back], spacing_ns[back])
 
     def remember(self, kind: Indices, time_ns: Indices, spacing_ns: Indices) -> None:
         """These frames have come, in this order, and will not be judged again."""
-        self._spacing_ns[kind] = spacing_ns
-        self._last_ns[kind] = time_ns
+        self.spacings_ns[kind] = spacing_ns
+        self.last_ns[kind] = time_ns
 
     def forget(self, modules: Indices) -> None:
         """These modules have restarted, and their time with them."""
         kinds = (modules[:, None] * self._n + np.arange(self._n)).reshape(-1)
-        self._last_ns[kinds] = _NEVER_NS
-        self._spacing_ns[kinds] = self._period_ns
+        self.last_ns[kinds] = _NEVER_NS
+        self.spacings_ns[kinds] = self.period_ns

@@ -38,7 +38,7 @@ class Sequences:
     def __init__(self, structure: Structure) -> None:
         self._module_patch = structure.module_patch.astype(np.intp)
         self._n_patches = structure.n_patches
-        self._last = np.full(structure.n_modules, _NONE_YET, np.int64)
+        self.last = np.full(structure.n_modules, _NONE_YET, np.int64)
 
     def compare(self, sequence: SequenceNumber, payload: Bytes, module: Indices) -> tuple[Indices, Indices, Indices]:
         """Compare the numbers of frames with those before them.
@@ -56,17 +56,17 @@ class Sequences:
         before = np.empty_like(number)
         before[1:] = number[:-1]
         first = np.flatnonzero(np.append(True, module[1:] != module[:-1])) if len(module) else module
-        before[first] = self._last[module[first]]
+        before[first] = self.last[module[first]]
         step = (number - before) % sequence.turn
         step[before == _NONE_YET] = 1
-        self._last[module] = number
+        self.last[module] = number
         is_back = step > sequence.turn // 2
         skipped = np.where(is_back, 0, np.maximum(step - 1, 0))
         return self._by_patch(module, skipped), self._by_patch(module, step == 0), self._by_patch(module, is_back)
 
     def forget(self, patch: int) -> None:
         """A patch has restarted, and its numbers with it."""
-        self._last[self._module_patch == patch] = _NONE_YET
+        self.last[self._module_patch == patch] = _NONE_YET
 
     def _by_patch(self, module: Indices, count: npt.NDArray[np.generic]) -> Indices:
         found = np.bincount(self._module_patch[module], weights=count, minlength=self._n_patches)

@@ -96,13 +96,13 @@ class SkinState:
     def __init__(self, tables: SkinTables) -> None:
         structure = tables.structure
         # one element more than there is: it takes what belongs nowhere, which is cheaper than to sort it out
-        self._values = np.zeros(structure.n_sensors + 1, structure.dtype)
-        self._status = np.full(structure.n_sensors + 1, int(Status.NEVER_SEEN), np.uint8)
+        self.values_and_sink = np.zeros(structure.n_sensors + 1, structure.dtype)
+        self.status_and_sink = np.full(structure.n_sensors + 1, int(Status.NEVER_SEEN), np.uint8)
         self._module_time_ns = np.zeros(structure.n_modules + 1, np.int64)
         self._updated = np.zeros(structure.n_modules + 1, bool)
         self._patch_time_ns = np.zeros(structure.n_patches + 1, np.int64)
-        self.values: npt.NDArray[Any] = self._values[:-1]
-        self.status: npt.NDArray[np.uint8] = self._status[:-1]
+        self.values: npt.NDArray[Any] = self.values_and_sink[:-1]
+        self.status: npt.NDArray[np.uint8] = self.status_and_sink[:-1]
         self.module_time_ns: npt.NDArray[np.int64] = self._module_time_ns[:-1]
         self.updated: npt.NDArray[np.bool_] = self._updated[:-1]
         self.patch_time_ns: npt.NDArray[np.int64] = self._patch_time_ns[:-1]
@@ -119,9 +119,9 @@ class SkinState:
         if not len(updates):
             return
         shown = np.where(updates.whole, updates.module, self._nobody)
-        self._values[updates.sensors] = updates.values
+        self.values_and_sink[updates.sensors] = updates.values
         if updates.flagged or not self._status_is_zero:
-            self._status[updates.sensors] = updates.status
+            self.status_and_sink[updates.sensors] = updates.status
             self._status_is_zero = not updates.flagged and not self.status.any()
         self._module_time_ns[shown] = updates.oldest_ns
         self._updated[shown] = True

@@ -48,10 +48,10 @@ class Bursts:
         self._state = state
         self._module_patch = module_patch
         self._n_patches = len(state.patch_time_ns)
-        self._pause_ns = np.full(self._n_patches, period_ns // 2)
-        self._standing_out_ns = _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
+        self.pause_ns: Indices = np.full(self._n_patches, period_ns // 2, np.int64)
+        self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
         self._first_module = np.searchsorted(module_patch, np.arange(self._n_patches))
-        self._gap_ns = np.zeros(len(module_patch), np.int64)  # before the last update of each module
+        self.gap_ns: Indices = np.zeros(len(module_patch), np.int64)  # before the last update of each module
         self._longest_pause_ns = period_ns // 2
         self._show = show
         self._skip = skip
@@ -115,11 +115,11 @@ class Bursts:
         if not missing.any():
             return lacks
         lacks[self._module_patch[missing]] = True
-        return self._begun() & lacks & (time_ns - self._state.patch_time_ns <= self._pause_ns)
+        return self._begun() & lacks & (time_ns - self._state.patch_time_ns <= self.pause_ns)
 
     def pause_ends_ns(self, patches: Flags) -> int:
         """When the last of these patches will have said nothing for long enough to have ended its burst."""
-        return int((self._state.patch_time_ns + self._pause_ns)[patches].max()) + 1
+        return int((self._state.patch_time_ns + self.pause_ns)[patches].max()) + 1
 
     def _begun(self) -> Flags:
         """(n_patches,) bool: patches of which this frame shows something."""
@@ -193,7 +193,7 @@ class Bursts:
         before_ns = np.where(first, self._state.patch_time_ns[patch], updates.newest_ns[of_patch])
         gap_ns = updates.oldest_ns - before_ns
         self._learn_pauses(module, patch, gap_ns)
-        pause = gap_ns > self._pause_ns[patch]
+        pause = gap_ns > self.pause_ns[patch]
         if pause.any():
             pause &= ~first | self._begun()[patch]
             found[pause] = np.maximum(found[pause], of_patch[pause] + 1)
@@ -201,11 +201,11 @@ class Bursts:
 
     def _learn_pauses(self, module: Indices, patch: Indices, gap_ns: Indices) -> None:
         gap_ns = np.where(gap_ns < 2 * self._longest_pause_ns, gap_ns, 0)  # more than a period is no pause
-        self._gap_ns[module] = gap_ns
-        longest_ns = np.maximum.reduceat(self._gap_ns, self._first_module)
+        self.gap_ns[module] = gap_ns
+        longest_ns = np.maximum.reduceat(self.gap_ns, self._first_module)
         np.maximum.at(longest_ns, patch, gap_ns)
-        own_ns = np.where(longest_ns >= self._standing_out_ns, _SIMILAR * longest_ns, self._longest_pause_ns)
-        self._pause_ns = np.minimum(own_ns, self._longest_pause_ns).astype(np.int64)
+        own_ns = np.where(longest_ns >= self.standing_out_ns, _SIMILAR * longest_ns, self._longest_pause_ns)
+        self.pause_ns[:] = np.minimum(own_ns, self._longest_pause_ns)
 
 
 def _chain(key: Indices) -> Indices:

@@ -16,6 +16,8 @@ from skinware_drivers.operations import Operation, check_arguments, operations_o
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import hook
 
+_NOBODY = (1 << 63) - 1
+
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 Changed = Callable[[BusLine, Sequence[Patch], bool], object]
@@ -65,13 +67,9 @@ class RequestDesk:
             self._fail(error)
 
     @property
-    def waited_for(self) -> bool:
-        """Whether anybody waits for a frame."""
-        return bool(self._waiting)
-
-    def wants(self, oldest_ns: int) -> bool:
-        """Whether somebody waits for a frame whose data is no older than this."""
-        return any(time_ns <= oldest_ns for time_ns, request in self._waiting if not request.cancelled)
+    def wanted_ns(self) -> int:
+        """The oldest data that is new enough for one of those who wait, CLOCK_MONOTONIC ns; far ahead if nobody does."""
+        return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=_NOBODY)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
         """A frame was published: answer those who waited for it.

@@ -27,6 +27,7 @@ ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
 _IDLE_NS = NS_PER_S // 4
+_NOBODY = (1 << 63) - 1
 _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
@@ -35,9 +36,7 @@ class Desk(Protocol):
     """Who waits for frames; see :class:`skinware_drivers.running.desk.RequestDesk`."""
 
     @property
-    def waited_for(self) -> bool: ...  # noqa: D102
-
-    def wants(self, oldest_ns: int) -> bool: ...  # noqa: D102
+    def wanted_ns(self) -> int: ...  # noqa: D102
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None: ...  # noqa: D102
 
@@ -75,26 +74,27 @@ class Publisher:
     ) -> None:
         self._writer = writer
         self._state = decoder.state
-        self._watch = watch
-        self._period_ns = round(period_s * NS_PER_S)
-        self._by_cycle = by_cycle
-        self._desk, self._on_request = desk, on_request
-        self._most_at_once = most_at_once
+        self.watch = watch
+        self.period_ns = round(period_s * NS_PER_S)
+        self.by_cycle = by_cycle
+        self._desk, self.on_request = desk, on_request
+        self.most_at_once = most_at_once
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
-        self._patience_ns = self._period_ns * 3 // 2
-        self._pause_ns = self._period_ns // 2
-        self._silence_ns = age_limit_ns(self._period_ns)
+        self.patience_ns = self.period_ns * 3 // 2
+        self.pause_ns = self.period_ns // 2
+        self.idle_ns: int = max(_IDLE_NS, 2 * self.period_ns)
+        self._silence_ns = age_limit_ns(self.period_ns)
         self._structure = structure = decoder.tables.structure
         self._module_patch = structure.module_patch.astype(np.intp)
         self._sensor_module = structure.sensor_module.astype(np.intp)
         self._first_module = np.searchsorted(self._module_patch, np.arange(structure.n_patches))
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
-        self._bursts = Bursts(self._state, self._module_patch, self._period_ns, self._show, self._skip)
-        self._module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
+        self.bursts = Bursts(self._state, self._module_patch, self.period_ns, self._show, self._skip)
+        self.module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
         self.timing: PatchTiming = PatchTiming(structure)
-        self._behind = np.zeros(structure.n_modules, bool)
-        self._patch_heard_ns = np.zeros(structure.n_patches, np.int64)
-        self._patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
+        self.behind = np.zeros(structure.n_modules, bool)
+        self.patch_heard_ns = np.zeros(structure.n_patches, np.int64)
+        self.patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
         self._due_ns = 0
         self._not_before_ns = 0  # a burst that has begun holds up the frame until then
         self._last_published_ns = now_ns()
@@ -107,6 +107,20 @@ class Publisher:
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
+    def sequence(self) -> int:
+        """Of the newest frame."""
+        return self._writer.sequence
+
+    @property
+    def ring_address(self) -> int | None:
+        """Of what C code publishes through; None where Python does."""
+        return self._writer.ring_address
+
+    def column_offsets(self) -> dict[str, int]:
+        """Where each column of a frame begins, bytes from the beginning of its slot."""
+        return self._writer.column_offsets()
+
+    @property
     def silence_ns(self) -> int:
         """How long a patch may be silent before it counts as stale."""
         return self._silence_ns
@@ -114,9 +128,9 @@ class Publisher:
     @property
     def deadline_ns(self) -> int:
         """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""
-        if not self._by_cycle:
-            return self._last_published_ns + self._period_ns
-        idle_ns = self._last_published_ns + max(_IDLE_NS, 2 * self._period_ns)
+        if not self.by_cycle:
+            return self._last_published_ns + self.period_ns
+        idle_ns = self._last_published_ns + self.idle_ns
         return max(self._not_before_ns, min(self._due_ns, idle_ns) if self._due_ns else idle_ns)
 
     def take(self, updates: Updates) -> None:
@@ -127,10 +141,10 @@ class Publisher:
         self.count_buses()
         self._hear(updates, time_ns)
         self._update_patch_states(time_ns)
-        if not self._by_cycle:
+        if not self.by_cycle:
             self._show(updates)
             return
-        self._bursts.take(updates, self._living(time_ns), self.publish, self._most_at_once - 1)
+        self.bursts.take(updates, self._living(time_ns), self.publish, self.most_at_once - 1)
         self._look_at_frame(time_ns)
 
     def publish_if_due(self) -> None:
@@ -140,14 +154,14 @@ class Publisher:
             return
         self.count_buses()
         self._update_patch_states(time_ns)
-        if self._by_cycle:
+        if self.by_cycle:
             living = self._living(time_ns)
-            open_patches = self._bursts.in_the_middle(living, time_ns)
+            open_patches = self.bursts.in_the_middle(living, time_ns)
             if open_patches.any():
-                self._due_ns = self._not_before_ns = self._bursts.pause_ends_ns(open_patches)
+                self._due_ns = self._not_before_ns = self.bursts.pause_ends_ns(open_patches)
                 return
             self.publish()
-            self._bursts.take(None, living, self.publish, self._most_at_once - 2)
+            self.bursts.take(None, living, self.publish, self.most_at_once - 2)
             self._look_at_frame(time_ns)
         else:
             self.publish()
@@ -162,9 +176,9 @@ class Publisher:
         self._last_published_ns = time_ns
 
     def _wanted(self, time_ns: int) -> bool:
-        if self._desk is None or not self._on_request or not self._writer.sequence:
+        if self._desk is None or not self.on_request or not self._writer.sequence:
             return True
-        return self._desk.wants(self._oldest_new_ns(time_ns))
+        return self.wanted_ns <= self._oldest_new_ns(time_ns)
 
     def _oldest_new_ns(self, time_ns: int) -> int:
         """Oldest stamp of what is new in this frame; if nothing is, the frame says so as of now."""
@@ -189,12 +203,26 @@ class Publisher:
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)
         columns["patch_age_counts"][:] = self.timing.ages.reshape(-1)
         self._writer.commit(state.newest_ns or time_ns)
-        if self._desk is not None and self._desk.waited_for:
-            self._desk.published(self._oldest_new_ns(time_ns), self._writer.position)
+        if self.wanted_ns < _NOBODY:
+            self.answer(self._oldest_new_ns(time_ns))
+
+    @property
+    def wanted_ns(self) -> int:
+        """The oldest data that is new enough for one of those who wait for a frame; far ahead if nobody does."""
+        return _NOBODY if self._desk is None else self._desk.wanted_ns
+
+    def answer(self, oldest_ns: int) -> None:
+        """A frame was published: tell those who waited for it.
+
+        Args:
+            oldest_ns: of the data that is new in it, CLOCK_MONOTONIC ns.
+        """
+        if self._desk is not None:
+            self._desk.published(oldest_ns, self._writer.position)
 
     def lose(self, patch: int, state: PatchState) -> None:
         """Take a patch as silent from here on, until its next data."""
-        self._patch_updated_ns[patch] = 0
+        self.patch_updated_ns[patch] = 0
         self.patch_state[patch] = state
 
     def count_buses(self) -> npt.NDArray[np.int64]:
@@ -204,17 +232,24 @@ class Publisher:
         return self._counts
 
     def _update_patch_states(self, time_ns: int) -> None:
-        live = self._patch_updated_ns > max(0, time_ns - self._silence_ns)
+        live = self.patch_updated_ns > max(0, time_ns - self._silence_ns)
         if not live.all() or not (self.patch_state == _LIVE).all():
             self.patch_state[~live & (self.patch_state == _LIVE)] = _NOW_STALE
             self.patch_state[live] = _LIVE
 
     def _show(self, updates: Updates) -> None:
         self._state.show(updates)
-        if not updates.flagged:
-            return
+        if updates.flagged:
+            self.look(updates)
+
+    def look(self, updates: Updates) -> None:
+        """Let the watch look at updates that were shown, some of them flagged.
+
+        Raises:
+            DriverError: it raised something.
+        """
         try:
-            self._watch.look(updates)
+            self.watch.look(updates)
         except Exception as error:
             buses = np.unique(self._structure.patch_bus[self._module_patch[updates.module]]).tolist()
             names = ", ".join(self._structure.buses[bus] for bus in buses)
@@ -227,33 +262,33 @@ class Publisher:
     def _look_at_frame(self, time_ns: int) -> None:
         """After new data: publish a complete frame, or say when it will be due."""
         state = self._state
-        if self._bursts.holds_back:
-            self._due_ns = time_ns + self._pause_ns
+        if self.bursts.holds_back:
+            self._due_ns = time_ns + self.pause_ns
         elif state.updated.any() and (state.touched | ~self._living(time_ns)).all():
             self.publish()
         elif not self._due_ns and state.touched.any():
-            self._due_ns = time_ns + self._patience_ns
+            self._due_ns = time_ns + self.patience_ns
 
     def _hear(self, updates: Updates, time_ns: int) -> None:
         """Note who lives. Of a patch that begins to send, all its modules: its first burst is not over after one."""
-        patch_sends = np.zeros(len(self._patch_heard_ns), bool)
+        patch_sends = np.zeros(len(self.patch_heard_ns), bool)
         patch_sends[self._module_patch[updates.module]] = True
-        begins = patch_sends & (time_ns - self._patch_heard_ns > self._silence_ns)
+        begins = patch_sends & (time_ns - self.patch_heard_ns > self._silence_ns)
         if begins.any():
-            self._module_heard_ns[begins[self._module_patch]] = time_ns
-        self._patch_heard_ns[patch_sends] = time_ns
-        self._module_heard_ns[updates.module] = time_ns
+            self.module_heard_ns[begins[self._module_patch]] = time_ns
+        self.patch_heard_ns[patch_sends] = time_ns
+        self.module_heard_ns[updates.module] = time_ns
         whole = updates.whole
-        self._patch_updated_ns[self._module_patch[updates.module[whole]]] = updates.newest_ns[whole]
+        self.patch_updated_ns[self._module_patch[updates.module[whole]]] = updates.newest_ns[whole]
 
     def _living(self, time_ns: int) -> npt.NDArray[np.bool_]:
-        living: npt.NDArray[np.bool_] = time_ns - self._module_heard_ns < self._silence_ns
+        living: npt.NDArray[np.bool_] = time_ns - self.module_heard_ns < self._silence_ns
         return living
 
     def _fill_status(self, status: npt.NDArray[np.uint8], time_ns: int) -> None:
         """What the wire said, what time tells, and what the driver's watch holds against a module."""
         bits = np.multiply(self._stale_modules(time_ns), _STALE)
-        bits |= self._watch.module_status
+        bits |= self.watch.module_status
         if bits.any():
             np.bitwise_or(self._state.status, bits.take(self._sensor_module), out=status)
         else:
@@ -267,12 +302,12 @@ class Publisher:
         """
         state, module_patch = self._state, self._module_patch
         shown_ns, updated = state.module_time_ns, state.updated
-        if not self._by_cycle:
-            self._behind = state.patch_time_ns[module_patch] - shown_ns > self._period_ns * 3 // 2
+        if not self.by_cycle:
+            self.behind[:] = state.patch_time_ns[module_patch] - shown_ns > self.period_ns * 3 // 2
         else:
-            self._behind |= np.logical_or.reduceat(updated, self._first_module)[module_patch]
-            np.greater(self._behind, updated, out=self._behind)  # and not updated
+            self.behind |= np.logical_or.reduceat(updated, self._first_module)[module_patch]
+            np.greater(self.behind, updated, out=self.behind)  # and not updated
         stale: npt.NDArray[np.bool_] = shown_ns < time_ns - self._silence_ns
-        stale |= self._behind
+        stale |= self.behind
         stale &= shown_ns > 0
         return stale

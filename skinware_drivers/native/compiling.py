@@ -1,0 +1,212 @@
+"""A decoder's layouts and tables, told to C."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skinware_drivers.decoding.cycles import CompiledCycle
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.frame_kind import FrameKind
+from skinware_drivers.layout import Byte, Expand, Flag, Frame, Packed, Sentinel, StatusBytes
+from skinware_drivers.native import structs
+from skinware_drivers.numbering import SequenceNumber
+
+_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+_PACKED = len(_TYPES)
+_ORDERS = ("given", "any", "ends_with")
+_SENTINEL, _STATUS_BYTES, _WORD = range(3)
+_MOST_MEMBERS = 32
+_LARGEST_TURN = 1 << 62
+
+
+def why_not(decoder: Decoder) -> str:
+    """Why C cannot do what these layouts say; empty if it can."""
+    if decoder.tables.structure.dtype.str[1:] not in _TYPES:
+        return f"values of dtype {decoder.tables.structure.dtype}"
+    for frame in decoder.frames:
+        runs = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
+        if not all(dtype.str[1:] in _TYPES for dtype in runs):
+            return f"frame {frame.name!r}: values of an unusual dtype"
+        if len({dtype.kind == "f" for dtype in runs}) > 1 or (runs and np.result_type(*runs).kind != runs[0].kind == "f"):
+            return f"frame {frame.name!r}: integers beside floats"
+        if runs and np.result_type(*runs).kind == "f" and not decoder.tables.structure.dtype.kind == "f":
+            return f"frame {frame.name!r}: floats where the driver has integers"
+        if runs and runs[0].kind != "f" and np.result_type(*runs).kind == "f":
+            return f"frame {frame.name!r}: values of 64 bits with and without a sign"
+    for cycle in decoder.cycles:
+        if len(cycle.members) > _MOST_MEMBERS:
+            return f"a cycle of more than {_MOST_MEMBERS} frames"
+    return ""
+
+
+def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
+    """Fill in what a plan says of frames and updates."""
+    structure, state, addresses = decoder.tables.structure, decoder.state, decoder.addresses
+    plan.n_buses, plan.n_patches = len(structure.buses), structure.n_patches
+    plan.n_modules, plan.n_sensors = structure.n_modules, structure.n_sensors
+    plan.value_type, plan.value_bytes = _type(structure.dtype)[0], structure.dtype.itemsize
+    plan.width = decoder.width
+
+    plan.n_slots, plan.nobody, plan.n_sets = len(addresses.entry), addresses.nobody, len(addresses.sets)
+    plan.entry, plan.candidates = arrays.at(addresses.entry), arrays.at(addresses.candidates)
+    plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(decoder.payload_names)
+    plan.n_forms, plan.forms = arrays.structs(structs.Form, (_form(form, arrays) for form in addresses.forms))
+    plan.length_columns, plan.length_ok = decoder.length_ok.shape[1], arrays.at(decoder.length_ok)
+    if decoder.header is not None:
+        plan.header_byte, plan.header = decoder.header[0], arrays.at(decoder.header[1])
+
+    assemblies = [*decoder.alone.items()]
+    groups = [([number], assembly) for number, assembly in assemblies]
+    groups += [(cycle.members, cycle.assembly) for cycle in decoder.cycles]
+    plan.n_assemblies, plan.assemblies = arrays.structs(
+        structs.Assembly,
+        (
+            structs.Assembly(
+                len(members),
+                arrays.of(members, np.int64),
+                arrays.at(assembly.channels),
+                arrays.of(assembly.destination, np.int32),
+            )
+            for members, assembly in groups
+        ),
+    )
+    kinds = [_kind(kind, decoder, arrays) for kind in decoder.kinds]
+    for number, (members, assembly) in enumerate(groups):
+        for place, (member, columns) in enumerate(zip(members, assembly.columns, strict=True)):
+            kind = kinds[member]
+            kind.assembly, kind.place, kind.column = number, place, columns.start
+            kind.cycle = number - len(assemblies) if number >= len(assemblies) else -1
+            _place_runs(kind, columns.start)
+    plan.n_kinds, plan.kinds = arrays.structs(structs.Kind, kinds)
+    plan.n_cycles, plan.cycles = arrays.structs(
+        structs.Cycle,
+        (_cycle(cycle, len(assemblies) + number, arrays) for number, cycle in enumerate(decoder.cycles)),
+    )
+    plan.module_patch = arrays.of(structure.module_patch, np.int64)
+    plan.sensor_module = arrays.of(structure.sensor_module, np.int64)
+    plan.first_module = arrays.of(np.searchsorted(structure.module_patch, np.arange(structure.n_patches)), np.int64)
+    plan.patch_bus = arrays.of(structure.patch_bus, np.int64)
+    plan.last_sequence, plan.haste = arrays.at(decoder.sequences.last), arrays.at(decoder.haste)
+    plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
+
+    plan.values, plan.status = arrays.at(state.values_and_sink), arrays.at(state.status_and_sink)
+    plan.module_time_ns, plan.updated = arrays.at(state.module_time_ns), arrays.at(state.updated)
+    plan.patch_time_ns, plan.touched = arrays.at(state.patch_time_ns), arrays.at(state.touched)
+    plan.bus_counters, plan.patch_counters = arrays.at(state.bus_counters), arrays.at(state.patch_counters)
+
+
+def _type(dtype: Any) -> tuple[int, int]:
+    """Number of a dtype, and whether its bytes come in the other order."""
+    found = np.dtype(dtype)
+    return _TYPES.index(found.str[1:]), found.str[0] == ">"
+
+
+def _number(sequence: SequenceNumber | None) -> structs.Number:
+    if sequence is None:
+        return structs.Number()
+    mask, shift = (-1, 0) if sequence.mask is None else (sequence.mask, sequence.shift)
+    return structs.Number(1, sequence.offset, *_type(sequence.dtype), mask, shift, min(sequence.turn, _LARGEST_TURN))
+
+
+def _form(form: Any, arrays: structs.Arrays) -> structs.Form:
+    conditions = [structs.IdentifierCondition(c.mask, c.value) for c in form.conditions]
+    return structs.Form(
+        form.bus,
+        *arrays.structs(structs.IdentifierCondition, conditions),
+        structs.Field(form.patch.shift, form.patch.mask, form.patch.constant),
+        structs.Field(form.module.shift, form.module.mask, form.module.constant),
+        len(form.patch_codes),
+        len(form.codes),
+        arrays.at(form.patch_codes),
+        arrays.at(form.patch_slots),
+        arrays.at(form.codes),
+        arrays.at(form.slots),
+    )
+
+
+def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> structs.Kind:
+    frame = compiled.frame
+    kind = structs.Kind(width=len(compiled.channels), is_expanded=isinstance(frame.values, Expand))
+    kind.n_conditions, kind.conditions = arrays.structs(
+        structs.ByteCondition,
+        (structs.ByteCondition(c.offset, c.mask, c.value) for c in frame.when if isinstance(c, Byte)),
+    )
+    kind.n_runs, kind.runs = arrays.structs(structs.Run, _runs(frame))
+    values = decoder.tables.structure.dtype if isinstance(frame.values, Expand) else _common(frame)
+    kind.n_flags, kind.flags = arrays.structs(structs.Flag, (_flag(flag, values, arrays) for flag in frame.flags))
+    bits, table = frame.module_byte, compiled.module_by_byte
+    if bits is not None and bits.byte is not None and table is not None:
+        kind.names_module, kind.key_byte, kind.key_shift = True, bits.byte, bits.shift
+        kind.key_mask, kind.n_keys, kind.module_by_key = (1 << bits.width) - 1, table.shape[1], arrays.at(table)
+    kind.sequence = _number(frame.sequence)
+    return kind
+
+
+def _common(frame: Frame) -> np.dtype[Any]:
+    """The dtype that can hold the values of all runs of a frame."""
+    return np.result_type(*(np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs))
+
+
+def _runs(frame: Frame) -> list[structs.Run]:
+    runs, column = [], 0
+    for run in frame.runs:
+        if isinstance(run.dtype, Packed):
+            how = run.dtype
+            packed = how.bits, how.order == "little", how.signed, how.skip
+            runs.append(structs.Run(run.offset, run.count, _PACKED, 0, column, *packed))
+        else:
+            runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
+        column += run.count
+    return runs
+
+
+def _place_runs(kind: structs.Kind, column: int) -> None:
+    """Columns of runs count from the beginning of the update, not of their frame."""
+    runs = (structs.Run * kind.n_runs).from_address(kind.runs)
+    for run in runs:
+        run.column += column
+
+
+def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:
+    if isinstance(flag, Sentinel):
+        return _sentinel(flag, values)
+    if isinstance(flag, StatusBytes):
+        return structs.Flag(form=_STATUS_BYTES, offset=flag.offset, mask=int(flag.mask))
+    assert isinstance(flag, Flag)
+    dtype, is_swapped = _type(flag.dtype)
+    n_each, each = arrays.structs(structs.ChannelBit, (structs.ChannelBit(*pair) for pair in flag.each))
+    word = {"offset": flag.offset, "type": dtype, "is_swapped": is_swapped, "mask": flag.mask}
+    return structs.Flag(form=_WORD, status=int(flag.status), n_each=n_each, each=each, **word)
+
+
+def _sentinel(flag: Sentinel, values: np.dtype[Any]) -> structs.Flag:
+    """Compared as numpy compares an array of ``values`` with the number."""
+    found = structs.Flag(form=_SENTINEL, status=int(flag.status), is_possible=True)
+    if values.kind == "f":
+        found.real = float(values.type(flag.value))
+    elif isinstance(flag.value, float):
+        found.is_float, found.real = True, flag.value
+    else:
+        limits = np.iinfo(values)
+        found.is_possible = limits.min <= flag.value <= limits.max
+        found.integer = flag.value if flag.value < 1 << 63 else flag.value - (1 << 64)
+    return found
+
+
+def _cycle(cycle: CompiledCycle, assembly: int, arrays: structs.Arrays) -> structs.Cycle:
+    pairing, punctuality = cycle.pairing, cycle.punctuality
+    found = structs.Cycle(len(cycle.members), _ORDERS.index(pairing.order), pairing.maximum_age_ns, assembly)
+    found.has_counter = bool(cycle.counters)
+    _, found.counters = arrays.structs(structs.Number, (_number(counter) for counter in cycle.counters))
+    found.group_of_entry = arrays.at(cycle.group_of_entry)
+    found.compared_member = -1
+    if cycle.sequence is not None:
+        found.compared_member, found.compared = cycle.sequence[0], _number(cycle.sequence[1])
+    if punctuality is not None:
+        found.is_timed, found.all_as_they_should = True, punctuality.all_as_they_should
+        found.period_ns, found.reach_ns = punctuality.period_ns, punctuality.reach_ns
+        found.margin_ns, found.soon_ns = punctuality.margin_ns, punctuality.soon_ns
+        found.last_ns, found.spacing_ns = arrays.at(punctuality.last_ns), arrays.at(punctuality.spacings_ns)
+    return found

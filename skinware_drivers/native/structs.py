@@ -1,0 +1,227 @@
+"""The structures of ``path.h`` and ``inside.h``, field by field: every field has 8 bytes."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+_WHOLE, _POINTER, _REAL = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
+
+
+def _fields(names: str, kind: type[Any] = _WHOLE) -> list[tuple[str, type[Any]]]:
+    return [(name, kind) for name in names.split()]
+
+
+class ByteCondition(ctypes.Structure):
+    """A condition on a payload byte."""
+
+    _fields_ = _fields("offset mask value")
+
+
+class IdentifierCondition(ctypes.Structure):
+    """A condition on an identifier."""
+
+    _fields_ = _fields("mask value")
+
+
+class Field(ctypes.Structure):
+    """Bits of an identifier."""
+
+    _fields_ = _fields("shift mask constant")
+
+
+class Form(ctypes.Structure):
+    """29-bit identifiers of one bus that are built alike."""
+
+    _fields_ = [
+        *_fields("bus n_conditions"),
+        *_fields("conditions", _POINTER),
+        ("patch", Field),
+        ("module", Field),
+        *_fields("n_patch_codes n_codes"),
+        *_fields("patch_codes patch_slots codes slots", _POINTER),
+    ]
+
+
+class Number(ctypes.Structure):
+    """A number in a payload that a device counts up."""
+
+    _fields_ = _fields("is_there offset type is_swapped mask shift turn")
+
+
+class Run(ctypes.Structure):
+    """Values that lie side by side in a payload."""
+
+    _fields_ = _fields("offset count type is_swapped column bits is_little is_signed skip")
+
+
+class ChannelBit(ctypes.Structure):
+    """A bit of a word that flags one channel."""
+
+    _fields_ = _fields("channel shift")
+
+
+class Flag(ctypes.Structure):
+    """What sets status bits."""
+
+    _fields_ = [
+        *_fields("form status offset type is_swapped mask n_each"),
+        *_fields("each", _POINTER),
+        *_fields("is_float is_possible integer"),
+        *_fields("real", _REAL),
+    ]
+
+
+class Kind(ctypes.Structure):
+    """A kind of frame."""
+
+    _fields_ = [
+        *_fields("n_conditions"),
+        *_fields("conditions", _POINTER),
+        *_fields("width column assembly cycle place is_expanded n_runs"),
+        *_fields("runs", _POINTER),
+        *_fields("n_flags"),
+        *_fields("flags", _POINTER),
+        *_fields("names_module key_byte key_shift key_mask n_keys"),
+        *_fields("module_by_key", _POINTER),
+        ("sequence", Number),
+    ]
+
+
+class Assembly(ctypes.Structure):
+    """What makes one update of a module."""
+
+    _fields_ = [*_fields("n_members"), *_fields("members channels destination", _POINTER)]
+
+
+class Cycle(ctypes.Structure):
+    """Frames that only count together."""
+
+    _fields_ = [
+        *_fields("n order maximum_age_ns assembly has_counter"),
+        *_fields("counters group_of_entry", _POINTER),
+        *_fields("compared_member"),
+        ("compared", Number),
+        *_fields("is_timed all_as_they_should period_ns reach_ns margin_ns soon_ns"),
+        *_fields("last_ns spacing_ns", _POINTER),
+    ]
+
+
+class Batch(ctypes.Structure):
+    """A :class:`skinware_drivers.bus.FrameBatch`."""
+
+    _fields_ = [
+        *_fields("wire time_ns bus", _POINTER),
+        *_fields("row_bytes payload_size headroom capacity start stop limit"),
+    ]
+
+
+class Columns(ctypes.Structure):
+    """Where the columns of a slot begin."""
+
+    _fields_ = _fields(
+        "values status module_time_ns patch_state bus_state bus_reason bus_since_ns bus_load bus_samples"
+        " bus_counters patch_counters patch_interval_counts patch_age_counts"
+    )
+
+
+HEAR = ctypes.CFUNCTYPE(None)
+OFFER = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)
+KEEP = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)
+EXPAND = ctypes.CFUNCTYPE(
+    None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64
+)
+PUBLISHED = ctypes.CFUNCTYPE(None, ctypes.c_int64)
+SORT_OUT = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+LOSE = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
+
+
+class Hooks(ctypes.Structure):
+    """What only Python can do."""
+
+    _fields_ = [
+        ("hear", HEAR),
+        ("tell_times", HEAR),
+        ("offer", OFFER),
+        ("keep", KEEP),
+        ("expand", EXPAND),
+        ("look", OFFER),
+        ("published", PUBLISHED),
+        ("sort_out", SORT_OUT),
+        ("lose", LOSE),
+    ]
+
+
+class Plan(ctypes.Structure):
+    """All of one generation."""
+
+    _fields_ = [
+        *_fields("n_buses n_patches n_modules n_sensors value_type value_bytes width"),
+        *_fields("n_slots nobody n_sets n_kinds n_forms length_columns header_byte"),
+        *_fields("entry candidates sets payload_names forms length_ok header kinds", _POINTER),
+        *_fields("n_assemblies n_cycles"),
+        *_fields("assemblies cycles module_patch sensor_module first_module", _POINTER),
+        *_fields("last_sequence haste unknown_identifiers sample_next_ns interrupted", _POINTER),
+        *_fields("values status module_time_ns patch_time_ns updated touched bus_counters patch_counters", _POINTER),
+        *_fields("period_ns patience_ns pause_ns silence_ns by_cycle most_at_once idle_ns n_counts n_own_counts"),
+        *_fields("stale state_live state_stale"),
+        *_fields("burst_pause_ns standing_out_ns gap_ns module_heard_ns patch_heard_ns patch_updated_ns", _POINTER),
+        *_fields("behind patch_state module_status bus_state bus_reason bus_samples bus_since_ns bus_load", _POINTER),
+        *_fields("bus_samples_bytes"),
+        *_fields("counts skipped skipped_before patch_bus", _POINTER),
+        *_fields("skipped_column"),
+        *_fields("timing timing_before_ns", _POINTER),
+        ("columns", Columns),
+        ("hooks", Hooks),
+    ]
+
+
+class Words(ctypes.Structure):
+    """What Python sees and sets between calls."""
+
+    _fields_ = _fields(
+        "fixed_ns carried n_updates n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
+        " hastened store sequence must_leave entry kind"
+    )
+
+
+UPDATE = np.dtype([(name, np.int64) for name in "module row whole is_flagged oldest_ns newest_ns".split()])
+"""An update; its sensors (int32), values and status (uint8) follow."""
+
+SIZES = tuple(
+    ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number)
+) + (UPDATE.itemsize, ctypes.sizeof(Assembly))
+"""As ``skinware_path_size`` tells them."""
+
+
+class Arrays:
+    """Memory that C code refers to by address, kept for as long as this is."""
+
+    def __init__(self) -> None:
+        self._kept: list[object] = []
+
+    def at(self, array: npt.NDArray[Any]) -> int:
+        """Address of an array that Python goes on with.
+
+        Raises:
+            ValueError: its elements do not lie one after the other.
+        """
+        if not array.flags.c_contiguous:
+            raise ValueError(f"an array of {array.shape} {array.dtype} whose elements lie apart")
+        self._kept.append(array)
+        return array.ctypes.data
+
+    def of(self, values: npt.ArrayLike, dtype: npt.DTypeLike) -> int:
+        """Address of a copy of these values."""
+        return self.at(np.array(values, dtype, order="C"))
+
+    def structs(self, kind: type[Any], rows: Iterable[Any]) -> tuple[int, int]:
+        """How many structures there are, and their address."""
+        found = list(rows)
+        memory = (kind * max(1, len(found)))(*found)
+        self._kept.append(memory)
+        return len(found), ctypes.addressof(memory)

@@ -1,0 +1,329 @@
+"""The data path in C for one generation: the decoder's and the publisher's arrays, and what Python adds to it."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import PlatformError
+from skinware.memory.statistics import BUCKETS
+from skinware.native import Library
+from skinware.realtime import now_ns
+from skinware.samples import Unused
+from skinware.status import PatchState, Status
+from skinware_drivers import native
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import OWN_BUS_COUNTERS
+from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.layout import Expand
+from skinware_drivers.native import structs
+from skinware_drivers.native.compiling import compile_decoder, why_not
+from skinware_drivers.running.publisher import Publisher
+from skinware_drivers.watch import Watch
+
+Rows = npt.NDArray[np.int64]
+
+_real_now_ns = now_ns
+_NOBODY = (1 << 63) - 1
+_SAMPLE_KINDS = 6
+
+
+def path_for(decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> tuple[NativePath | None, str]:
+    """The data path in C for these; None where numpy has to do it, and why."""
+    library = native.library()
+    if library is None:
+        return None, native.why_python()
+    if publisher.ring_address is None:
+        return None, "shared memory is written by Python"
+    why = why_not(decoder)
+    return (None, why) if why else (NativePath(library, decoder, publisher, batch, publisher.ring_address), "")
+
+
+class NativePath:
+    """Does what the decoder and the publisher do, on their arrays.
+
+    Args:
+        library: where the code is.
+        decoder: what frames mean, and what is known of the skin.
+        publisher: when frames are published, and what they say beside values.
+        batch: what buses fill.
+        ring: address of the ring's end.
+
+    Attributes:
+        hear: shown the new rows of each batch, before anything else, while somebody waits for a frame that is data.
+        offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
+    """
+
+    def __init__(
+        self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int
+    ) -> None:
+        self._decoder, self._publisher, self._batch = decoder, publisher, batch
+        self.hear: Callable[[Rows], None] | None = None
+        self.offer: Callable[[Rows], Rows] | None = None
+        self._error: BaseException | None = None
+        self._arrays = arrays = structs.Arrays()
+        self._plan, self._words, self._rows = structs.Plan(), structs.Words(), structs.Batch()
+        compile_decoder(decoder, self._plan, arrays)
+        self._compile_publisher(publisher, arrays)
+        self._compile_batch(batch, arrays)
+        self._hooks = self._make_hooks()
+        self._set_hooks()
+        self._load(library)
+        self._words.sequence = publisher.sequence
+        self._words.last_published_ns = now_ns()
+        self._path = ctypes.c_void_p(
+            library.quick.skinware_path_new(
+                ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words), ctypes.c_void_p(ring)
+            )
+        )
+        if not self._path:
+            raise MemoryError("no memory for the data path of a driver")
+        self._update = self._update_dtype()
+
+    def __del__(self) -> None:
+        if getattr(self, "_path", None):
+            self._free(self._path)
+
+    # -- what Python calls ----------------------------------------------------------------------------------------
+
+    def empty(self) -> None:
+        """Empty the batch, except for the frames that still wait for their partners, which come first."""
+        self._batch.clear()
+        self._batch.start = self._batch.headroom - self._words.carried
+
+    def digest(self, interrupted: Sequence[int] = ()) -> None:
+        """Decode the batch, and publish what is due.
+
+        Args:
+            interrupted: buses of which it is known that they have lost frames since the last batch.
+        """
+        self._interrupted[list(interrupted)] = True
+        self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
+        self._enter()
+        result = self._digest(self._path)
+        self._leave()
+        if result < 0:
+            raise MemoryError("no memory for the updates of a driver")
+
+    def publish(self) -> None:
+        """Publish what there is."""
+        self._enter()
+        self._publish(self._path)
+        self._leave()
+
+    def publish_if_due(self) -> None:
+        """Publish if the time has come, and nothing speaks against it."""
+        self._enter()
+        self._publish_if_due(self._path)
+        self._leave()
+
+    @property
+    def deadline_ns(self) -> int:
+        """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""
+        return int(self._deadline_ns(self._path))
+
+    def _enter(self) -> None:
+        counts = self._publisher.count_buses()
+        self._skipped_before[:] = counts[:, self._skipped_column]
+        self._words.fixed_ns = 0 if now_ns is _real_now_ns else now_ns()
+        self._words.wanted_ns = self._publisher.wanted_ns
+        self._set_hooks()
+
+    def _leave(self) -> None:
+        self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
+        for bus in np.flatnonzero(self._skipped).tolist():
+            self._publisher.bus_counters[bus].updates_skipped += int(self._skipped[bus])
+        self._skipped[:] = 0
+        if self._words.hastened:
+            self._words.hastened = 0
+            self._decoder.tell_of_haste()
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    # -- making it ------------------------------------------------------------------------------------------------
+
+    def _load(self, library: Library) -> None:
+        size = library.quick.skinware_path_size
+        size.argtypes, size.restype = [ctypes.c_int64], ctypes.c_int64
+        found = tuple(size(number) for number in range(len(structs.SIZES)))
+        if found != structs.SIZES:
+            raise PlatformError(f"the data path in C has structures of {found} bytes, not {structs.SIZES}")
+        library.quick.skinware_path_new.restype = ctypes.c_void_p
+        self._free = library.quick.skinware_path_free
+        self._count_strangers = library.quick.skinware_path_count_strangers
+        self._deadline_ns = library.quick.skinware_path_deadline_ns
+        self._deadline_ns.restype = ctypes.c_int64
+        self._digest = library.waiting.skinware_path_digest
+        self._digest.restype = ctypes.c_int64
+        self._publish = library.waiting.skinware_path_publish
+        self._publish_if_due = library.waiting.skinware_path_publish_if_due
+
+    def _compile_publisher(self, publisher: Publisher, arrays: structs.Arrays) -> None:
+        plan, bursts, structure = self._plan, publisher.bursts, self._decoder.tables.structure
+        n_buses = len(structure.buses)
+        plan.period_ns, plan.silence_ns = publisher.period_ns, publisher.silence_ns
+        plan.patience_ns, plan.pause_ns = publisher.patience_ns, publisher.pause_ns
+        plan.idle_ns, plan.by_cycle, plan.most_at_once = publisher.idle_ns, publisher.by_cycle, publisher.most_at_once
+        plan.stale = int(Status.STALE)
+        plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
+        plan.burst_pause_ns = arrays.at(bursts.pause_ns)
+        plan.standing_out_ns, plan.gap_ns = arrays.at(bursts.standing_out_ns), arrays.at(bursts.gap_ns)
+        plan.module_heard_ns = arrays.at(publisher.module_heard_ns)
+        plan.patch_heard_ns = arrays.at(publisher.patch_heard_ns)
+        plan.patch_updated_ns = arrays.at(publisher.patch_updated_ns)
+        plan.behind, plan.patch_state = arrays.at(publisher.behind), arrays.at(publisher.patch_state)
+        plan.module_status = arrays.at(publisher.watch.module_status)
+        plan.bus_state, plan.bus_reason = arrays.at(publisher.bus_state), arrays.at(publisher.bus_reason)
+        plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
+        plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
+        self._skipped_column = OWN_BUS_COUNTERS.index("updates_skipped")
+        counts = publisher.count_buses()
+        plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
+        plan.skipped_column = self._skipped_column
+        self._skipped, self._skipped_before = np.zeros((2, n_buses), np.int64)
+        plan.skipped, plan.skipped_before = arrays.at(self._skipped), arrays.at(self._skipped_before)
+        self._interrupted = np.zeros(n_buses, bool)
+        plan.interrupted = arrays.at(self._interrupted)
+        self._sample_next_ns = np.zeros((n_buses, _SAMPLE_KINDS), np.int64)
+        plan.sample_next_ns = arrays.at(self._sample_next_ns)
+        timing = publisher.timing
+        plan.timing, plan.timing_before_ns = arrays.at(timing.both), arrays.at(timing.before_ns)
+        assert timing.both.shape == (2, structure.n_patches, BUCKETS)
+        for name, offset in publisher.column_offsets().items():
+            setattr(plan.columns, name, offset)
+        self._words.on_request = publisher.on_request
+
+    def _compile_batch(self, batch: FrameBatch, arrays: structs.Arrays) -> None:
+        rows = self._rows
+        rows.wire, rows.time_ns, rows.bus = arrays.at(batch.wire), arrays.at(batch.time_ns), arrays.at(batch.bus)
+        rows.row_bytes, rows.payload_size = batch.wire.dtype.itemsize, batch.payload_size
+        rows.headroom, rows.capacity = batch.headroom, batch.capacity
+        rows.start, rows.stop, rows.limit = batch.start, batch.stop, batch.limit
+
+    def _update_dtype(self) -> np.dtype[np.void]:
+        """Rows of the updates in C."""
+        width, values = self._decoder.width, self._decoder.tables.structure.dtype
+        sensors_at = structs.UPDATE.itemsize
+        values_at = -(-(sensors_at + 4 * width) // 8) * 8
+        status_at = values_at + width * values.itemsize
+        fields: dict[str, tuple[Any, int]] = {
+            name: (np.int64, structs.UPDATE.fields[name][1])  # type: ignore[index]
+            for name in structs.UPDATE.names or ()
+        }
+        fields |= {
+            "sensors": ((np.int32, (width,)), sensors_at),
+            "values": ((values, (width,)), values_at),
+            "status": ((np.uint8, (width,)), status_at),
+        }
+        return np.dtype(
+            {
+                "names": list(fields),
+                "formats": [form for form, _ in fields.values()],
+                "offsets": [at for _, at in fields.values()],
+                "itemsize": -(-(status_at + width) // 8) * 8,
+            }
+        )
+
+    # -- what C calls ---------------------------------------------------------------------------------------------
+
+    def _make_hooks(self) -> structs.Hooks:
+        return structs.Hooks(
+            structs.HEAR(self._guarded(self._on_hear)),
+            structs.HEAR(self._guarded(self._on_times)),
+            structs.OFFER(self._guarded(self._on_offer)),
+            structs.KEEP(self._guarded(self._on_keep)),
+            structs.EXPAND(self._guarded(self._on_expand)),
+            structs.OFFER(self._guarded(self._on_look)),
+            structs.PUBLISHED(self._guarded(self._on_published)),
+        )
+
+    def _set_hooks(self) -> None:
+        """Let C call what there is to call now."""
+        wanted = {
+            "hear": self.hear is not None,
+            "tell_times": self._decoder.device_stamps.are_told,
+            "offer": self.offer is not None,
+            "keep": True,
+            "expand": True,
+            "look": type(self._publisher.watch).look is not Watch.look,
+            "published": True,
+        }
+        for name, is_wanted in wanted.items():
+            setattr(self._plan.hooks, name, getattr(self._hooks, name) if is_wanted else type(getattr(self._hooks, name))())
+
+    def _guarded(self, hook: Callable[..., None]) -> Callable[..., None]:
+        """What a hook raises cannot go through C: it is raised when C has come back."""
+
+        def call(*arguments: int) -> None:
+            if self._error is not None:
+                return
+            self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
+            try:
+                hook(*arguments)
+            except BaseException as error:  # noqa: BLE001
+                self._error = error
+                self._words.must_leave = True
+
+        return call
+
+    def _on_hear(self) -> None:
+        assert self.hear is not None
+        self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
+
+    def _on_times(self) -> None:
+        batch = self._batch
+        new = slice(max(batch.start, batch.headroom), batch.stop)
+        entry = _view(self._words.entry, batch.capacity, np.int64)[new]
+        kind = _view(self._words.kind, batch.capacity, np.uint8)[new]
+        self._decoder.device_stamps.tell(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
+
+    def _on_offer(self, at: int, n: int) -> None:
+        assert self.offer is not None
+        left = self.offer(_view(at, n, np.int64).copy())
+        self._count_strangers(self._path, ctypes.c_void_p(left.ctypes.data), ctypes.c_int64(len(left)))
+
+    def _on_keep(self, why: int, at: int, n: int) -> None:
+        decoder = self._decoder
+        decoder.keep_samples(Unused(why), self._batch.bus, self._batch.wire, _view(at, n, np.int64))
+        self._sample_next_ns[:, : len(Unused) + 1] = [samples.next_ns for samples in decoder.samples]
+
+    def _on_expand(self, number: int, updates_at: int, rows_at: int, failed_at: int, n: int) -> None:
+        updates, rows = _view(updates_at, n, np.int64), _view(rows_at, n, np.int64)
+        kind, columns = self._decoder.kinds[number], self._decoder.columns_of(number)
+        assert isinstance(kind.frame.values, Expand)
+        taken = self._batch.wire[rows]
+        values, found, failed = kind.expand(kind.frame.values, taken["payload"], taken["length"])
+        _view(failed_at, n, np.uint8)[failed] = True
+        records = self._updates(int(updates.max()) + 1)
+        records["values"][updates, columns] = values
+        sensors = records["sensors"][updates, columns]
+        sensors[~found] = self._plan.n_sensors
+        records["sensors"][updates, columns] = sensors
+
+    def _on_look(self, at: int, n: int) -> None:
+        numbers = _view(at, n, np.int64)
+        records = self._updates(int(numbers.max()) + 1)[numbers]
+        whole = records["whole"] != 0
+        sensors = records["sensors"].astype(np.int64)
+        sensors[~whole] = self._plan.n_sensors
+        parts = records["values"], records["status"], records["oldest_ns"], records["newest_ns"]
+        self._publisher.look(Updates(records["module"], whole, sensors, *parts, True))
+
+    def _on_published(self, oldest_ns: int) -> None:
+        self._publisher.answer(oldest_ns)
+        self._words.wanted_ns = self._publisher.wanted_ns
+
+    def _updates(self, n: int) -> npt.NDArray[np.void]:
+        return _view(self._words.store, n, self._update)
+
+
+def _view(address: int, n: int, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """(n,) elements of memory that C owns."""
+    found = np.dtype(dtype)
+    return np.frombuffer((ctypes.c_char * (n * found.itemsize)).from_address(address), found)

@@ -7,34 +7,25 @@ sleeps: load the wake word; fence; look at latest and state. docs/reference/shar
 
 from __future__ import annotations
 
-import mmap
-import operator
-import time
 from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import Closed, Overrun, ServiceError
+from skinware.errors import Overrun
 from skinware.memory import file_layout, futex
 from skinware.memory._fences import fence
 from skinware.memory.segments import Segment
-from skinware.memory.statistics import bucket_of
 from skinware.realtime import now_ns
 
 COPY_ATTEMPTS = 64
 """How often a reader tries again while the writer overwrites what it copies."""
-_LATEST = file_layout.LATEST_OFFSET // 8
-_MISSED_PERIODS = file_layout.MISSED_PERIODS_OFFSET // 8
-_WAKE_WORD = file_layout.WAKE_WORD_OFFSET // 4
-_STATE = file_layout.STATE_OFFSET // 4
-_SEQUENCE, _ACQUIRED, _PUBLISHED, _FLAGS = range(4)  # 8-byte words of a slot's header
+LATEST = file_layout.LATEST_OFFSET // 8
+MISSED_PERIODS = file_layout.MISSED_PERIODS_OFFSET // 8
+WAKE_WORD = file_layout.WAKE_WORD_OFFSET // 4
+STATE = file_layout.STATE_OFFSET // 4
+SEQUENCE, ACQUIRED, PUBLISHED, FLAGS = range(4)  # 8-byte words of a slot's header
 _HEADER_WORDS = file_layout.SLOT.itemsize // 8
-_STATISTICS = slice(file_layout.STATISTICS_OFFSET // 8, file_layout.COLUMN_OFFSET // 8)
-# words of the statistics: a count, two times (best, worst, total), another count, histograms
-_TIMED, _WALL, _CPU, _BEFORE_BOOT, _AGE = 0, 1, 4, 7, 8
-_LATENESS = _AGE + file_layout.HISTOGRAM_BUCKETS
-_MOST_NS, _ALL_FLAGS = (1 << 63) - 1, (1 << 64) - 1
 
 
 class Frame:
@@ -42,47 +33,47 @@ class Frame:
 
     Attributes:
         generation: which incarnation of the service it belongs to.
-        sequence: 1, 2, 3 ... within the generation.
-        acquired_ns: newest time stamp of the data in it, CLOCK_MONOTONIC ns.
-        published_ns: when the writer handed it out, CLOCK_MONOTONIC ns.
-        flags: bits for the service's own use.
         period_ns: the writer's nominal period, 0 if it has none.
         stale: the writer was dead when the frame was taken: this is its last word.
         context: what the reader knows of the service (for a driver: its structure).
     """
 
-    __slots__ = (
-        "_columns",
-        "_data",
-        "_words",
-        "acquired_ns",
-        "context",
-        "flags",
-        "generation",
-        "period_ns",
-        "published_ns",
-        "sequence",
-        "stale",
-    )
+    __slots__ = ("_columns", "_data", "_header", "_in_ring", "context", "generation", "period_ns", "stale")
 
     def __init__(
         self,
         ring: RingReader[Any],
         data: bytearray | memoryview,
-        sequence: int,
-        words: memoryview,
+        in_ring: memoryview | None = None,
     ) -> None:
         self._data = data
-        self._words = words if type(data) is memoryview else None
+        self._in_ring = in_ring
+        self._header = memoryview(data).cast("Q") if in_ring is None else in_ring.tolist()
         self._columns = ring.columns
         self.context: object = ring.context
         self.generation: int = ring.generation
         self.period_ns: int = ring.period_ns
-        self.sequence: int = sequence
-        self.acquired_ns: int = words[_ACQUIRED]
-        self.published_ns: int = words[_PUBLISHED]
-        self.flags: int = words[_FLAGS]
         self.stale: bool = False
+
+    @property
+    def sequence(self) -> int:
+        """1, 2, 3 ... within the generation."""
+        return self._header[SEQUENCE]
+
+    @property
+    def acquired_ns(self) -> int:
+        """Newest time stamp of the data in it, CLOCK_MONOTONIC ns."""
+        return self._header[ACQUIRED]
+
+    @property
+    def published_ns(self) -> int:
+        """When the writer handed it out, CLOCK_MONOTONIC ns."""
+        return self._header[PUBLISHED]
+
+    @property
+    def flags(self) -> int:
+        """Bits for the service's own use."""
+        return self._header[FLAGS]
 
     @property
     def position(self) -> tuple[int, int]:
@@ -97,10 +88,10 @@ class Frame:
     @property
     def valid(self) -> bool:
         """Whether the writer has left the memory alone so far; always True for a copy."""
-        if self._words is None:
+        if self._in_ring is None:
             return True
         fence()
-        return bool(self._words[_SEQUENCE] == self.sequence)
+        return bool(self._in_ring[SEQUENCE] == self.sequence)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """One column of the frame, a view of its memory.
@@ -150,13 +141,13 @@ class RingReader(Generic[FrameT]):
         self._half_words = segment.data.data.cast("I")
         self.wake_word: futex.Word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
         self._count = layout.slot_count
-        self._slots = _slots(segment)
-        self._slot_words = _slot_headers(segment)
+        self._slots = slots_of(segment)
+        self._slot_words = slot_headers_of(segment)
 
     @property
     def latest(self) -> int:
         """Sequence of the newest frame, 0 before the first."""
-        return self._words[_LATEST]
+        return self._words[LATEST]
 
     @property
     def slot_count(self) -> int:
@@ -166,23 +157,26 @@ class RingReader(Generic[FrameT]):
     @property
     def state(self) -> int:
         """``STATE_*`` bits."""
-        return self._half_words[_STATE]
+        return self._half_words[STATE]
 
     @property
     def wake_count(self) -> int:
         """Present value of the futex word; take it before looking at ``latest`` or ``state``."""
-        count = self._half_words[_WAKE_WORD]
+        count = self._half_words[WAKE_WORD]
         fence()
         return count
 
-    def sleep(self, wake_count: int, latest: int, timeout_ns: int) -> bool:
+    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
         """Sleep until the futex word is another than ``wake_count``, or the time is up; may return early.
 
         Returns:
-            Whether the newest frame is another than ``latest`` now.
+            A copy, as of ``copy(sequence)``, if the newest frame is another than ``latest`` then.
+
+        Raises:
+            Overrun: as ``copy``.
         """
         self.wake_word.wait(wake_count, timeout_ns)
-        return self._words[_LATEST] != latest
+        return self.copy(sequence) if self.latest != latest else None
 
     def copy(self, sequence: int | None = None) -> FrameT | None:
         """A private copy of a frame.
@@ -205,7 +199,10 @@ class RingReader(Generic[FrameT]):
             frame = self._copy(latest)
             if frame is not None:
                 return frame
-        raise Overrun(
+        raise self._overrun()
+
+    def _overrun(self) -> Overrun:
+        return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
             f"give the service more slots (it has {self._count}) or publish less often"
         )
@@ -213,25 +210,25 @@ class RingReader(Generic[FrameT]):
     def _copy(self, sequence: int) -> FrameT | None:
         slot = sequence % self._count
         words = self._slot_words[slot]
-        if words[_SEQUENCE] != sequence:
+        if words[SEQUENCE] != sequence:
             return None
         fence()
-        frame = self._frame_class(self, bytearray(self._slots[slot]), sequence, words)
+        frame = self._frame_class(self, bytearray(self._slots[slot]))
         fence()
-        return frame if words[_SEQUENCE] == sequence else None
+        return frame if words[SEQUENCE] == sequence else None
 
     @property
     def missed_periods(self) -> int:
         """Periods that the writer missed."""
-        return self._words[_MISSED_PERIODS]
+        return self._words[MISSED_PERIODS]
 
     def publication_times_ns(self) -> list[int]:
         """When the frames that the ring still holds were published, oldest first."""
-        return [time_ns for _, time_ns in self._times_ns(_PUBLISHED)]
+        return [time_ns for _, time_ns in self._times_ns(PUBLISHED)]
 
     def acquisition_times_ns(self) -> list[tuple[int, int]]:
         """(sequence, ``acquired_ns``) of the frames that the ring still holds, oldest first."""
-        return self._times_ns(_ACQUIRED)
+        return self._times_ns(ACQUIRED)
 
     def _times_ns(self, word: int) -> list[tuple[int, int]]:
         times = []
@@ -240,7 +237,7 @@ class RingReader(Generic[FrameT]):
             words = self._slot_words[sequence % self._count]
             time_ns = words[word]
             fence()
-            if words[_SEQUENCE] == sequence:
+            if words[SEQUENCE] == sequence:
                 times.append((sequence, time_ns))
         return times
 
@@ -251,144 +248,19 @@ class RingReader(Generic[FrameT]):
             if wanted == 0:
                 return None
             slot = wanted % self._count
-            frame = self._frame_class(self, self._slots[slot], wanted, self._slot_words[slot])
-            if frame.valid:
+            frame = self._frame_class(self, self._slots[slot], self._slot_words[slot])
+            if frame.sequence == wanted and frame.valid:
                 return frame
         raise Overrun(f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row")
 
 
-class RingWriter:
-    """The writer's end of one generation. Not for several threads at once."""
-
-    def __init__(self, segment: Segment) -> None:
-        layout = segment.layout
-        self.segment = segment
-        self._words = segment.data.data.cast("Q")
-        self._half_words = segment.data.data.cast("I")
-        self._wake_word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
-        self._count = layout.slot_count
-        self._slot_words = _slot_headers(segment)
-        self._columns = [
-            {name: np.ndarray(*where[:2], slot, where[2]) for name, where in segment.slot_formats().items()}
-            for slot in _slots(segment)
-        ]
-        self._contents = [slot[file_layout.SLOT.itemsize :] for slot in _slots(segment)]
-        self._statistics = self._words[_STATISTICS]
-        self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
-        for page in range(0, layout.file_size, mmap.PAGESIZE):
-            segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
-
-    @property
-    def sequence(self) -> int:
-        """Sequence of the newest frame, 0 before the first."""
-        return self._words[_LATEST]
-
-    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
-        """The columns of the next slot, to be filled; they hold an old frame.
-
-        Until ``commit``, readers of that old frame are told that it is gone.
-
-        Args:
-            from_last: copy the newest frame into it first, for writers that change parts only.
-        """
-        if self.segment.descriptor.fd < 0:
-            raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
-        latest = self.sequence
-        slot = (latest + 1) % self._count
-        self._begun_ns = now_ns()
-        self._slot_words[slot][_SEQUENCE] = 0
-        fence()
-        if from_last and latest:
-            self._contents[slot][:] = self._contents[latest % self._count]
-        return self._columns[slot]
-
-    def commit(self, acquired_ns: int, flags: int = 0) -> int:
-        """Publish what was filled in since ``begin`` and wake all readers with one system call.
-
-        If it raises, nothing has changed: the newest frame is the one before, and the one begun may be committed still.
-        An exception from outside in the middle of it (Ctrl-C) leaves the frame published, or not at all.
-
-        Args:
-            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
-                machine booted) it counts as 0, and in ``WriterStatistics.before_boot``.
-            flags: bits for the service's own use.
-
-        Returns:
-            The frame's sequence.
-
-        Raises:
-            Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
-            ServiceError: there was no ``begin`` before it: the slot holds an old frame.
-            TypeError: ``acquired_ns`` or ``flags`` is no integer.
-            ValueError: ``acquired_ns`` does not fit 63 bits, or ``flags`` 64.
-        """
-        if self.segment.descriptor.fd < 0:
-            raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
-        if not self._begun_ns:
-            raise ServiceError(f"{self.segment.path}: commit without begin would publish an old frame as a new one")
-        acquired_ns, flags = operator.index(acquired_ns), operator.index(flags)
-        if acquired_ns > _MOST_NS or not 0 <= flags <= _ALL_FLAGS:
-            raise ValueError(f"{self.segment.path}: a frame has 63 bits for acquired_ns ({acquired_ns}), 64 for flags")
-        if acquired_ns < 0:
-            acquired_ns = 0
-            self._statistics[_BEFORE_BOOT] += 1
-        sequence = self.sequence + 1
-        words = self._slot_words[sequence % self._count]
-        published_ns = now_ns()
-        words[_ACQUIRED] = acquired_ns
-        words[_PUBLISHED] = published_ns
-        words[_FLAGS] = flags
-        fence()
-        words[_SEQUENCE] = sequence
-        begun_ns, self._begun_ns = self._begun_ns, 0
-        self._words[_LATEST] = sequence  # from now on it is published: this word alone says so
-        self.wake()
-        self._note(begun_ns, published_ns, acquired_ns)
-        return sequence
-
-    def wake(self) -> None:
-        """Wake everybody who waits for this generation."""
-        fence()  # who sees the new word sees what it is about; the system call itself orders the word
-        self._half_words[_WAKE_WORD] = (self._half_words[_WAKE_WORD] + 1) & 0xFFFF_FFFF
-        self._wake_word.wake_all()
-
-    def count_missed_periods(self, count: int) -> None:
-        """Add to the number of periods that this writer missed, for everybody to see."""
-        self._words[_MISSED_PERIODS] += count
-
-    def count_lateness(self, late_ns: int) -> None:
-        """Tell how late a period began."""
-        self._statistics[_LATENESS + bucket_of(late_ns)] += 1
-
-    def _note(self, begun_ns: int, published_ns: int, acquired_ns: int) -> None:
-        """Statistics of one publication, after the readers have been woken."""
-        words = self._statistics
-        words[_AGE + bucket_of(published_ns - acquired_ns)] += 1
-        words[_TIMED] = timed = words[_TIMED] + 1
-        cpu_ns = time.thread_time_ns()
-        passed_ns = max(0, cpu_ns - self._cpu_ns)  # below 0 if another thread publishes now
-        self._cpu_ns = cpu_ns
-        for first, value_ns in ((_WALL, published_ns - begun_ns), (_CPU, passed_ns)):
-            if value_ns < words[first] or timed == 1:
-                words[first] = value_ns
-            if value_ns > words[first + 1]:
-                words[first + 1] = value_ns
-            words[first + 2] += value_ns
-
-    def set_state(self, bits: int, on: bool = True) -> None:
-        """Set ``STATE_*`` bits, or clear them, and wake everybody."""
-        state = self._half_words[_STATE]
-        self._half_words[_STATE] = state | bits if on else state & ~bits
-        self.wake()
-
-
-def _slots(segment: Segment) -> list[memoryview]:
+def slots_of(segment: Segment) -> list[memoryview]:
     """The bytes of every slot, its header and its columns, in place."""
     layout = segment.layout
     starts = range(layout.slot_offset, layout.slot_offset + layout.slot_count * layout.slot_stride, layout.slot_stride)
     return [segment.data.data[start : start + layout.slot_stride] for start in starts]
 
 
-def _slot_headers(segment: Segment) -> list[memoryview]:
+def slot_headers_of(segment: Segment) -> list[memoryview]:
     """The 8-byte words of every slot's header, in place."""
-    return [slot.cast("Q")[:_HEADER_WORDS] for slot in _slots(segment)]
+    return [slot.cast("Q")[:_HEADER_WORDS] for slot in slots_of(segment)]

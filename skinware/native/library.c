@@ -28,6 +28,7 @@ SKINWARE_EXPORT int skinware_native_copy(const skinware__ring *ring, uint64_t wa
 SKINWARE_EXPORT int skinware_native_wait(const skinware_native_request *request, unsigned char *to);
 SKINWARE_EXPORT void skinware_native_begin(skinware_ring_writer *writer);
 SKINWARE_EXPORT uint64_t skinware_native_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags);
+SKINWARE_EXPORT void skinware_native_wake(const skinware_ring_writer *writer);
 
 uint32_t skinware_native_abi(void) {
     return ABI;
@@ -66,4 +67,8 @@ void skinware_native_begin(skinware_ring_writer *writer) {
 
 uint64_t skinware_native_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags) {
     return skinware_ring_commit(writer, acquired_ns, flags);
+}
+
+void skinware_native_wake(const skinware_ring_writer *writer) {
+    skinware_ring_wake(writer);
 }

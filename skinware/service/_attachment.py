@@ -9,6 +9,7 @@ import numpy.typing as npt
 from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
+from skinware.memory.native_ring import ring_reader
 from skinware.memory.ring import Frame, FrameT, RingReader
 from skinware.memory.schema import Schema
 from skinware.memory.statistics import WriterStatistics, read_statistics
@@ -147,8 +148,8 @@ class Attachment(Generic[FrameT]):
     def _attach(self, known: RingReader[FrameT] | None = None) -> RingReader[FrameT]:
         segment = segments.attach(self.namespace, self.name)
         if known is not None and _digest(segment) == _digest(known.segment):
-            return RingReader(segment, self.frame_class, known.context)
-        return RingReader(segment, self.frame_class, self._describe(segment))
+            return ring_reader(segment, self.frame_class, known.context)
+        return ring_reader(segment, self.frame_class, self._describe(segment))
 
     def _describe(self, _attached: segments.Segment) -> object:
         """What frames carry as ``context`` (a subclass reads its structure here); kept while the columns are equal."""

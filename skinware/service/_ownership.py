@@ -15,7 +15,8 @@ from skinware.errors import Closed, NameInUse, NamespaceError
 from skinware.memory import file_layout, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
-from skinware.memory.ring import RingWriter
+from skinware.memory.native_ring import ring_writer
+from skinware.memory.ring_writer import RingWriter
 from skinware.memory.schema import Column, Schema
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service._server import RequestServer
@@ -216,7 +217,7 @@ class Ownership:
                 published_before=published_before,
             )
             try:
-                ring = RingWriter(segment)
+                ring = ring_writer(segment)
                 ring.set_state(file_layout.STATE_PAUSED, self._paused)
                 segments.publish(segment, self.namespace, self.name)
             except BaseException:

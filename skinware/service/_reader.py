@@ -117,8 +117,7 @@ class ServiceReader(Attachment[FrameT]):
                     return frame
                 known = frame.position
         while True:
-            alive = self._wait_for_newer(known, deadline_ns, max_age_s)
-            frame = self._taken(self._whole(self._ring.copy), alive)
+            frame = self._next_frame(known, deadline_ns, max_age_s=max_age_s)
             if _is_young(frame, max_age_s):
                 return frame
             known = frame.position
@@ -200,10 +199,9 @@ class ServiceReader(Attachment[FrameT]):
             deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
             if self._lags():
                 self._accounts.end_turn()
-                alive = self.alive
+                yield self._taken(self._whole(self._next_in_order), self.alive)
             else:
-                alive = self._wait_for_newer(self._last, deadline_ns)
-            yield self._taken(self._whole(self._next_in_order), alive)
+                yield self._next_frame(self._last, deadline_ns, in_order=True)
 
     def request(self, *, timeout_s: float = 5.0) -> FrameT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
@@ -254,8 +252,15 @@ class ServiceReader(Attachment[FrameT]):
 
     # -- waiting ------------------------------------------------------------------------------------------------
 
-    def _wait_for_newer(self, known: Position | None, deadline_ns: int | None, max_age_s: float | None = None) -> bool:
-        """Wait for a frame that is newer than ``known``; whether its writer is running.
+    def _next_frame(
+        self,
+        known: Position | None,
+        deadline_ns: int | None,
+        *,
+        in_order: bool = False,
+        max_age_s: float | None = None,
+    ) -> FrameT:
+        """Wait for a frame that is newer than ``known``: the newest, or the next in order.
 
         One that is slept for was published within the last slice: its writer lived then, which saves the question
         at the very moment at which a reader is in a hurry.
@@ -273,15 +278,23 @@ class ServiceReader(Attachment[FrameT]):
             latest = ring.latest
             if latest and (known is None or (ring.generation, latest) > known):
                 self._accounts.end_turn()
-                return self.alive
+                take = self._next_in_order if in_order else self._ring.copy
+                return self._taken(self._whole(take), self.alive)
             if self._moved:
                 raise self._structure_changed()
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came(max_age_s))
             self._accounts.end_turn()
-            if ring.sleep(wake_count, latest, min(remaining_ns, WAIT_SLICE_NS)):
-                return True
+            timeout_ns = min(remaining_ns, WAIT_SLICE_NS)
+            try:
+                frame = ring.wait(wake_count, latest, timeout_ns, latest + 1 if in_order else None)
+            except Overrun:
+                self._accounts.record.overruns += 1
+                raise
+            if frame is not None:
+                self._count(frame)
+                return frame
             look_around = True
 
     def _structure_changed(self) -> StructureChanged:

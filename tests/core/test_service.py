@@ -14,7 +14,7 @@ from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory import _fences, file_layout, segments
 from skinware.memory import ring as ring_module
-from skinware.memory.ring import RingReader, RingWriter
+from skinware.memory.native_ring import ring_reader, ring_writer
 from skinware.memory.schema import Schema
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
@@ -221,9 +221,9 @@ def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     lock = segments.take_name(namespace, "x")
     schema = Schema.of(SMALL, "")
     segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
-    writer = RingWriter(segment)
+    writer = ring_writer(segment)
     segments.publish(segment, namespace, "x")
-    reader = RingReader(segments.attach(namespace, "x"), Frame)
+    reader = ring_reader(segments.attach(namespace, "x"), Frame)
     writer._half_words[file_layout.WAKE_WORD_OFFSET // 4] = 0xFFFF_FFFF
     writer.begin()["values"][:] = 1
     assert writer.commit(5) == 1

@@ -91,11 +91,7 @@ class _WriterState(ctypes.Structure):
 
 
 class NativeRingWriter(RingWriter):
-    """The writer's end whose publication is a call of C.
-
-    Attributes:
-        native_address: of its ``skinware_ring_writer``, for C code that publishes through it.
-    """
+    """The writer's end whose publication is a call of C."""
 
     def __init__(self, segment: Segment, library: native.Library) -> None:
         super().__init__(segment)

@@ -37,7 +37,13 @@ _MOST_NS, _ALL_FLAGS = (1 << 63) - 1, (1 << 64) - 1
 
 
 class RingWriter:
-    """The writer's end of one generation. Not for several threads at once."""
+    """The writer's end of one generation. Not for several threads at once.
+
+    Attributes:
+        native_address: of its ``skinware_ring_writer``, for C code that publishes through it; None: Python publishes.
+    """
+
+    native_address: int | None = None
 
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout

@@ -96,6 +96,15 @@ class Ownership:
         return self.generation, self.sequence
 
     @property
+    def ring_address(self) -> int | None:
+        """Of the ring's ``skinware_ring_writer``, for C code that publishes through it; None where Python does."""
+        return self._ring.native_address
+
+    def column_offsets(self) -> dict[str, int]:
+        """Where each column begins, bytes from the beginning of a slot."""
+        return {name: offset for name, (_, _, offset) in self._ring.segment.slot_formats().items()}
+
+    @property
     def paused(self) -> bool:
         """Whether ``pause`` was called last."""
         return self._paused

@@ -212,9 +212,7 @@ class Decoder:
             time_ns[early] = _EARLIEST_NS
             self.state.bus_counters[:, 3] += np.bincount(bus[early], minlength=len(self.state.bus_counters))
 
-    def keep_samples(
-        self, why: Unused, bus: npt.NDArray[np.uint16], wire: npt.NDArray[np.void], rows: Indices
-    ) -> None:
+    def keep_samples(self, why: Unused, bus: npt.NDArray[np.uint16], wire: npt.NDArray[np.void], rows: Indices) -> None:
         """Keep some of these rows of a batch, which cannot be used."""
         if len(rows):
             for ordinal, samples in enumerate(self.samples):

@@ -29,7 +29,9 @@ def why_not(decoder: Decoder) -> str:
         runs = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
         if not all(dtype.str[1:] in _TYPES for dtype in runs):
             return f"frame {frame.name!r}: values of an unusual dtype"
-        if len({dtype.kind == "f" for dtype in runs}) > 1 or (runs and np.result_type(*runs).kind != runs[0].kind == "f"):
+        if len({dtype.kind == "f" for dtype in runs}) > 1 or (
+            runs and np.result_type(*runs).kind != runs[0].kind == "f"
+        ):
             return f"frame {frame.name!r}: integers beside floats"
         if runs and np.result_type(*runs).kind == "f" and not decoder.tables.structure.dtype.kind == "f":
             return f"frame {frame.name!r}: floats where the driver has integers"

@@ -132,9 +132,7 @@ class Columns(ctypes.Structure):
 HEAR = ctypes.CFUNCTYPE(None)
 OFFER = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64)
 KEEP = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)
-EXPAND = ctypes.CFUNCTYPE(
-    None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64
-)
+EXPAND = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
 PUBLISHED = ctypes.CFUNCTYPE(None, ctypes.c_int64)
 SORT_OUT = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 LOSE = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
@@ -192,9 +190,10 @@ class Words(ctypes.Structure):
 UPDATE = np.dtype([(name, np.int64) for name in "module row whole is_flagged oldest_ns newest_ns".split()])
 """An update; its sensors (int32), values and status (uint8) follow."""
 
-SIZES = tuple(
-    ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number)
-) + (UPDATE.itemsize, ctypes.sizeof(Assembly))
+SIZES = tuple(ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number)) + (
+    UPDATE.itemsize,
+    ctypes.sizeof(Assembly),
+)
 """As ``skinware_path_size`` tells them."""
 
 

@@ -49,7 +49,9 @@ class Bursts:
         self._module_patch = module_patch
         self._n_patches = len(state.patch_time_ns)
         self.pause_ns: Indices = np.full(self._n_patches, period_ns // 2, np.int64)
-        self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
+        self.standing_out_ns: npt.NDArray[np.float64] = (
+            _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
+        )
         self._first_module = np.searchsorted(module_patch, np.arange(self._n_patches))
         self.gap_ns: Indices = np.zeros(len(module_patch), np.int64)  # before the last update of each module
         self._longest_pause_ns = period_ns // 2

@@ -52,6 +52,7 @@ class RequestDesk:
 
     def take(self) -> None:
         """Take the requests that have arrived; safe as a callback of the loop."""
+        self._waiting = [(time_ns, request) for time_ns, request in self._waiting if not request.cancelled]
         for request in self._server.take():
             if request.operation == ACQUIRE:
                 self._waiting.append((now_ns(), request))

@@ -59,9 +59,7 @@ class NativePath:
         offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
     """
 
-    def __init__(
-        self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int
-    ) -> None:
+    def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self.hear: Callable[[Rows], None] | None = None
         self.offer: Callable[[Rows], Rows] | None = None
@@ -255,7 +253,9 @@ class NativePath:
             "published": True,
         }
         for name, is_wanted in wanted.items():
-            setattr(self._plan.hooks, name, getattr(self._hooks, name) if is_wanted else type(getattr(self._hooks, name))())
+            setattr(
+                self._plan.hooks, name, getattr(self._hooks, name) if is_wanted else type(getattr(self._hooks, name))()
+            )
 
     def _guarded(self, hook: Callable[..., None]) -> Callable[..., None]:
         """What a hook raises cannot go through C: it is raised when C has come back."""

@@ -278,6 +278,12 @@ class Link:
         await asyncio.sleep(duration_s)
 
     @property
+    def is_listening(self) -> bool:
+        """Whether frames that are none of the layout's matter to anybody: ``offer`` wants to be called."""
+        self._forget_late()
+        return bool(self._waiters or self._late or self._heard is not None)
+
+    @property
     def expects_data(self) -> bool:
         """Whether a question is open whose answer may be data: ``hear`` wants to be called."""
         return self._expected is not None
@@ -291,14 +297,16 @@ class Link:
         if any(match.fits(_reply(batch, row)) for row in likely):
             came.set()
 
+    def _forget_late(self) -> None:
+        while self._late and self._late[0][0] < now_ns():
+            self._late.popleft()
+
     def offer(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """Show frames of this bus to those who wait (called by the runner); returns the rows that nobody waited for.
 
         An answer that comes too late, after its question was given up, is still none of a stranger.
         """
-        while self._late and self._late[0][0] < now_ns():
-            self._late.popleft()
-        if not len(rows) or not (self._waiters or self._late or self._heard is not None):
+        if not len(rows) or not self.is_listening:
             return rows
         expected = np.zeros(len(rows), bool)
         identifier = batch.wire["identifier"][rows]

@@ -45,6 +45,7 @@ class Rows:
     Attributes:
         control: (capacity, CONTROL_WORDS) int64, ancillary data of each row; where the kernel gave none, what was left
             from before (see ``forget``).
+        headers_address: of the ``mmsghdr`` of the first row.
     """
 
     def __init__(self, batch: FrameBatch) -> None:
@@ -64,12 +65,12 @@ class Rows:
         self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
         self._control_length = self._headers["control_length"]
         self._flags = self._headers["flags"]
-        self._address = self._headers.ctypes.data
+        self.headers_address: int = self._headers.ctypes.data
 
     def receive(self, fd: int, free: slice) -> int:
         """Fill free rows of the batch; returns how many were filled, -1 on an error (errno)."""
         self._control_length[free] = 8 * CONTROL_WORDS  # the kernel wrote what it used
-        address = self._address + _MMSGHDR.itemsize * free.start
+        address = self.headers_address + _MMSGHDR.itemsize * free.start
         count: int = _recvmmsg(fd, address, free.stop - free.start, socket.MSG_DONTWAIT, None)
         return count
 

@@ -24,10 +24,10 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch, KernelSource, Received
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
-from skinware_drivers.can.recvmmsg import Rows, rows_of
+from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
 from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.options import options_from_strings
@@ -212,18 +212,51 @@ class SocketCanBus(Bus):
             rows.forget(free)
         count = rows.receive(self._socket.fileno(), free)
         if count < 0:
-            return self._nothing_received(ctypes.get_errno())
+            return self.nothing_received(ctypes.get_errno())
         new = slice(first, first + count)
         batch.time_ns[new] = self._stamper.read(rows.control[new])
         batch.bus[new] = ordinal
-        kept = self._sort_out(batch, new, rows)
+        kept = self.sort_out(batch, new)
         batch.stop += kept
         self.counters.frames += kept
-        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         if self.bit_rate:
             self.wire_bits += wire_bits(batch.wire[first : first + kept], self._speed_up)
         self._read_memory()
         return kept
+
+    @property
+    def reads_natively(self) -> bool:
+        """Whether frames have the kernel's stamps; a controller's clock is followed in Python."""
+        return not self._stamper.hardware
+
+    def hand_over(self, batch: FrameBatch) -> KernelSource | None:
+        """What C code needs to receive in place of this; None while it cannot.
+
+        Args:
+            batch: into whose rows.
+        """
+        if self._socket is None or not self.reads_natively:
+            return None
+        rows = rows_of(batch)
+        return KernelSource(
+            self._socket.fileno(),
+            rows.headers_address,
+            rows.control.ctypes.data,
+            *self._stamper.state,
+            self._lost_before,
+            self.bit_rate > 0,
+            self._speed_up,
+        )
+
+    def take_back(self, received: Received) -> None:
+        """What C code did meanwhile."""
+        self._stamper.state = received.offset_ns, received.last_poll_ns
+        self.counters.frames += received.frames
+        self.counters.lost = received.lost
+        self.wire_bits += received.wire_bits
+        self.fullest = max(self.fullest, received.fullest)
+        if received.frames:
+            self._health.heard_data()
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
@@ -263,7 +296,12 @@ class SocketCanBus(Bus):
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
 
-    def _nothing_received(self, number: int) -> int:
+    def nothing_received(self, number: int) -> int:
+        """What an error of the kernel in the place of frames means.
+
+        Raises:
+            BusNotAvailable: the interface went down or away.
+        """
         if number in (errno.EAGAIN, errno.EINTR):
             return 0
         if number == errno.ENETDOWN:
@@ -271,9 +309,9 @@ class SocketCanBus(Bus):
         reason = BusReason.INTERFACE_GONE if number in _AWAY else BusReason.FAILED
         raise BusNotAvailable(f"bus {self.channel} vanished ({os.strerror(number)})", reason=reason)
 
-    def _sort_out(self, batch: FrameBatch, new: slice, rows: Rows) -> int:
-        """Take what is no data frame of this layout out of the new rows; returns how many are left."""
-        wire, first = batch.wire[new], new.start
+    def sort_out(self, batch: FrameBatch, new: slice) -> int:
+        """Take what is no data frame of this layout out of new rows of a batch; returns how many are left."""
+        rows, wire, first = rows_of(batch), batch.wire[new], new.start
         identifier = wire["identifier"]
         is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.any_cut(new)
         if is_usual and (not len(wire) or int(wire["length"].max()) <= batch.payload_size):
@@ -287,6 +325,7 @@ class SocketCanBus(Bus):
         self.samples.take(Unused.REFUSED, wire[other])
         good = np.flatnonzero(~(is_error | other))
         self._take_errors(np.flatnonzero(is_error), good, identifier, wire["payload"])
+        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
         good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]

@@ -59,6 +59,15 @@ class Stamper:
         self._last_poll_ns = now_ns()
         self._offset_ns = _offset_now_ns()[0]
 
+    @property
+    def state(self) -> tuple[int, int]:
+        """What is known of the clocks: CLOCK_MONOTONIC - CLOCK_REALTIME, ns, and when frames were stamped last."""
+        return self._offset_ns, self._last_poll_ns
+
+    @state.setter
+    def state(self, state: tuple[int, int]) -> None:
+        self._offset_ns, self._last_poll_ns = state
+
     def switch_on(self, sock: socket.socket) -> None:
         """Let the kernel stamp what this socket receives."""
         if self.hardware:

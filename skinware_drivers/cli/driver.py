@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from skinware_drivers.bus import Bus
     from skinware_drivers.bus_names import BusPlace
     from skinware_drivers.options.file import ConfigFile, DriverConfig
-    from skinware_drivers.running.runner import PublishMode, Runner
-
+    from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.runner import PublishMode, Runner
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -263,7 +263,8 @@ def command(
     )
     if profile is not None:
         profile.apply()
-    asyncio.run(_run(runner, as_json, read_buses_again))
+    with asyncio.Runner(loop_factory=FlowLoop) as loop:
+        loop.run(_run(runner, as_json, read_buses_again))
 
 
 async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Coroutine[Any, Any, None]]) -> None:

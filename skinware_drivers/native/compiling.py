@@ -9,7 +9,7 @@ import numpy as np
 from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
-from skinware_drivers.layout import Byte, Expand, Flag, Frame, Packed, Sentinel, StatusBytes
+from skinware_drivers.layout import Byte, Expand, Frame, Packed, Sentinel, StatusBytes
 from skinware_drivers.native import structs
 from skinware_drivers.numbering import SequenceNumber
 
@@ -29,11 +29,9 @@ def why_not(decoder: Decoder) -> str:
         runs = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
         if not all(dtype.str[1:] in _TYPES for dtype in runs):
             return f"frame {frame.name!r}: values of an unusual dtype"
-        if len({dtype.kind == "f" for dtype in runs}) > 1 or (
-            runs and np.result_type(*runs).kind != runs[0].kind == "f"
-        ):
+        if len({dtype.kind == "f" for dtype in runs}) > 1:
             return f"frame {frame.name!r}: integers beside floats"
-        if runs and np.result_type(*runs).kind == "f" and not decoder.tables.structure.dtype.kind == "f":
+        if runs and runs[0].kind == "f" and decoder.tables.structure.dtype.kind != "f":
             return f"frame {frame.name!r}: floats where the driver has integers"
         if runs and runs[0].kind != "f" and np.result_type(*runs).kind == "f":
             return f"frame {frame.name!r}: values of 64 bits with and without a sign"
@@ -176,7 +174,6 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
         return _sentinel(flag, values)
     if isinstance(flag, StatusBytes):
         return structs.Flag(form=_STATUS_BYTES, offset=flag.offset, mask=int(flag.mask))
-    assert isinstance(flag, Flag)
     dtype, is_swapped = _type(flag.dtype)
     n_each, each = arrays.structs(structs.ChannelBit, (structs.ChannelBit(*pair) for pair in flag.each))
     word = {"offset": flag.offset, "type": dtype, "is_swapped": is_swapped, "mask": flag.mask}

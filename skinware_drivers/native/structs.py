@@ -187,14 +187,36 @@ class Words(ctypes.Structure):
     )
 
 
-UPDATE = np.dtype([(name, np.int64) for name in "module row whole is_flagged oldest_ns newest_ns".split()])
+class Source(ctypes.Structure):
+    """A socket that C reads."""
+
+    _fields_ = [
+        *_fields("fd bus headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
+        *_fields("lost_column frames_column is_counted is_watched"),
+        *_fields("speed_up wire_bits fullest", _REAL),
+    ]
+
+
+class Flow(ctypes.Structure):
+    """The loop that takes, publishes and rests."""
+
+    _fields_ = [
+        *_fields("loop_fd epoll_fd until_ns latency_ns rest_until_ns n_sources"),
+        *_fields("sources", _POINTER),
+        *_fields("takes wakes"),
+    ]
+
+
+UPDATE = np.dtype([(name, np.int64) for name in ["module", "row", "whole", "is_flagged", "oldest_ns", "newest_ns"]])
 """An update; its sensors (int32), values and status (uint8) follow."""
 
-SIZES = tuple(ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number)) + (
+SIZES = (
+    *(ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly)),
     UPDATE.itemsize,
-    ctypes.sizeof(Assembly),
 )
 """As ``skinware_path_size`` tells them."""
+FLOW_SIZES = ctypes.sizeof(Flow), ctypes.sizeof(Source)
+"""As ``skinware_flow_size`` tells them."""
 
 
 class Arrays:

@@ -69,7 +69,7 @@ class RequestDesk:
 
     @property
     def wanted_ns(self) -> int:
-        """The oldest data that is new enough for one of those who wait, CLOCK_MONOTONIC ns; far ahead if nobody does."""
+        """The oldest data that is new enough for one of those who wait, CLOCK_MONOTONIC ns; far ahead: nobody does."""
         return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=_NOBODY)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:

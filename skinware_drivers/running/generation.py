@@ -15,12 +15,15 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _LOOK_PAUSE_NS = NS_PER_S // 20
+
+Rows = npt.NDArray[np.int64]
 
 
 def make_batch(lines: Sequence[BusLine], headroom: int = 0) -> FrameBatch:
@@ -46,6 +49,8 @@ class Generation:
         period_s: nominal time between two updates that the publisher counts on.
         batch: what buses fill.
         begun_ns: when it began.
+        native: does the work of decoder and publisher in C; None where numpy does.
+        why_python: why numpy does; empty where it does not.
     """
 
     lines: Sequence[BusLine]
@@ -55,6 +60,8 @@ class Generation:
     period_s: float
     batch: FrameBatch = field(init=False)
     begun_ns: int = field(init=False)
+    native: NativePath | None = field(init=False)
+    why_python: str = field(init=False)
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
@@ -65,6 +72,7 @@ class Generation:
         self._known_state = self.publisher.patch_state.copy()
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
+        self.native, self.why_python = path_for(self.decoder, self.publisher, self.batch)
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
@@ -79,24 +87,55 @@ class Generation:
 
     def empty_batch(self) -> FrameBatch:
         """The batch, with nothing in it but frames that wait for their partners."""
-        self.decoder.put_back(self.batch)
+        if self.native is not None:
+            self.native.empty()
+        else:
+            self.decoder.put_back(self.batch)
         return self.batch
 
     def digest(self, batch: FrameBatch) -> None:
         """Decode a batch and publish what is due."""
-        if any(line.link.expects_data for line in self.lines):
-            new = np.arange(max(batch.start, batch.headroom), batch.stop)
-            for line, own in zip(self.lines, split_by_bus(batch, new, len(self.lines)), strict=True):
-                line.link.hear(batch, own)
-        found, foreign = self.decoder.decode(batch, self._interrupted())
-        if len(foreign):
-            for line, own in zip(self.lines, split_by_bus(batch, foreign, len(self.lines)), strict=True):
-                self.decoder.count_unknown(batch, line.link.offer(batch, own))
         self.update_bus_states(settled=now_ns() >= self._look_ns)
+        if self.native is not None:
+            self.prepare_native()
+            self.native.digest(self.interrupted())
+            return
+        if any(line.link.expects_data for line in self.lines):
+            self._hear(np.arange(max(batch.start, batch.headroom), batch.stop))
+        found, foreign = self.decoder.decode(batch, self.interrupted())
+        if len(foreign):
+            self.decoder.count_unknown(batch, self._offer(foreign))
         self.publisher.take(found)
 
-    def _interrupted(self) -> list[int]:
-        """Buses that are known to have lost frames since the last batch."""
+    def publish_if_due(self) -> None:
+        """Publish if the time has come, and nothing speaks against it."""
+        if self.native is not None:
+            self.native.publish_if_due()
+        else:
+            self.publisher.publish_if_due()
+
+    @property
+    def deadline_ns(self) -> int:
+        """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""
+        return self.publisher.deadline_ns if self.native is None else self.native.deadline_ns
+
+    def prepare_native(self) -> None:
+        """Before C code runs: say who waits for frames now."""
+        if self.native is not None:
+            self.native.hear = self._hear if any(line.link.expects_data for line in self.lines) else None
+            self.native.offer = self._offer if any(line.link.is_listening for line in self.lines) else None
+
+    def _hear(self, rows: Rows) -> None:
+        for line, own in zip(self.lines, split_by_bus(self.batch, rows, len(self.lines)), strict=True):
+            line.link.hear(self.batch, own)
+
+    def _offer(self, rows: Rows) -> Rows:
+        """Show rows that are of no module to those who wait; those that nobody waited for."""
+        by_bus = split_by_bus(self.batch, rows, len(self.lines))
+        return np.concatenate([line.link.offer(self.batch, own) for line, own in zip(self.lines, by_bus, strict=True)])
+
+    def interrupted(self) -> list[int]:
+        """Buses that are known to have lost frames since this was last asked."""
         losses = {line.ordinal: line.losses for line in self.lines}
         before, self._known_losses = self._known_losses, losses
         return [ordinal for ordinal, now in losses.items() if now != before.get(ordinal, now)]

@@ -44,7 +44,7 @@ class Intake:
         self._lines = lines
         self._empty_batch = empty_batch
         self._digest = digest
-        self._latency_s = latency_s
+        self.latency_s: float = latency_s
         self._look = guard(self._on_readable)
         self._rest: asyncio.TimerHandle | None = None
         self._by_fd: dict[int, BusLine] = {}
@@ -88,7 +88,7 @@ class Intake:
             factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
             if any(link.expects_data for link in links):
                 factor = _REST_IN_STEP  # the answer alone is what comes, and then the next question
-            rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self._latency_s)
+            rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:

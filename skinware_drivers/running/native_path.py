@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import PlatformError
-from skinware.memory.statistics import BUCKETS
 from skinware.native import Library
 from skinware.realtime import now_ns
 from skinware.samples import Unused
@@ -57,12 +56,16 @@ class NativePath:
     Attributes:
         hear: shown the new rows of each batch, before anything else, while somebody waits for a frame that is data.
         offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
+        sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
+        lose: told which bus went away, and the system's error number.
     """
 
     def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self.hear: Callable[[Rows], None] | None = None
         self.offer: Callable[[Rows], Rows] | None = None
+        self.sort_out: Callable[[int, int, int], int] | None = None
+        self.lose: Callable[[int, int], None] | None = None
         self._error: BaseException | None = None
         self._arrays = arrays = structs.Arrays()
         self._plan, self._words, self._rows = structs.Plan(), structs.Words(), structs.Batch()
@@ -74,17 +77,16 @@ class NativePath:
         self._load(library)
         self._words.sequence = publisher.sequence
         self._words.last_published_ns = now_ns()
-        self._path = ctypes.c_void_p(
-            library.quick.skinware_path_new(
-                ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words), ctypes.c_void_p(ring)
-            )
+        made = library.quick.skinware_path_new(
+            ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words), ctypes.c_void_p(ring)
         )
-        if not self._path:
+        if not made:
             raise MemoryError("no memory for the data path of a driver")
+        self._path = ctypes.c_void_p(made)
         self._update = self._update_dtype()
 
     def __del__(self) -> None:
-        if getattr(self, "_path", None):
+        if hasattr(self, "_path"):
             self._free(self._path)
 
     # -- what Python calls ----------------------------------------------------------------------------------------
@@ -100,13 +102,17 @@ class NativePath:
         Args:
             interrupted: buses of which it is known that they have lost frames since the last batch.
         """
-        self._interrupted[list(interrupted)] = True
+        self.interrupt(interrupted)
         self._rows.start, self._rows.stop = self._batch.start, self._batch.stop
         self._enter()
         result = self._digest(self._path)
         self._leave()
         if result < 0:
             raise MemoryError("no memory for the updates of a driver")
+
+    def interrupt(self, buses: Sequence[int]) -> None:
+        """Frames were lost on these buses: what waits for partners there is not joined with what comes now."""
+        self._interrupted[list(buses)] = True
 
     def publish(self) -> None:
         """Publish what there is."""
@@ -119,6 +125,17 @@ class NativePath:
         self._enter()
         self._publish_if_due(self._path)
         self._leave()
+
+    def run(self, flow: structs.Flow) -> int:
+        """Let frames flow until Python has something to do.
+
+        Returns:
+            Why it has: ``flow.c`` has the numbers.
+        """
+        self._enter()
+        result = int(self._run(self._path, ctypes.byref(flow)))
+        self._leave()
+        return result
 
     @property
     def deadline_ns(self) -> int:
@@ -161,10 +178,11 @@ class NativePath:
         self._digest.restype = ctypes.c_int64
         self._publish = library.waiting.skinware_path_publish
         self._publish_if_due = library.waiting.skinware_path_publish_if_due
+        self._run = library.waiting.skinware_flow_run
+        self._run.restype = ctypes.c_int64
 
     def _compile_publisher(self, publisher: Publisher, arrays: structs.Arrays) -> None:
-        plan, bursts, structure = self._plan, publisher.bursts, self._decoder.tables.structure
-        n_buses = len(structure.buses)
+        plan, bursts, n_buses = self._plan, publisher.bursts, len(publisher.bus_counters)
         plan.period_ns, plan.silence_ns = publisher.period_ns, publisher.silence_ns
         plan.patience_ns, plan.pause_ns = publisher.patience_ns, publisher.pause_ns
         plan.idle_ns, plan.by_cycle, plan.most_at_once = publisher.idle_ns, publisher.by_cycle, publisher.most_at_once
@@ -192,7 +210,6 @@ class NativePath:
         plan.sample_next_ns = arrays.at(self._sample_next_ns)
         timing = publisher.timing
         plan.timing, plan.timing_before_ns = arrays.at(timing.both), arrays.at(timing.before_ns)
-        assert timing.both.shape == (2, structure.n_patches, BUCKETS)
         for name, offset in publisher.column_offsets().items():
             setattr(plan.columns, name, offset)
         self._words.on_request = publisher.on_request
@@ -239,6 +256,8 @@ class NativePath:
             structs.EXPAND(self._guarded(self._on_expand)),
             structs.OFFER(self._guarded(self._on_look)),
             structs.PUBLISHED(self._guarded(self._on_published)),
+            structs.SORT_OUT(self._guarded(self._on_unusual)),
+            structs.LOSE(self._guarded(self._on_loss)),
         )
 
     def _set_hooks(self) -> None:
@@ -251,30 +270,43 @@ class NativePath:
             "expand": True,
             "look": type(self._publisher.watch).look is not Watch.look,
             "published": True,
+            "sort_out": self.sort_out is not None,
+            "lose": self.lose is not None,
         }
         for name, is_wanted in wanted.items():
             setattr(
                 self._plan.hooks, name, getattr(self._hooks, name) if is_wanted else type(getattr(self._hooks, name))()
             )
 
-    def _guarded(self, hook: Callable[..., None]) -> Callable[..., None]:
+    def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
         """What a hook raises cannot go through C: it is raised when C has come back."""
 
-        def call(*arguments: int) -> None:
+        def call(*arguments: int) -> int:
             if self._error is not None:
-                return
+                return 0
             self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
             try:
-                hook(*arguments)
+                return hook(*arguments) or 0
             except BaseException as error:  # noqa: BLE001
                 self._error = error
                 self._words.must_leave = True
+                return 0
 
         return call
 
+    def _on_unusual(self, bus: int, first: int, n: int) -> int:
+        self._words.must_leave = True
+        return n if self.sort_out is None else self.sort_out(bus, first, n)
+
+    def _on_loss(self, bus: int, error: int) -> None:
+        self._words.must_leave = True
+        if self.lose is not None:
+            self.lose(bus, error)
+
     def _on_hear(self) -> None:
-        assert self.hear is not None
-        self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
+        self._words.must_leave = True
+        if self.hear is not None:
+            self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
 
     def _on_times(self) -> None:
         batch = self._batch
@@ -284,8 +316,9 @@ class NativePath:
         self._decoder.device_stamps.tell(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
-        assert self.offer is not None
-        left = self.offer(_view(at, n, np.int64).copy())
+        rows = _view(at, n, np.int64).copy()
+        left = rows if self.offer is None else self.offer(rows)
+        self._words.must_leave = True  # somebody may have what it waited for
         self._count_strangers(self._path, ctypes.c_void_p(left.ctypes.data), ctypes.c_int64(len(left)))
 
     def _on_keep(self, why: int, at: int, n: int) -> None:
@@ -296,9 +329,10 @@ class NativePath:
     def _on_expand(self, number: int, updates_at: int, rows_at: int, failed_at: int, n: int) -> None:
         updates, rows = _view(updates_at, n, np.int64), _view(rows_at, n, np.int64)
         kind, columns = self._decoder.kinds[number], self._decoder.columns_of(number)
-        assert isinstance(kind.frame.values, Expand)
-        taken = self._batch.wire[rows]
-        values, found, failed = kind.expand(kind.frame.values, taken["payload"], taken["length"])
+        taken, how = self._batch.wire[rows], kind.frame.values
+        if not isinstance(how, Expand):
+            return
+        values, found, failed = kind.expand(how, taken["payload"], taken["length"])
         _view(failed_at, n, np.uint8)[failed] = True
         records = self._updates(int(updates.max()) + 1)
         records["values"][updates, columns] = values
@@ -325,5 +359,6 @@ class NativePath:
 
 def _view(address: int, n: int, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     """(n,) elements of memory that C owns."""
-    found = np.dtype(dtype)
-    return np.frombuffer((ctypes.c_char * (n * found.itemsize)).from_address(address), found)
+    found: np.dtype[Any] = np.dtype(dtype)
+    memory = memoryview((ctypes.c_char * (n * found.itemsize)).from_address(address))
+    return np.ndarray(n, found, memory)

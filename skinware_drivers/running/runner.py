@@ -28,6 +28,7 @@ from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
+from skinware_drivers.running.flow import Flow, FlowLoop
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
 from skinware_drivers.running.guard import end_of_driver, failure, hook
 from skinware_drivers.running.intake import DEFAULT_LATENCY_S, Intake
@@ -37,6 +38,9 @@ from skinware_drivers.running.serving import Serving
 from skinware_drivers.running.turns import short_turns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
+
+_LOOK_S = 0.25
+"""While C publishes: how often files, states and counters are looked after."""
 
 PublishMode = Literal["cycle", "rate", "request"]
 
@@ -110,6 +114,7 @@ class Runner:
             self.lines, listen_only, lambda: self.generation, self._built, self._build, self._tell_ready, self.fail
         )
         self._timer: asyncio.TimerHandle | None = None
+        self._flows = False
 
     @property
     def _layouts(self) -> list[Layout | None]:
@@ -213,6 +218,8 @@ class Runner:
         for failed in stopped:
             if isinstance(failed, Exception):
                 self.fail(failed)
+        if isinstance(loop, FlowLoop):
+            loop.selector.flow = None
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
@@ -296,7 +303,29 @@ class Runner:
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)
+        self._let_flow()
         self._guard(self._publish_when_due)()
+
+    def _let_flow(self) -> None:
+        """Have C read the buses while the event loop rests, if that can be; else they wake the loop."""
+        loop, generation = asyncio.get_running_loop(), self.generation
+        self._flows = (
+            isinstance(loop, FlowLoop)
+            and generation is not None
+            and generation.native is not None
+            and all(line.bus.reads_natively for line in self.lines if line.reason != BusReason.REMOVED)
+        )
+        if not isinstance(loop, FlowLoop):
+            return
+        loop.selector.flow = None
+        self._intake.start()
+        if self._flows and generation is not None and generation.native is not None:
+            self._intake.stop()
+            take, fail = self._guard(self._take), self.fail
+            flow = Flow(
+                generation, generation.native, self.lines, self._epoll.fileno(), self._intake.latency_s, take, fail
+            )
+            loop.selector.flow = flow.run
 
     @property
     def _period_s(self) -> float:
@@ -323,6 +352,9 @@ class Runner:
         self._first_batch.clear()
         return self._first_batch
 
+    def _take(self) -> None:
+        self._intake.take()
+
     def _digest(self, batch: FrameBatch) -> None:
         if self.generation is not None:
             self._machine.look()
@@ -335,13 +367,14 @@ class Runner:
             line.link.offer(batch, own)
 
     def _publish_when_due(self) -> None:
-        self._intake.take()  # what has arrived comes first: this may be late
+        if not self._flows:
+            self._intake.take()  # what has arrived comes first: this may be late
         if self.writer is None or self.generation is None:
             return
         self.writer.keep_files()
         self._machine.look()
         self.generation.update_bus_states()
-        self.generation.publisher.publish_if_due()
+        self.generation.publish_if_due()
         self.generation.log_patches()
         self._arm_timer()
 
@@ -349,7 +382,7 @@ class Runner:
         if self.generation is None:
             return
         loop = asyncio.get_running_loop()
-        due_s = self.generation.publisher.deadline_ns / NS_PER_S
+        due_s = loop.time() + _LOOK_S if self._flows else self.generation.deadline_ns / NS_PER_S
         if self._timer is not None:
             if not self._timer.cancelled() and loop.time() < self._timer.when() <= due_s:
                 return  # it comes early enough and then looks again

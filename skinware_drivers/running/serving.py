@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
+from skinware_drivers.adapter import Adapter
 from skinware_drivers.polling import Poller
 from skinware_drivers.running.bus_line import BusLine, are_patches
 from skinware_drivers.running.generation import Generation
@@ -19,6 +20,8 @@ from skinware_drivers.running.patch_care import PatchCare
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
+_LOOK_S = 0.5
+"""How often silent patches are looked for."""
 _SILENCE_S = 0.5
 """Before there is a structure that says how long a patch may be silent."""
 
@@ -111,7 +114,8 @@ class Serving:
                 beside.create_task(care.attend(lambda: self._silence_s))
                 if not self._listen_only:
                     await line.set_up()
-                    beside.create_task(self._poll(line))
+                    if type(line.adapter).polls is not Adapter.polls:
+                        beside.create_task(self._poll(line))
                 async with self._built:  # others may still be asked what is there
                     await self._built.wait_for(lambda: self._generation() is not None)
                 await care.check_data()
@@ -126,7 +130,7 @@ class Serving:
             await care.recover_silent()
             with contextlib.suppress(TimeoutError):
                 # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
-                async with asyncio.timeout(self._silence_s):
+                async with asyncio.timeout(max(self._silence_s, _LOOK_S)):
                     await line.lost.wait()
             line.is_aside = False
             if now_ns() - begun_ns > line.aside.longest_s * NS_PER_S:

@@ -15,6 +15,7 @@ from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import PublishMode, Runner
 from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.testing.defect import defect, require
@@ -72,7 +73,8 @@ class Driving:
             await self.runner.run()
 
         try:
-            asyncio.run(run())
+            with asyncio.Runner(loop_factory=FlowLoop) as loop:
+                loop.run(run())
         except BaseException as error:  # noqa: BLE001  (shown to the test, which fails on it)
             self.failure = error
             self.ready.set()

@@ -22,14 +22,14 @@ def test_a_bus_that_counts_a_loss_is_told_to_the_decoder_once(counter: str, name
             await rig.until_fresh()
             assert rig.runner is not None
             assert rig.runner.generation is not None
-            decoder: Any = rig.runner.generation.decoder
-            decode = decoder.decode
+            generation: Any = rig.runner.generation
+            ask = generation.interrupted
 
-            def listen(batch: Any, interrupted: list[int]) -> Any:
-                told.append(list(interrupted))
-                return decode(batch, interrupted)
+            def interrupted() -> list[int]:
+                told.append(ask())
+                return told[-1]
 
-            decoder.decode = listen
+            generation.interrupted = interrupted
             await rig.sleep(0.1)
             assert told
             assert not any(told)

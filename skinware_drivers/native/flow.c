@@ -1,0 +1,129 @@
+/* Takes, publishes and rests until Python has something to do: running/intake.py. */
+#include "flow.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <sys/epoll.h>
+#include <time.h>
+
+enum { TURNS = 8, MOST_EVENTS = 64 };
+#define TURN_NS INT64_C(20000000)
+
+enum taken { NOTHING, ALL, SOME };
+enum reason { TIME, LOOP, OTHER_BUS, NEWS, NO_MEMORY };
+
+SKINWARE_EXPORT int64_t skinware_flow_size(int64_t of_source)
+{
+    return (int64_t)(of_source ? sizeof(struct source) : sizeof(struct flow));
+}
+
+static struct source *source_of(const struct flow *flow, int fd)
+{
+    for (struct source *source = flow->sources; source < flow->sources + flow->n_sources; source++)
+        if (source->fd == fd)
+            return source;
+    return NULL;
+}
+
+/* Fill the batch from buses that have something, each with its share; whether one of them has more. */
+static bool fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns)
+{
+    struct batch *batch = path->batch;
+    bool is_behind = false;
+    batch->stop = batch->headroom;
+    for (int64_t i = 0; i < n; i++) {
+        batch->limit = batch->stop + (batch->capacity - batch->stop) / (n - i);
+        if (!receive(path, ready[i]))
+            continue;
+        ready[i]->heard_ns = time_ns;
+        is_behind |= batch->stop == batch->limit;
+        path->words->must_leave |= ready[i]->is_watched;
+    }
+    return is_behind;
+}
+
+/* Take what has arrived. OTHER: a bus that Python has to read has something. */
+static enum taken take(struct path *path, struct flow *flow, bool *is_other)
+{
+    int64_t begun_ns = path_time_ns(path);
+    for (int turn = 0; turn < TURNS; turn++) {
+        struct epoll_event events[MOST_EVENTS];
+        struct source *ready[MOST_EVENTS];
+        int64_t time_ns = path_time_ns(path);
+        if (time_ns - begun_ns > TURN_NS)
+            return SOME;
+        int n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
+        if (n <= 0)
+            return turn ? ALL : NOTHING;
+        for (int i = 0; i < n; i++) {
+            ready[i] = source_of(flow, events[i].data.fd);
+            *is_other |= !ready[i];
+        }
+        if (*is_other)
+            return turn ? ALL : NOTHING;
+        flow->takes++;
+        bool is_behind = fill(path, ready, n, time_ns);
+        decode_batch(path);
+        if (path->failed)
+            return ALL;
+        take_updates(path);
+        if (!is_behind)
+            return ALL;
+    }
+    return SOME;
+}
+
+static int64_t earlier(int64_t one, int64_t other)
+{
+    return one < other ? one : other;
+}
+
+/* Sleep until then, or until Python has something to do (true), or, if it may, a bus. */
+static bool sleep_until(struct flow *flow, int64_t until_ns, int64_t time_ns, bool is_resting)
+{
+    struct pollfd fds[] = {{.fd = (int)flow->loop_fd, .events = POLLIN}, {.fd = (int)flow->epoll_fd, .events = POLLIN}};
+    int64_t left_ns = until_ns > time_ns ? until_ns - time_ns : 0;
+    struct timespec timeout = {.tv_sec = left_ns / 1000000000, .tv_nsec = left_ns % 1000000000};
+    int n = ppoll(fds, is_resting ? 1 : 2, &timeout, NULL);
+    return n < 0 || fds[0].revents;
+}
+
+/* Until there is a reason to come back. */
+SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
+{
+    for (;;) {
+        int64_t time_ns = path_time_ns(path), due_ns = deadline_ns(path);
+        bool is_other = false, is_due = time_ns >= due_ns;
+        if (time_ns >= flow->until_ns)
+            return TIME;
+        if (is_due || time_ns >= flow->rest_until_ns) {
+            enum taken taken = take(path, flow, &is_other);
+            if (path->failed)
+                return NO_MEMORY;
+            if (is_due)
+                publish_if_due(path);
+            if (taken == ALL)
+                flow->rest_until_ns = path_time_ns(path) + flow->latency_ns;
+            if (is_other)
+                return OTHER_BUS;
+            if (path->words->must_leave) {
+                path->words->must_leave = 0;
+                return NEWS;
+            }
+            if (taken == SOME) {
+                if (sleep_until(flow, 0, 0, true))
+                    return LOOP;
+                continue;
+            }
+            time_ns = path_time_ns(path);
+            due_ns = deadline_ns(path);
+        }
+        bool is_resting = time_ns < flow->rest_until_ns;
+        int64_t until_ns = earlier(flow->until_ns, due_ns);
+        if (is_resting)
+            until_ns = earlier(until_ns, flow->rest_until_ns);
+        flow->wakes++;
+        if (sleep_until(flow, until_ns, time_ns, is_resting))
+            return LOOP;
+    }
+}

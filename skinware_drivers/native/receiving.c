@@ -1,0 +1,151 @@
+/* Takes what has arrived on a CAN socket: can/socketcan.py, recvmmsg.py, stamps.py and wire_time.py. */
+#include "flow.h"
+
+#include <errno.h>
+#include <sys/socket.h>
+#include <time.h>
+
+enum { ROWS_AT_ONCE = 64, CONTROL_BYTES = 64, SOFTWARE_WORD = 2, CLOCK_READS = 3, GOOD_READ_NS = 2000 };
+enum { MEMORY_INFO = 55, MEMORY_USED = 0, MEMORY_SIZE = 1, MEMORY_DROPS = 8, MEMORY_WORDS = 9 };
+enum { SWITCHED = 1, PASSIVE_SENDER = 2, IS_FD = 4, CLASSIC_PAYLOAD = 8, LONGEST_SHORT_FD = 16 };
+#define SLEW_NS INT64_C(2000000)
+#define UNUSUAL UINT32_C(0x60000000) /* remote and error frames */
+#define EXTENDED UINT32_C(0x80000000)
+
+static int64_t clock_ns(clockid_t clock)
+{
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+}
+
+/* CLOCK_MONOTONIC - CLOCK_REALTIME, not bent by a pause between reading the two; `poll_ns`: now. */
+static int64_t offset_now_ns(int64_t *poll_ns)
+{
+    int64_t best_ns = INT64_MAX, offset_ns = 0;
+    for (int i = 0; i < CLOCK_READS && best_ns >= GOOD_READ_NS; i++) {
+        int64_t first_ns = clock_ns(CLOCK_MONOTONIC), real_ns = clock_ns(CLOCK_REALTIME);
+        int64_t second_ns = clock_ns(CLOCK_MONOTONIC);
+        if (second_ns - first_ns < best_ns) {
+            best_ns = second_ns - first_ns;
+            offset_ns = (first_ns + second_ns) / 2 - real_ns;
+        }
+        *poll_ns = second_ns;
+    }
+    return offset_ns;
+}
+
+static void stamp(struct path *path, struct source *source, int64_t first, int64_t n)
+{
+    const int64_t *control = (const int64_t *)(intptr_t)source->control;
+    int64_t before_ns = source->offset_ns, poll_ns = 0, *stamps = path->batch->time_ns + first, latest_ns = INT64_MIN;
+    source->offset_ns = offset_now_ns(&poll_ns);
+    int64_t step_ns = source->offset_ns - before_ns;
+    bool is_step = step_ns > SLEW_NS || step_ns < -SLEW_NS;
+    for (int64_t i = 0; i < n; i++) {
+        const int64_t *words = control + (first + i) * (CONTROL_BYTES / 8) + SOFTWARE_WORD;
+        int64_t software_ns = words[0] * INT64_C(1000000000) + words[1], other_ns = software_ns + before_ns;
+        stamps[i] = software_ns + source->offset_ns;
+        if (is_step && other_ns >= source->last_poll_ns && other_ns <= poll_ns &&
+            (stamps[i] < source->last_poll_ns || stamps[i] > poll_ns))
+            stamps[i] = other_ns;
+        if (stamps[i] < source->last_poll_ns)
+            stamps[i] = source->last_poll_ns;
+        if (stamps[i] > poll_ns)
+            stamps[i] = poll_ns;
+        if (is_step && stamps[i] < latest_ns)
+            stamps[i] = latest_ns;
+        latest_ns = stamps[i];
+    }
+    source->last_poll_ns = latest_ns < poll_ns ? latest_ns : poll_ns;
+}
+
+static bool is_usual(const struct path *path, const struct source *source, int64_t first, int64_t n)
+{
+    const struct mmsghdr *headers = (const struct mmsghdr *)(intptr_t)source->headers;
+    uint32_t identifiers = 0;
+    int flags = 0;
+    int64_t longest = 0;
+    for (int64_t row = first; row < first + n; row++) {
+        identifiers |= identifier_of(path->batch, row);
+        flags |= headers[row].msg_hdr.msg_flags;
+        if (length_of(path->batch, row) > longest)
+            longest = length_of(path->batch, row);
+    }
+    return !(identifiers & UNUSUAL) && !(flags & MSG_TRUNC) && longest <= path->batch->payload_size;
+}
+
+static double wire_bits(const struct path *path, const struct source *source, int64_t first, int64_t n)
+{
+    const struct batch *batch = path->batch;
+    double bits = 0;
+    for (int64_t row = first; row < first + n; row++) {
+        int64_t length = length_of(batch, row), flags = batch->wire[row * batch->row_bytes + 5];
+        bool is_extended = identifier_of(batch, row) & EXTENDED;
+        bool is_fd = batch->payload_size > CLASSIC_PAYLOAD &&
+                     (flags & (SWITCHED | PASSIVE_SENDER | IS_FD) || length > CLASSIC_PAYLOAD);
+        if (is_fd)
+            bits += (is_extended ? 49 : 30) + (double)((length > LONGEST_SHORT_FD ? 37 : 32) + 8 * length) *
+                                                  (flags & SWITCHED ? 1 / source->speed_up : 1.0);
+        else
+            bits += (double)((is_extended ? 67 : 47) + 8 * length);
+    }
+    return 1.1 * bits;
+}
+
+static void read_memory(struct path *path, struct source *source)
+{
+    uint32_t words[MEMORY_WORDS];
+    socklen_t size = sizeof words;
+    if (getsockopt((int)source->fd, SOL_SOCKET, MEMORY_INFO, words, &size) || size < sizeof words)
+        return;
+    double full = (double)words[MEMORY_USED] / words[MEMORY_SIZE];
+    int64_t lost = source->lost_before + words[MEMORY_DROPS];
+    if (full > source->fullest)
+        source->fullest = full;
+    if (lost == source->lost)
+        return;
+    source->lost = lost;
+    path->plan->counts[source->bus * path->plan->n_counts + source->lost_column] = lost;
+    path->plan->interrupted[source->bus] = 1;
+}
+
+/* One call of the kernel: how many datagrams it gave, into rows from the batch's stop on. */
+static int64_t receive_some(struct path *path, const struct source *source)
+{
+    struct batch *batch = path->batch;
+    struct mmsghdr *headers = (struct mmsghdr *)(intptr_t)source->headers + batch->stop;
+    int64_t n = batch->limit - batch->stop < ROWS_AT_ONCE ? batch->limit - batch->stop : ROWS_AT_ONCE;
+    for (int64_t i = 0; i < n; i++)
+        headers[i].msg_hdr.msg_controllen = CONTROL_BYTES;
+    return recvmmsg((int)source->fd, headers, (unsigned)n, MSG_DONTWAIT, NULL);
+}
+
+/* Append what has arrived to the batch, up to its limit; how many rows that are. */
+int64_t receive(struct path *path, struct source *source)
+{
+    struct batch *batch = path->batch;
+    int64_t begin = batch->stop, n = ROWS_AT_ONCE;
+    while (n == ROWS_AT_ONCE && batch->stop < batch->limit) {
+        int64_t first = batch->stop, kept;
+        n = receive_some(path, source);
+        if (n < 0 && errno != EAGAIN && errno != EINTR && path->plan->hooks.lose) {
+            path->plan->hooks.lose(source->bus, errno);
+            source->fd = -1;
+            return batch->stop - begin;
+        }
+        if (n <= 0)
+            break;
+        stamp(path, source, first, n);
+        for (int64_t row = first; row < first + n; row++)
+            batch->bus[row] = (uint16_t)source->bus;
+        kept = is_usual(path, source, first, n) ? n : path->plan->hooks.sort_out(source->bus, first, n);
+        batch->stop += kept;
+        source->frames += kept;
+        path->plan->counts[source->bus * path->plan->n_counts + source->frames_column] += kept;
+        if (source->is_counted)
+            source->wire_bits += wire_bits(path, source, first, kept);
+    }
+    read_memory(path, source);
+    return batch->stop - begin;
+}

@@ -12,6 +12,7 @@ from skinware.memory.ring import Frame
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
+from skinware.status import DataPath
 from skinware.structure import Structure
 
 
@@ -93,6 +94,16 @@ class DriverFrame(Frame):
     def patch_age_counts(self) -> npt.NDArray[np.uint64]:
         """(n_patches, BUCKETS) uint64: histogram of the age of a module's update when it was published, likewise."""
         return self._told("patch_age_counts", (self.structure.n_patches, BUCKETS), np.uint64)
+
+    @property
+    def latency_ns(self) -> int:
+        """The longest that frames on a bus wait so that more are taken with them, ns; 0: not at all, or not told."""
+        return int(self._told("latency_ns", (1,), np.int64)[0])
+
+    @property
+    def data_path(self) -> DataPath:
+        """Which way the driver's frames take."""
+        return DataPath(int(self._told("data_path", (1,), np.uint8)[0]))
 
     def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         """A column that a driver need not have."""

@@ -85,6 +85,17 @@ class BusReason(enum.IntEnum):
     """The driver's own code failed on this bus: it was closed, and is tried again later. The driver's log says why."""
 
 
+class DataPath(enum.IntEnum):
+    """Which way a driver's frames take from its buses to its readers; the values are the same by both."""
+
+    NOT_TOLD = 0
+    """The driver does not tell."""
+    PYTHON = 1
+    """Through numpy: the native path was not compiled, is switched off, or cannot do what the driver says."""
+    NATIVE = 2
+    """Through compiled code."""
+
+
 LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF
 """In place of a bus' load: its bit rate is not known; or its filters drop frames without counting them."""
 

@@ -165,6 +165,8 @@ def _skin(driver: DriverReader, frame: DriverFrame | None, life: str) -> dict[st
     return {
         "driver_type": driver.driver_type,
         "dtype": structure.dtype.name,
+        "data_path": frame.data_path.name.lower() if frame else None,
+        "latency_ms": frame.latency_ns / 1e6 if frame else None,
         "sensors": structure.n_sensors,
         "modules": structure.n_modules,
         "patches": structure.n_patches,

@@ -148,8 +148,20 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             {"orphans"},
         ),
         *([_ABOUT_A_PATCH] if timed else []),
+        *_path_lines(driver),
     ]
     return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
+
+
+def _path_lines(driver: dict[str, Any]) -> list[str]:
+    """Which way frames take, and how long they may wait."""
+    if driver["data_path"] not in ("native", "python"):
+        return []
+    rest = f"frames wait up to {driver['latency_ms']:g} ms to be taken together"
+    return [
+        "",
+        f"{driver['data_path']} data path; {rest}" if driver["latency_ms"] else f"{driver['data_path']} data path",
+    ]
 
 
 def _column_lines(service: dict[str, Any]) -> list[str]:

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from skinware_drivers.bus import Bus
     from skinware_drivers.bus_names import BusPlace
     from skinware_drivers.options.file import ConfigFile, DriverConfig
-    from skinware_drivers.running.flow import FlowLoop
-from skinware_drivers.running.runner import PublishMode, Runner
+    from skinware_drivers.running.runner import PublishMode, Runner
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -134,7 +133,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "latency_ms",
     type=click.FloatRange(0, 1000),
     metavar="MS",
-    help="Longest time that frames wait to be taken together; less costs processor time.  [default: 5]",
+    help="Longest time that frames wait to be taken together; less costs processor time.  [default: period / 4, 1-20]",
 )
 @click.option(
     "--geometry",
@@ -192,8 +191,8 @@ def command(
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
+    from skinware_drivers.running.flow import FlowLoop
     from skinware_drivers.running.guard import hook
-    from skinware_drivers.running.intake import DEFAULT_LATENCY_S
     from skinware_drivers.running.runner import Runner
 
     logging.basicConfig(
@@ -254,7 +253,7 @@ def command(
         listen_only=listen_only,
         wait_for_buses=wait or settings.wait,
         publish=publish or settings.publish or None,
-        latency_s=DEFAULT_LATENCY_S if latency_ms is None else latency_ms / 1e3,
+        latency_s=None if latency_ms is None else latency_ms / 1e3,
         namespace=Namespace(namespace),
         slots=slots,
         group=group,

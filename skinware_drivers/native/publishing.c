@@ -114,6 +114,8 @@ static void write_frame(struct path *path, int64_t time_ns)
     fill(plan->patch_counters, slot, columns->patch_counters, plan->n_patches * N_PATCH_COUNTERS * 8);
     fill(plan->timing, slot, columns->patch_interval_counts, n_timing * 8);
     fill(plan->timing + n_timing, slot, columns->patch_age_counts, n_timing * 8);
+    fill(plan->latency_ns, slot, columns->latency_ns, 8);
+    fill(plan->data_path, slot, columns->data_path, 1);
     int64_t acquired_ns = path->words->newest_ns ? path->words->newest_ns : time_ns;
     path->words->sequence = (int64_t)skinware_ring_commit(path->ring, acquired_ns, 0);
 }

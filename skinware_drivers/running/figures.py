@@ -46,7 +46,10 @@ def figures(
                 **counters,
             }
         )
-    return {"sequence": writer.sequence, "buses": buses, "patches": patches, "machine": _machine(machine)}
+    way = {"data_path": "python" if generation.native is None else "native", "why_python": generation.why_python}
+    latency = {"latency_ms": publisher.latency_ns[0] / 1e6}
+    figures = {"sequence": writer.sequence, **way, **latency, "buses": buses, "patches": patches}
+    return {**figures, "machine": _machine(machine)}
 
 
 def _machine(machine: MachineLimits) -> dict[str, int]:

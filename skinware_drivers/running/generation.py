@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import PatchState
+from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
@@ -73,6 +73,7 @@ class Generation:
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
         self.native, self.why_python = path_for(self.decoder, self.publisher, self.batch)
+        self.publisher.data_path[:] = DataPath.PYTHON if self.native is None else DataPath.NATIVE
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)

@@ -15,8 +15,13 @@ from skinware_drivers.running.guard import bus_failure
 _TURNS, _TURN_NS = 8, NS_PER_S // 50  # full batches per wake-up, and how long, before all else gets its turn
 _REST, _REST_WHILE_ASKING, _REST_IN_STEP = 16, 4, 1
 """After a take: so many times its duration, while more arrives (decision 0006)."""
-DEFAULT_LATENCY_S = 0.005
-"""What the longest rest is if nobody says."""
+_SHARE = 0.25
+_SHORTEST_S, _LONGEST_S = 0.001, 0.020
+
+
+def latency_for(period_s: float) -> float:
+    """The longest rest, s, of a driver whose patches send with this period, s: a quarter of it, 1 to 20 ms."""
+    return min(max(_SHARE * period_s, _SHORTEST_S), _LONGEST_S)
 
 
 class Intake:
@@ -27,7 +32,7 @@ class Intake:
         lines: the buses; the list may change.
         empty_batch: gives the batch to fill.
         digest: gets it, filled.
-        latency_s: the longest rest.
+        latency_s: the longest rest; may be changed.
         guard: makes of a callback one that may fail in the event loop.
     """
 

@@ -13,7 +13,7 @@ from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import DEFAULT_SLOTS
-from skinware.status import LOAD_UNKNOWN, BusState, PatchState, Status
+from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, Status
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
@@ -104,6 +104,8 @@ class Publisher:
         self.bus_since_ns: npt.NDArray[np.int64] = np.zeros(len(structure.buses), np.int64)
         self.bus_load: npt.NDArray[np.uint16] = np.full(len(structure.buses), LOAD_UNKNOWN, np.uint16)
         self.bus_samples: npt.NDArray[np.void] = np.zeros((len(structure.buses), SAMPLES), SAMPLE)
+        self.latency_ns: npt.NDArray[np.int64] = np.zeros(1, np.int64)
+        self.data_path: npt.NDArray[np.uint8] = np.full(1, int(DataPath.PYTHON), np.uint8)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -202,6 +204,8 @@ class Publisher:
         columns["patch_counters"][:] = state.patch_counters.reshape(-1)
         columns["patch_interval_counts"][:] = self.timing.intervals.reshape(-1)
         columns["patch_age_counts"][:] = self.timing.ages.reshape(-1)
+        columns["latency_ns"][:] = self.latency_ns
+        columns["data_path"][:] = self.data_path
         self._writer.commit(state.newest_ns or time_ns)
         if self.wanted_ns < _NOBODY:
             self.answer(self._oldest_new_ns(time_ns))

@@ -31,7 +31,7 @@ from skinware_drivers.running.figures import figures
 from skinware_drivers.running.flow import Flow, FlowLoop
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
 from skinware_drivers.running.guard import end_of_driver, failure, hook
-from skinware_drivers.running.intake import DEFAULT_LATENCY_S, Intake
+from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
@@ -56,7 +56,8 @@ class Runner:
         wait_for_buses: for one to appear, if there is none at the start.
         publish: ``cycle`` (when every living patch has delivered), ``rate`` (at the adapter's rate), ``request`` (by
             cycle, but only what a program has asked for); default: what the adapter says.
-        latency_s: the longest that frames may wait so that more are taken with them, s.
+        latency_s: the longest that frames may wait so that more are taken with them, s; default: a quarter of the
+            shortest period, 1 to 20 ms.
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         geometry: where the sensors are, for programs; None where nobody knows.
         on_ready: called once, when frames are being published.
@@ -78,7 +79,7 @@ class Runner:
         listen_only: bool = False,
         wait_for_buses: bool = False,
         publish: PublishMode | None = None,
-        latency_s: float = DEFAULT_LATENCY_S,
+        latency_s: float | None = None,
         namespace: Namespace | None = None,
         slots: int = DEFAULT_SLOTS,
         group: str | None = None,
@@ -105,7 +106,10 @@ class Runner:
         self._geometry = geometry
         self._on_ready = on_ready
         self._machine = MachineLimits()
-        self._intake = Intake(self._epoll, self.lines, self._empty_batch, self._digest, latency_s, self._guard)
+        self._latency_s = latency_s
+        self._intake = Intake(
+            self._epoll, self.lines, self._empty_batch, self._digest, self._longest_rest_s, self._guard
+        )
         self._first_batch = make_batch(self.lines)
         self._stopping = asyncio.Event()
         self._failure: BaseException | None = None
@@ -302,6 +306,8 @@ class Runner:
         by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
+        self._intake.latency_s = self._longest_rest_s
+        publisher.latency_ns[:] = round(self._longest_rest_s * NS_PER_S)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)
         self._let_flow()
         self._guard(self._publish_when_due)()
@@ -328,9 +334,17 @@ class Runner:
             loop.selector.flow = flow.run
 
     @property
-    def _period_s(self) -> float:
+    def _periods_s(self) -> list[float]:
         present = [line for line in self.lines if line.reason != BusReason.REMOVED] or self.lines
-        return max(line.adapter.period_s for line in present)
+        return [line.adapter.period_s for line in present]
+
+    @property
+    def _period_s(self) -> float:
+        return max(self._periods_s)
+
+    @property
+    def _longest_rest_s(self) -> float:
+        return latency_for(min(self._periods_s)) if self._latency_s is None else self._latency_s
 
     def _after_operation(self, line: BusLine, patches: Sequence[Patch], set_up: bool) -> None:
         generation = self.generation

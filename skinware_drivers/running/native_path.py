@@ -137,6 +137,10 @@ class NativePath:
         self._leave()
         return result
 
+    def leave_soon(self) -> None:
+        """Have ``run`` come back after its first take."""
+        self._words.must_leave = True
+
     @property
     def deadline_ns(self) -> int:
         """When ``publish_if_due`` has something to do at the latest, CLOCK_MONOTONIC ns."""

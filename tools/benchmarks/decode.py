@@ -2,9 +2,11 @@
 
 The socket is UDP on the loopback, which shares receive buffer, time stamps and drop counter with CAN sockets in the
 kernel: its datagrams are ``struct can_frame``. The frames are those of 7 boards x 16 triangles, their bursts
-interleaved, with 1 % lost halves, wrong lengths and foreign identifiers. Both paths drain the same frames in turns:
+interleaved, with 1 % lost halves, wrong lengths and foreign identifiers. All drain the same frames in turns:
 
-* ours: ``SocketCanBus.receive``, ``Decoder``, ``Publisher`` into a ``DriverWriter``;
+* native: the compiled path from the socket into the ring of a ``DriverWriter``;
+* numpy: ``SocketCanBus.receive``, ``Decoder``, ``Publisher`` into such a ring;
+* kernel: ``recvmmsg`` alone, with time stamps: nobody can be faster;
 * python-can: its ``Notifier`` with a listener that decodes each frame into the same kind of arrays.
 
 python-can runs its own socketcan interface, whose socket alone is replaced. Both get the frames in portions of a few
@@ -14,8 +16,10 @@ cycles and are timed while they drain them: a long queue in the kernel would mea
 from __future__ import annotations
 
 import argparse
+import ctypes
 import os
 import random
+import select
 import socket
 import statistics
 import struct
@@ -27,11 +31,15 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from skinware import DriverReader, DriverWriter, Namespace
+from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
+from skinware_drivers.native import structs
+from skinware_drivers.running.native_path import path_for
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 
 BOARDS = range(7, 14)
@@ -62,8 +70,8 @@ def make_frames(cycles: int, seed: int = 1) -> list[bytes]:
     return frames
 
 
-class Ours:
-    """The product's path, from socket to ring."""
+class Numpy:
+    """The product's path through numpy, from socket to ring."""
 
     def __init__(self, namespace: Namespace, sock: socket.socket) -> None:
         self.bus = SocketCanBus("bench")
@@ -99,6 +107,63 @@ class Ours:
     def close(self) -> None:
         """Take the service back."""
         self.writer.close()
+        self.bus.close()
+
+
+class Native(Numpy):
+    """The product's compiled path, from socket to ring."""
+
+    def __init__(self, namespace: Namespace, sock: socket.socket) -> None:
+        super().__init__(namespace, sock)
+        path, why = path_for(self.decoder, self.publisher, self.batch)
+        if path is None:
+            raise SystemExit(f"decode: no native data path: {why}")
+        self.path, self.epoll = path, select.epoll()
+        self.epoll.register(sock, select.EPOLLIN)
+        self.source = (structs.Source * 1)()
+        self.flow = structs.Flow(epoll_fd=self.epoll.fileno(), loop_fd=-1, until_ns=1 << 62, n_sources=1)
+        self.flow.sources = ctypes.addressof(self.source)
+
+    def drain(self) -> int:
+        """Take, decode and publish everything that waits; returns the number of frames."""
+        handed, total = self.bus.hand_over(self.batch), 0
+        if handed is None:
+            raise SystemExit("decode: the socket is not read natively")
+        source = self.source[0]
+        source.fd, source.headers, source.control = handed.fd, handed.headers, handed.control
+        source.offset_ns, source.last_poll_ns = handed.offset_ns, handed.last_poll_ns
+        while True:
+            source.frames, self.flow.rest_until_ns = 0, 0
+            self.path.leave_soon()
+            self.path.run(self.flow)
+            if not source.frames:
+                return total
+            total += source.frames
+
+    def close(self) -> None:
+        """Take the service back."""
+        self.epoll.close()
+        super().close()
+
+
+class Kernel:
+    """The least: receive, with time stamps."""
+
+    def __init__(self, _namespace: Namespace, sock: socket.socket) -> None:
+        self.bus = SocketCanBus("bench")
+        self.bus.adopt(sock)
+        self.batch = FrameBatch(2048)
+        self.rows, self.fd = rows_of(self.batch), sock.fileno()
+
+    def drain(self) -> int:
+        """Receive everything that waits; returns the number of frames."""
+        total = 0
+        while (count := self.rows.receive(self.fd, slice(0, 2048))) > 0:
+            total += count
+        return total
+
+    def close(self) -> None:
+        """Close the socket."""
         self.bus.close()
 
 
@@ -169,10 +234,10 @@ def portions(frames: list[bytes]) -> list[list[bytes]]:
     return [frames[i : i + PORTION] for i in range(0, len(frames), PORTION)]
 
 
-def measure_ours(frames: list[bytes], namespace: Namespace) -> tuple[float, int]:
+def measure(kind: type[Numpy | Kernel], frames: list[bytes], namespace: Namespace) -> tuple[float, int]:
     """Seconds per frame, and frames lost."""
     sender, receiver = sockets()
-    path = Ours(namespace, receiver)
+    path = kind(namespace, receiver)
     time.sleep(0.1)  # the kernel begins to stamp in the background
     taken, passed = 0, 0.0
     for portion in portions(frames):
@@ -181,9 +246,10 @@ def measure_ours(frames: list[bytes], namespace: Namespace) -> tuple[float, int]
         begin = time.perf_counter()
         taken += path.drain()
         passed += time.perf_counter() - begin
-    with DriverReader("bench", namespace=namespace) as reader:
-        values = reader.read().values.reshape(-1, 12)
-        assert (values.min(axis=1) == values.max(axis=1)).all()
+    if isinstance(path, Numpy):
+        with DriverReader("bench", namespace=namespace) as reader:
+            values = reader.read().values.reshape(-1, 12)
+            assert (values.min(axis=1) == values.max(axis=1)).all()
     path.close()
     sender.close()
     return passed / taken, len(frames) - taken - path.bus.counters.refused
@@ -219,22 +285,25 @@ def main() -> None:
     frames = make_frames(arguments.cycles)
     few = frames[: max(1, len(frames) // 4)]
     print(f"{len(frames)} frames of {len(BOARDS)} boards x 16 triangles, {arguments.rounds} rounds")
-    ratios: list[float] = []
-    rows: list[tuple[float, float]] = []
+    kinds: dict[str, type[Numpy | Kernel]] = {"native": Native, "numpy": Numpy, "kernel": Kernel}
+    if native.library() is None:
+        print(f"no native data path: {native.why_python()}")
+        del kinds["native"]
+    found: dict[str, list[float]] = {name: [] for name in (*kinds, "python-can")}
     try:
         for _ in range(arguments.rounds):
-            ours, ours_lost = measure_ours(frames, namespace)
-            theirs, theirs_lost = measure_python_can(few)
-            rows.append((ours, theirs))
-            ratios.append(theirs / ours)
-            print(
-                f"  ours {ours * 1e6:.3f} us/frame ({1 / ours:,.0f} frames/s, {ours_lost} lost)"
-                f"   python-can Notifier {theirs * 1e6:.2f} us/frame ({theirs_lost} lost)   ratio {ratios[-1]:.1f}"
-            )
+            row = {name: measure(kind, frames, namespace) for name, kind in kinds.items()}
+            row["python-can"] = measure_python_can(few)
+            for name, (seconds, _) in row.items():
+                found[name].append(seconds)
+            print("  " + "   ".join(f"{name} {1e6 * s:.3f} us/frame ({lost} lost)" for name, (s, lost) in row.items()))
     finally:
         remove(namespace)
-    ours, theirs = (statistics.median(column) for column in zip(*rows, strict=True))
-    print(f"median: ours {1 / ours:,.0f} frames/s, python-can {1 / theirs:,.0f}, ratio {statistics.median(ratios):.1f}")
+    for name, taken in found.items():
+        of_kernel = statistics.median(k / s for k, s in zip(found["kernel"], taken, strict=True))
+        times = statistics.median(p / s for p, s in zip(found["python-can"], taken, strict=True))
+        rate = f"{1 / statistics.median(taken):>11,.0f} frames/s"
+        print(f"{name:>10}: {rate}, {100 * of_kernel:.0f} % of the kernel's rate, {times:.1f} times python-can")
 
 
 def remove(namespace: Namespace) -> None:

@@ -29,7 +29,7 @@ static struct source *source_of(const struct flow *flow, int fd)
 static bool fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns)
 {
     struct batch *batch = path->batch;
-    bool is_behind = false;
+    bool is_behind = false, is_news = false;
     batch->stop = batch->headroom;
     for (int64_t i = 0; i < n; i++) {
         batch->limit = batch->stop + (batch->capacity - batch->stop) / (n - i);
@@ -37,8 +37,10 @@ static bool fill(struct path *path, struct source **ready, int64_t n, int64_t ti
             continue;
         ready[i]->heard_ns = time_ns;
         is_behind |= batch->stop == batch->limit;
-        path->words->must_leave |= ready[i]->is_watched;
+        is_news |= ready[i]->is_watched;
     }
+    if (is_news && path->plan->hooks.heard)
+        path->plan->hooks.heard();
     return is_behind;
 }
 

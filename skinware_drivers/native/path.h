@@ -116,6 +116,7 @@ struct hooks {             /* NULL: there is nothing to do */
     void (*published)(int64_t oldest_ns);
     int64_t (*sort_out)(int64_t bus, int64_t first, int64_t n); /* unusual rows are among these; how many are left */
     void (*lose)(int64_t bus, int64_t error);
+    void (*heard)(void); /* frames came on a bus that Python wanted to know of */
 };
 
 /* -- the whole ----------------------------------------------------------------------------------------------------- */

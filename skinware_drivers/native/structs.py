@@ -151,6 +151,7 @@ class Hooks(ctypes.Structure):
         ("published", PUBLISHED),
         ("sort_out", SORT_OUT),
         ("lose", LOSE),
+        ("heard", HEAR),
     ]
 
 

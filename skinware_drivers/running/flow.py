@@ -86,7 +86,7 @@ class Flow:
         self._handed: list[KernelSource | None] = []
         self._sources = (structs.Source * 0)()
         self._line_of: list[BusLine] = []
-        path.sort_out, path.lose = self._sort_out, self._lose
+        path.sort_out, path.lose, path.heard = self._sort_out, self._lose, self._heard
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, for so long at the most."""
@@ -136,6 +136,14 @@ class Flow:
         for line, at in zip(self._line_of, self._sources, strict=True):
             line.heard_ns = at.heard_ns
             line.bus.take_back(Received(at.offset_ns, at.last_poll_ns, at.frames, at.lost, at.wire_bits, at.fullest))
+
+    def _heard(self) -> None:
+        """A bus that was silent is not."""
+        for line, at in zip(self._line_of, self._sources, strict=True):
+            line.heard_ns = at.heard_ns
+        self._generation.update_bus_states()
+        for line, at in zip(self._line_of, self._sources, strict=True):
+            at.is_watched = line.state != BusState.LIVE
 
     def _sort_out(self, bus: int, first: int, n: int) -> int:
         kept = self._lines[bus].bus.sort_out(self._batch, slice(first, first + n))

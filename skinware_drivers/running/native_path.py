@@ -58,6 +58,7 @@ class NativePath:
         offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
         sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
         lose: told which bus went away, and the system's error number.
+        heard: told that frames came on a bus that is watched.
     """
 
     def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int) -> None:
@@ -66,6 +67,7 @@ class NativePath:
         self.offer: Callable[[Rows], Rows] | None = None
         self.sort_out: Callable[[int, int, int], int] | None = None
         self.lose: Callable[[int, int], None] | None = None
+        self.heard: Callable[[], None] | None = None
         self._error: BaseException | None = None
         self._arrays = arrays = structs.Arrays()
         self._plan, self._words, self._rows = structs.Plan(), structs.Words(), structs.Batch()
@@ -263,6 +265,7 @@ class NativePath:
             structs.PUBLISHED(self._guarded(self._on_published)),
             structs.SORT_OUT(self._guarded(self._on_unusual)),
             structs.LOSE(self._guarded(self._on_loss)),
+            structs.HEAR(self._guarded(lambda: None if self.heard is None else self.heard())),
         )
 
     def _set_hooks(self) -> None:
@@ -277,6 +280,7 @@ class NativePath:
             "published": True,
             "sort_out": self.sort_out is not None,
             "lose": self.lose is not None,
+            "heard": self.heard is not None,
         }
         for name, is_wanted in wanted.items():
             setattr(

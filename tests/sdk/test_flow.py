@@ -1,0 +1,254 @@
+"""Frames that C takes from a socket into the ring while the event loop rests.
+
+Datagrams of the loopback stand in for CAN: emulated boards at one end, the driver at the other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from skinware import BusReason, BusState, DriverReader, Status
+from skinware.errors import DriverError
+from skinware.status import DataPath
+from skinware_drivers import native
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG
+from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
+from skinware_drivers.can.roboskin_watch import BaselineWatch
+from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.cli.emulation import Emulation, JsonReport
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.description import SkinTables
+from skinware_drivers.running.flow import FlowLoop, FlowSelector
+from skinware_drivers.running.runner import Runner
+from skinware_drivers.testing.driving import Driving, driving_lines
+from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.watch import Watch
+from tests.sdk.cable import Cable
+from tests.sdk.driving import follow
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason=f"no native data path: {native.why_python()}")
+
+BOARDS = (3, 7)
+
+
+class EndOfCable(SocketCanBus):
+    """One end of a cable, which can be opened again."""
+
+    def __init__(self, end: socket.socket, **options: str) -> None:
+        super().__init__("cable", options)
+        self._end = end
+
+    def open(self) -> None:
+        """The end is there."""
+        self.adopt(socket.socket(fileno=os.dup(self._end.fileno())))
+
+
+class Stop:
+    """Ends an emulation."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._read, self._write = os.pipe()
+
+    def fileno(self) -> int:
+        """Readable once it ends."""
+        return self._read
+
+    def set(self) -> None:
+        """End it."""
+        self.stopped = True
+        os.write(self._write, b".")
+
+    def close(self) -> None:
+        """Let go of the descriptors."""
+        os.close(self._read)
+        os.close(self._write)
+
+
+@contextmanager
+def boards_on(cable: Cable, hardware: EmulatedRoboskin) -> Iterator[None]:
+    """Emulated boards at the far end, in a thread."""
+    stop = Stop()
+    emulation = Emulation(EndOfCable(cable.out), hardware, JsonReport(io.StringIO()))
+    run = {"bus_name": "cable", "driver": "roboskin", "options": EmulatorOptions()}
+    thread = threading.Thread(target=lambda: emulation.run(stop, **run), daemon=True)  # type: ignore[arg-type]
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(30)
+        stop.close()
+
+
+@contextmanager
+def flowing(cable: Cable, driver: Any = RoboskinDriver, **options: str) -> Iterator[tuple[Driving, EndOfCable]]:
+    bus = EndOfCable(cable.end, **options)
+    hardware = EmulatedRoboskin(EmulatorOptions(boards=BOARDS))
+    with boards_on(cable, hardware), driving_lines([(driver(RoboskinOptions()), bus)], "roboskin") as running:
+        yield running, bus
+
+
+def newer_and_good(than: Any) -> Callable[[Any], bool]:
+    return lambda frame: not frame.status.any() and bool((frame.module_time_ns > than.module_time_ns).all())
+
+
+def test_a_driver_flows_and_its_frames_are_whole(cable: Cable) -> None:
+    with flowing(cable) as (running, bus), DriverReader("roboskin") as reader:
+        frame = follow(reader, lambda f: not f.status.any())
+        assert frame.data_path == DataPath.NATIVE
+        assert frame.structure.n_patches == len(BOARDS)
+        assert frame.bus_state[0] == BusState.LIVE
+        for _ in range(5):
+            time_ns = frame.module_time_ns
+            frame = follow(
+                reader, lambda f, before=time_ns: not f.status.any() and bool((f.module_time_ns > before).all())
+            )
+        wait_until(lambda: running.status()["buses"][0]["frames"] > 1000)
+        counters = reader.bus_counters(reader.read())[0]
+        assert counters["frames"] <= bus.counters.frames + 200
+        assert counters["lost"] == bus.counters.lost == 0
+    assert running.status()["data_path"] == "native"
+
+
+def test_questions_are_answered_while_frames_flow(cable: Cable) -> None:
+    with flowing(cable), DriverReader("roboskin") as reader:
+        follow(reader, lambda f: not f.status.any())
+        assert "bus0" in reader.call("rebaseline", timeout_s=60)
+        follow(reader, lambda f: not f.status.any())
+
+
+def test_requests_are_answered_with_frames_that_begin_later(cable: Cable) -> None:
+    with flowing(cable), DriverReader("roboskin") as reader:
+        before = follow(reader, lambda f: not f.status.any())
+        for _ in range(5):
+            frame = reader.request(timeout_s=30)
+            assert frame.sequence > before.sequence
+            assert frame.acquired_ns > before.acquired_ns
+            before = frame
+
+
+def test_what_is_no_data_frame_is_sorted_out(cable: Cable) -> None:
+    with flowing(cable) as (running, bus), DriverReader("roboskin") as reader:
+        follow(reader, lambda f: not f.status.any())
+        cable.out.send(struct.pack("=IB3x8s", ERROR_FLAG | 0x4, 8, b"\0\x10"))  # error-passive
+        cable.out.send(struct.pack("=IB3x8s", REMOTE_FLAG | 0x123, 0, b""))
+        wait_until(lambda: (bus.counters.errors, bus.counters.refused) == (1, 1))
+        follow(reader, lambda f: f.bus_reason[0] == BusReason.ERROR_PASSIVE and not f.status.any())
+        assert [s["why"] for s in running.status()["buses"][0]["samples"]] == ["refused"]
+
+
+def test_strangers_and_wrong_frames_are_counted_and_kept_as_samples(cable: Cable) -> None:
+    with flowing(cable) as (running, _), DriverReader("roboskin") as reader:
+        follow(reader, lambda f: not f.status.any())
+        before = running.status()["buses"][0]
+        for _ in range(3):
+            cable.put(0x6F3)
+        cable.put(0x473, bytes(3))
+        cable.put(0x473, b"\x17" + bytes(7))
+
+        def counted() -> dict[str, int]:
+            now = running.status()["buses"][0]
+            return {name: now[name] - before[name] for name in ("unknown", "bad_length", "bad_content")}
+
+        wait_until(lambda: counted() == {"unknown": 3, "bad_length": 1, "bad_content": 1})
+        samples = running.status()["buses"][0]["samples"]
+        assert {(s["why"], s["identifier"]) for s in samples} >= {
+            ("unknown", 0x6F3),
+            ("bad_length", 0x473),
+            ("bad_content", 0x473),
+        }
+
+
+def test_losses_are_counted_and_nothing_is_joined_over_them(cable: Cable) -> None:
+    with flowing(cable, buffer="40000") as (running, bus), DriverReader("roboskin") as reader:
+        follow(reader, lambda f: not f.status.any())
+
+        def flood() -> None:  # in the driver's thread: nothing is taken meanwhile
+            for _ in range(2000):
+                cable.put(0x6F3)
+
+        running.do(flood)
+        wait_until(lambda: bus.counters.lost > 0)
+        frame = follow(reader, lambda f: not f.status.any())
+        wait_until(lambda: reader.bus_counters(reader.read())[0]["lost"] == bus.counters.lost)
+        assert frame.data_path == DataPath.NATIVE
+
+
+def test_boards_that_fall_silent_go_stale_though_nothing_wakes_the_driver(cable: Cable) -> None:
+    hardware = EmulatedRoboskin(EmulatorOptions(boards=BOARDS))
+    bus = EndOfCable(cable.end)
+    lines: Sequence[Any] = [(RoboskinDriver(RoboskinOptions()), bus)]
+    with driving_lines(lines, "roboskin", wait=False) as running:
+        with boards_on(cable, hardware):
+            running.wait()
+            with DriverReader("roboskin") as reader:
+                follow(reader, lambda f: not f.status.any())
+        with DriverReader("roboskin") as reader:
+            follow(reader, lambda f: bool((f.status & int(Status.STALE) != 0).all()))
+            follow(reader, lambda f: f.bus_state[0] == BusState.SILENT)
+
+
+class Failing(BaselineWatch):
+    def look(self, updates: Updates) -> None:
+        raise KeyError("oops")
+
+
+class Watched(RoboskinDriver):
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        return Failing(tables)
+
+
+def test_a_watch_that_fails_ends_the_driver(cable: Cable) -> None:
+    def flag_until_it_ends() -> None:
+        with flowing(cable, Watched) as (running, _):
+            cable.out.send(struct.pack("=IB3x8s", 0x430, 8, b"\x40" + bytes(7)))
+            cable.out.send(struct.pack("=IB3x8s", 0x430, 8, b"\xc0" + bytes(5) + b"\x01\x00"))
+            wait_until(lambda: running.failure is not None)
+
+    with pytest.raises(DriverError, match=r"`Watch.look` failed: KeyError: 'oops'"):
+        flag_until_it_ends()
+
+
+def test_in_another_loop_the_driver_takes_frames_without_the_flow(cable: Cable) -> None:
+    hardware = EmulatedRoboskin(EmulatorOptions(boards=BOARDS))
+    lines = [("bus0", RoboskinDriver(RoboskinOptions()), EndOfCable(cable.end))]
+
+    async def run() -> DataPath:
+        ready = asyncio.Event()
+        runner = Runner("roboskin", lines, name="roboskin", on_ready=ready.set)
+        running = asyncio.create_task(runner.run())
+        await asyncio.wait_for(ready.wait(), 60)
+        with DriverReader("roboskin") as reader:
+            frame = await asyncio.to_thread(follow, reader, lambda f: not f.status.any())
+        runner.stop()
+        await running
+        return DataPath(frame.data_path)
+
+    with boards_on(cable, hardware):
+        assert asyncio.run(run()) == DataPath.NATIVE
+
+
+def test_a_selector_without_a_flow_is_one_like_any_other() -> None:
+    async def run() -> str:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, FlowLoop)
+        assert isinstance(loop.selector, FlowSelector)
+        await asyncio.sleep(0.001)
+        return await asyncio.to_thread(lambda: "done")
+
+    with asyncio.Runner(loop_factory=FlowLoop) as loop:
+        assert loop.run(run()) == "done"

@@ -102,7 +102,10 @@ def flowing(cable: Cable, driver: Any = RoboskinDriver, **options: str) -> Itera
 
 
 def newer_and_good(than: Any) -> Callable[[Any], bool]:
-    return lambda frame: not frame.status.any() and bool((frame.module_time_ns > than.module_time_ns).all())
+    def condition(frame: Any) -> bool:
+        return not frame.status.any() and bool((frame.module_time_ns > than.module_time_ns).all())
+
+    return condition
 
 
 def test_a_driver_flows_and_its_frames_are_whole(cable: Cable) -> None:

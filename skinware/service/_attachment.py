@@ -6,7 +6,7 @@ from typing import Any, Generic
 
 import numpy.typing as npt
 
-from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, ServiceNotFound
+from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, RequestRefused, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring import Frame, FrameT, RingReader
@@ -131,10 +131,12 @@ class Attachment(Generic[FrameT]):
             RequestTimeout: so many requests wait already that this one cannot be sent.
             RequestRefused, PeerGone, Closed: as ``call``.
         """
-        if not self._keep_up() and not self._successor_lives():
-            unreadable = ", or is one that this program cannot read" if self._moved else ""
-            raise PeerGone(f"the writer of {self.name!r} is dead{unreadable}; start it again")
-        return self._client.send(operation, arguments)
+        self._require_writer()
+        try:
+            return self._client.send(operation, arguments)
+        except RequestRefused:
+            self._require_writer()  # it may have been closed meanwhile, with its socket
+            raise
 
     def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
         """What ``call`` can ask for: descriptions by name.
@@ -173,6 +175,11 @@ class Attachment(Generic[FrameT]):
     def _require_open(self) -> None:
         if self._closed or self._ring.segment.descriptor.fd < 0:
             raise Closed(f"the reader of {self.name!r} was closed, or belongs to the process before a fork")
+
+    def _require_writer(self) -> None:
+        if not self._keep_up() and not self._successor_lives():
+            unreadable = ", or is one that this program cannot read" if self._moved else ""
+            raise PeerGone(f"the writer of {self.name!r} is dead{unreadable}; start it again") from None
 
     def _keep_up(self) -> bool:
         """Go over to a new generation if there may be one; whether the writer of the present one lives."""

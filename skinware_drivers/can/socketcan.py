@@ -24,7 +24,7 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch, identifier_text
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
 from skinware_drivers.can.interface import read_controller
 from skinware_drivers.can.recvmmsg import Rows, rows_of
@@ -233,7 +233,8 @@ class SocketCanBus(Bus):
             sock.send(frame)
         except OSError as error:
             self.counters.send_failures += 1
-            raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error.strerror})") from None
+            why = f"frame {identifier_text(identifier)} not sent ({error.strerror})"
+            raise BusSendError(f"bus {self.channel}: {why}") from None
         self.counters.sent += 1
 
     def _fd_frame(self, identifier: int, payload: bytes) -> bytes:

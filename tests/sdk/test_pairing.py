@@ -358,9 +358,8 @@ def test_a_frame_repeated_a_period_later_is_not_joined_with_the_other_half(
     device = Device(2, order, "module", 1 if uncounted else 16, PERIOD_NS // 4)
     cycles = [(cycle, cycle, cycle + 0.1) for cycle in range(8)]
     for half in range(2):
-        again = [LOST, LOST]
-        again[half] = cycles[3][1 + half] + after
-        sent = two_halves(*cycles, (3, *again))
+        again = (3, 3 + after, LOST) if half == 0 else (3, LOST, 3.1 + after)
+        sent = two_halves(*cycles, again)
         assert torn(device, sent) == 0, half
         shown, _ = device.joined([frame._replace(serial=number) for number, frame in enumerate(sent)])
         assert len(shown) >= 6, half  # one cycle is disturbed, and the one after it may be

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, Generic
 
 import numpy.typing as npt
@@ -19,6 +20,8 @@ from skinware.service.messages import OPERATIONS
 GENERATION_ENDED = file_layout.STATE_SUPERSEDED | file_layout.STATE_CLOSED
 
 _TELLING_SPAN_NS = NS_PER_S // 2
+_HASTE = 2
+"""So many times faster than its data came, a writer does not publish for long."""
 
 
 class Attachment(Generic[FrameT]):
@@ -94,13 +97,20 @@ class Attachment(Generic[FrameT]):
         """How often the writer publishes, from the times of the frames that the ring holds.
 
         None where they are too few to tell: after its start a writer may publish two frames at once and then wait.
+        After it was held up, it publishes what has waited at once; then the times of the data tell.
         """
         times = self._ring.publication_times_ns()
         span_ns = times[-1] - times[0] if times else 0
         is_full = len(times) >= self._ring.slot_count - 1  # the writer may be filling the last one
         if not span_ns or (span_ns < _TELLING_SPAN_NS and not is_full):
             return None
-        return round((len(times) - 1) * NS_PER_S / span_ns, 3)
+        rate_hz = (len(times) - 1) * NS_PER_S / span_ns
+        acquired_ns = [time_ns for _, time_ns in self._ring.acquisition_times_ns()]
+        intervals_ns = sorted(after - before for before, after in pairwise(acquired_ns))
+        usual_ns = intervals_ns[len(intervals_ns) // 2] if intervals_ns else 0
+        if span_ns < _TELLING_SPAN_NS and rate_hz * usual_ns > _HASTE * NS_PER_S:
+            rate_hz = NS_PER_S / usual_ns
+        return round(rate_hz, 3)
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns of the generation that is being read, read-only."""

@@ -18,6 +18,7 @@ from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import hook
+from skinware_drivers.running.limits import TROUBLESHOOTING
 from skinware_drivers.running.unused_frames import why_unused
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -137,9 +138,10 @@ class PatchCare:
                 set_ups.put_off()
                 log.warning(
                     "%s: %s answers, but its data finds no room: the bus is full; fewer boards, or a longer period"
-                    " (see docs/troubleshooting.md)",
+                    " (%s)",
                     line.name,
                     patch.name,
+                    TROUBLESHOOTING,
                 )
                 return False
         if not set_ups.begun:

@@ -20,8 +20,7 @@ The file is TOML. Sensors stand in groups that share a type and a frame::
 from __future__ import annotations
 
 import dataclasses
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -32,11 +31,14 @@ import numpy.typing as npt
 
 from skinware._columns import column, texts, within
 from skinware.errors import ConfigurationError, StructureError
+from skinware.toml_text import Keys, TomlText, wrong_value
 
 FORMAT, VERSION = "skinware-geometry", 1
 
 _LENGTH_TOLERANCE = 0.02
 """Of a normal: files give them with few digits."""
+_LONGEST_NAME = 64
+"""Of a frame, bytes."""
 
 
 class Sensors(Protocol):
@@ -73,6 +75,8 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str = ""
 
     def __post_init__(self) -> None:
+        if len(self.frame.encode()) > _LONGEST_NAME:
+            raise ValueError(f"frame {self.frame!r} is longer than {_LONGEST_NAME} bytes")
         for what, rows in (("position_m", self.position_m), ("normal", self.normal)):
             if rows is None:
                 continue
@@ -174,7 +178,7 @@ class Geometry:
             "sensor_normal": self.normal.astype("<f8").reshape(-1),
             "sensor_radius_m": self.radius_m.astype("<f8"),
             "sensor_frame": frame.astype("<u4"),
-            "frame_name": column("frame_name", frames, "|S64"),
+            "frame_name": column("frame_name", frames, f"|S{_LONGEST_NAME}"),
         }
 
     @classmethod
@@ -223,14 +227,8 @@ def read_geometry(path: str | Path) -> Geometry:
     Raises:
         ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
     """
-    path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigurationError(f"{path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigurationError(f"{path}: not TOML: {error}") from None
-    return _from_data(data, str(path))
+    text = TomlText(Path(path))
+    return _from_data(text.data, text.place)
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
@@ -256,31 +254,40 @@ def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _from_data(data: dict[str, Any], where: str) -> Geometry:
+def _from_data(data: dict[str, Any], place: Callable[[Keys], str]) -> Geometry:
+    """The geometry that a file describes.
+
+    Args:
+        data: what it says.
+        place: file and line of a value, for messages.
+    """
     if data.get("format") != FORMAT:
-        raise ConfigurationError(f'{where}: no geometry file: it does not say format = "{FORMAT}"')
+        raise ConfigurationError(f'{place(("format",))}: no geometry file: it does not say format = "{FORMAT}"')
     if data.get("version") != VERSION:
-        raise ConfigurationError(f"{where}: version {data.get('version')}, this Skinware reads version {VERSION}")
+        known = f"this Skinware reads version {VERSION}"
+        raise ConfigurationError(f"{place(('version',))}: version {data.get('version')}, {known}")
     try:
         groups = msgspec.convert(data, _File).group
     except msgspec.ValidationError as error:
-        raise ConfigurationError(f"{where}: {str(error).replace('`', '')}") from None
-    return _joined(groups, where)
+        text, keys = wrong_value(error)
+        raise ConfigurationError(f"{place(keys)}: {text}") from None
+    return _joined(groups, place)
 
 
-def _joined(groups: Sequence[GeometryGroup], where: str) -> Geometry:
+def _joined(groups: Sequence[GeometryGroup], place: Callable[[Keys], str]) -> Geometry:
     geometry = _empty(sum(len(group.uid) for group in groups))
     known: dict[tuple[str, int], str] = {}
     row = 0
     for number, group in enumerate(groups):
         name = group.name or f"group {number + 1}"
         for uid in group.uid:
+            why = ""
             if uid >= 1 << 64:
-                raise ConfigurationError(f"{where}: {name}: uid {uid:#x} has more than 64 bits")
-            if (group.type, uid) in known:
-                raise ConfigurationError(
-                    f"{where}: {name}: {group.type} sensor {uid:#x} is also in {known[group.type, uid]}"
-                )
+                why = f"uid {uid:#x} has more than 64 bits"
+            elif (group.type, uid) in known:
+                why = f"{group.type} sensor {uid:#x} is also in {known[group.type, uid]}"
+            if why:
+                raise ConfigurationError(f"{place(('group', number, 'uid'))}: {name}: {why}")
             known[group.type, uid] = name
         rows = slice(row, row + len(group.uid))
         geometry.type_name[rows], geometry.frame[rows] = group.type, group.frame

@@ -98,6 +98,10 @@ class Adapter(HasOptions[OptionsT], ABC):
         except ConfigurationError as error:
             raise ConfigurationError(f"{name}: {error}") from None
 
+    def wire_s(self, poll: Poll) -> float:  # noqa: ARG002
+        """How long question and answer of a poll take on the wire at least, s; 0 where that is not known."""
+        return 0.0
+
     def fit(self, bus: Bus) -> None:
         """Prepare a bus that is not open yet for what this driver expects of it.
 

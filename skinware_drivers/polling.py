@@ -1,18 +1,13 @@
-"""Asking devices that only answer, at absolute deadlines."""
+"""Questions to devices that only answer."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from skinware.errors import BusSendError, ConfigurationError
-from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware.errors import ConfigurationError
 from skinware_drivers.bus import identifier_text
-from skinware_drivers.counters import BusCounters
-from skinware_drivers.link import Link, Match
-
-_LOOK_AGAIN_S = 0.05
+from skinware_drivers.link import Match
 
 
 @dataclass(frozen=True)
@@ -40,7 +35,7 @@ class Poll:
     timeout_s: float | None = None
 
     def __post_init__(self) -> None:
-        name = f"poll {identifier_text(self.identifier)}"
+        name = self.name
         if not self.period_s > 0:
             raise ConfigurationError(f"{name} every {self.period_s} s: give more than 0")
         if self.timeout_s is not None and self.answer is None:
@@ -48,87 +43,57 @@ class Poll:
         if self.timeout_s is not None and not self.timeout_s > 0:
             raise ConfigurationError(f"{name} waits {self.timeout_s} s for its answer: give more than 0")
 
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"poll {identifier_text(self.identifier)}"
 
-class _Timer(Periodic):
-    """Deadlines of a poll, and when it was last asked."""
+    @property
+    def patience_s(self) -> float:
+        """How long its answer is waited for, s."""
+        return self.timeout_s or self.period_s
 
-    asked_ns = 0
 
-
-class Poller:
-    """Asks the polls of one bus, one after the other.
-
-    Every poll has deadlines of its own, by its place in the sequence: another payload at the same place keeps them. One
-    that cannot be kept (the bus took no more frames, the answer before came late, or this process had no processor
-    time) is counted as missed and not made up for: the next poll goes out at the next deadline.
+def check_polls(polls: Sequence[Poll], wire_s: Callable[[Poll], float]) -> str:
+    """Refuse polls that cannot be answered in time.
 
     Args:
-        link: the bus.
-        counters: of the bus; ``polls_missed`` and ``polls_unanswered`` are counted in them.
+        polls: those of one bus.
+        wire_s: how long question and answer of one take on the line at least, s; 0 where that is not known.
+
+    Returns:
+        What is doubtful about them, for people; empty if nothing is.
+
+    Raises:
+        ConfigurationError: one cannot be answered before its timeout.
     """
+    load = 0.0
+    doubts = []
+    for poll in polls:
+        needed_s = wire_s(poll)
+        load += needed_s / poll.period_s
+        if poll.answer is None:
+            continue
+        if needed_s > poll.patience_s:
+            raise ConfigurationError(
+                f"{poll.name} waits {_ms(poll.patience_s)} for its answer, but question and answer alone take"
+                f" {_ms(needed_s)} on the line: make timeout_s longer, or the line faster (baudrate)"
+            )
+        if len(polls) > 1 and poll.patience_s > poll.period_s:
+            doubts.append(
+                f"{poll.name} waits {_ms(poll.patience_s)} for its answer, longer than its period of"
+                f" {_ms(poll.period_s)}: if its device is silent, the others miss their turns; make timeout_s shorter"
+            )
+    if load > 1:
+        doubts.append(
+            f"all questions and answers take {100 * load:.0f} % of the time that their periods leave on the line: ask"
+            " for less, make the periods longer, or the line faster (baudrate)"
+        )
+    return "; ".join(doubts)
 
-    def __init__(self, link: Link, counters: BusCounters) -> None:
-        self._link = link
-        self._counters = counters
-        self._timers: list[_Timer] = []
 
-    async def run(self, polls: Callable[[], Sequence[Poll]], is_away: Callable[[], bool]) -> None:
-        """Ask what ``polls`` names, the first of each at once, until it is cancelled. What ``polls`` raises, it raises.
+def _ms(time_s: float) -> str:
+    return f"{time_s * 1e3:.3g} ms"
 
-        Args:
-            polls: called once before each question: what is to be asked may change. None: a pause, it is called again
-                after 50 ms.
-            is_away: the bus is lost: nothing is sent, and nothing missed.
-        """
-        while True:
-            await self._until_first_deadline()
-            asked = polls()
-            self._keep_time(asked)
-            if asked:
-                await self._ask_first(asked, is_away())
-            else:
-                await asyncio.sleep(_LOOK_AGAIN_S)
 
-    async def _until_first_deadline(self) -> None:
-        await asyncio.sleep(0)  # if it is late, others have their turn all the same
-        first_ns = min((timer.deadline_ns for timer in self._timers), default=0)
-        while (left_ns := first_ns - now_ns()) > 0:  # noqa: ASYNC110 - the loop's timers may come a little early
-            await asyncio.sleep(left_ns / NS_PER_S)
-
-    def _keep_time(self, asked: Sequence[Poll]) -> None:
-        """A timer for every poll: of one whose period changed, from its last deadline on."""
-        del self._timers[len(asked) :]
-        for place, poll in enumerate(asked):
-            timer = _Timer(1 / poll.period_s)
-            if place == len(self._timers):
-                timer.deadline_ns -= timer.period_ns
-                self._timers.append(timer)
-            elif timer.period_ns != self._timers[place].period_ns:
-                before = self._timers[place]
-                timer.deadline_ns = before.deadline_ns - before.period_ns + timer.period_ns
-                timer.asked_ns = before.asked_ns
-                self._timers[place] = timer
-
-    async def _ask_first(self, asked: Sequence[Poll], is_away: bool) -> None:
-        """Of the polls that are due, ask the one that has waited longest since it was asked, if there is any."""
-        time_ns = now_ns()
-        due = [pair for pair in zip(self._timers, asked, strict=True) if pair[0].deadline_ns <= time_ns]
-        if not due:
-            return
-        timer, poll = min(due, key=lambda pair: pair[0].asked_ns)
-        missed_before = timer.missed
-        timer.advance(time_ns)
-        timer.asked_ns = time_ns
-        if is_away:
-            return
-        counters = self._counters
-        counters.polls_missed += timer.missed - missed_before
-        try:
-            if poll.answer is None:
-                await self._link.send(poll.identifier, poll.payload, timeout_s=poll.period_s)
-            elif not await self._link.ask(
-                poll.identifier, poll.payload, poll.answer, timeout_s=poll.timeout_s or poll.period_s
-            ):
-                counters.polls_unanswered += 1
-        except BusSendError:
-            counters.polls_missed += 1
+__all__ = ["Poll", "check_polls"]

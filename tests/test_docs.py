@@ -229,3 +229,15 @@ def test_pictures_need_nothing_from_elsewhere(image: Path) -> None:
     assert "@font-face" not in text
     assert "@import" not in text
     assert image.stat().st_size < 100_000
+
+
+def test_pages_that_messages_name_exist() -> None:
+    """By their titles: who has installed a wheel has no files of the documentation."""
+    titles = {page.read_text().partition("\n")[0].removeprefix("# ") for page in (ROOT / "docs").rglob("*.md")}
+    code = "".join(
+        path.read_text() for folder in ("skinware", "skinware_drivers") for path in (ROOT / folder).rglob("*.py")
+    )
+    named = set(re.findall(r'see "([^"]+)" in the documentation', code))
+    assert len(named) >= 2
+    assert named <= titles
+    assert not re.findall(r"see docs/[\w/-]+\.md", code)

@@ -18,7 +18,7 @@ from skinware.cli._health import (
 )
 from skinware.driver_service import KIND, DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
-from skinware.memory.announcement import ReaderRecord, living_readers
+from skinware.memory.announcement import MOST_ANNOUNCEMENTS, ReaderRecord, living_readers
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.memory.statistics import Histogram, WriterStatistics
@@ -46,6 +46,9 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
     services: list[dict[str, Any]] = []
     problems: list[str] = []
     readers = [_reader(record) for record in living_readers(namespace)]
+    if len(list(namespace.reader_files(MOST_ANNOUNCEMENTS + 1))) > MOST_ANNOUNCEMENTS:
+        folder = namespace.readers_path
+        problems.append(f"{folder}: more than {MOST_ANNOUNCEMENTS} files; readers may be missing here; empty it")
     for name in [only] if only is not None else namespace.services():
         try:
             entry = _describe(namespace, name)

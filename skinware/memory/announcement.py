@@ -1,13 +1,12 @@
 """Readers make themselves known: a locked file each, which only its reader writes and nobody maps.
 
 A file is the CRC-32 of what follows (8 hex digits), a space, one JSON object, spaces up to 2048 bytes. A file
-that nobody holds the lock of belongs to a dead reader and is swept away.
+that nobody holds the lock of belongs to a dead reader, and whoever looks and may removes it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import secrets
 import zlib
@@ -19,8 +18,9 @@ from skinware.memory.locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread
 
+MOST_ANNOUNCEMENTS = 1000
+"""Nobody looks at more of them at once."""
 _SIZE = 2048
-_SWEPT_AT_ONCE = 1000
 _READ_ATTEMPTS = 5
 
 
@@ -100,43 +100,37 @@ class Announcement:
 
 
 def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
-    """What the readers that are alive say of themselves, in order of service and pid."""
-    for path in namespace.reader_files():
-        try:
-            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        except OSError:
-            continue
-        try:
-            record = _read(fd) if is_locked(fd) else None
-        except OSError:
-            continue
-        finally:
-            os.close(fd)
+    """What the readers that are alive say of themselves, in order of service and pid; see :func:`sweep`."""
+    for fd in _living(namespace):
+        record = None
+        with contextlib.suppress(OSError):  # whatever it is, a reader made no such file
+            record = _read(fd)
         if record is not None:
             yield record
 
 
-def sweep(namespace: Namespace) -> int:
+def sweep(namespace: Namespace) -> None:
     """Remove what dead readers left behind, as far as this user may.
 
-    It looks at 1,000 files at most: however many somebody puts there, they delay no start. The next start goes on.
-
-    Returns:
-        How many files were removed.
+    It looks at ``MOST_ANNOUNCEMENTS`` files at most: however many somebody puts there, they delay nobody. The next
+    look goes on.
     """
-    removed = 0
-    with contextlib.suppress(OSError), os.scandir(namespace.readers_path) as entries:
-        for entry in itertools.islice(entries, _SWEPT_AT_ONCE):
-            with contextlib.suppress(OSError):
-                fd = os.open(entry.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-                try:
-                    alive = is_locked(fd)
-                finally:
-                    os.close(fd)
-                if not alive:
-                    os.unlink(entry.path)
-                    removed += 1
-    return removed
+    for _ in _living(namespace):
+        pass
+
+
+def _living(namespace: Namespace) -> Iterator[int]:
+    """Open announcements of readers that are alive; those of dead ones are removed."""
+    for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
+        with contextlib.suppress(OSError):
+            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                if is_locked(fd):
+                    yield fd
+                else:
+                    path.unlink()
+            finally:
+                os.close(fd)
 
 
 def _read(fd: int) -> ReaderRecord | None:

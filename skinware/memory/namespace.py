@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import grp
+import itertools
 import os
 import pwd
 import re
@@ -145,11 +146,15 @@ class Namespace:
         """Where a service takes requests."""
         return self.path / f"{service}.sock"
 
-    def reader_files(self) -> Iterator[Path]:
-        """The announcements of readers."""
+    def reader_files(self, most: int | None = None) -> Iterator[Path]:
+        """The announcements of readers.
+
+        Args:
+            most: look at no more of them; default: at all.
+        """
         try:
             with os.scandir(self.readers_path) as entries:
-                names = sorted(entry.name for entry in entries if not entry.name.startswith("."))
+                names = sorted(entry.name for entry in itertools.islice(entries, most))
         except (FileNotFoundError, PermissionError):
             return
         for name in names:

@@ -54,7 +54,7 @@ def set_policy(priority: int) -> Refusal | None:
         what = f"SCHED_FIFO priority {priority}" if priority else "normal scheduling"
         if _has_capability(_CAP_SYS_NICE):
             why = "this process has CAP_SYS_NICE, so its container or control group forbids it"
-            return Refusal(what, why, "allow it there, see docs/how-to/realtime.md")
+            return Refusal(what, why, 'allow it there, see "Keep a loop on time" in the documentation')
         limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
         return Refusal(what, f"RLIMIT_RTPRIO is {limit} without CAP_SYS_NICE", _limits_line(f"rtprio {priority}"))
     return None
@@ -73,7 +73,9 @@ def lock_memory() -> Refusal | None:
         why = f"RLIMIT_MEMLOCK is {limit // 1024} KiB, not unlimited, without CAP_IPC_LOCK"
         return Refusal(what, why, _limits_line("memlock unlimited"))
     if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) != 0:
-        return Refusal(what, f"mlockall: {os.strerror(ctypes.get_errno())}", "see docs/how-to/realtime.md")
+        return Refusal(
+            what, f"mlockall: {os.strerror(ctypes.get_errno())}", 'see "Keep a loop on time" in the documentation'
+        )
     return None
 
 
@@ -106,7 +108,7 @@ def _limits_line(limit: str) -> str:
         name = "USER"
     return (
         f"put '{name} - {limit}' into /etc/security/limits.d/skinware.conf and log in again"
-        " (services, containers: docs/how-to/realtime.md)"
+        ' (services, containers: see "Keep a loop on time" in the documentation)'
     )
 
 

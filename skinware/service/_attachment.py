@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, Generic
 
 import numpy.typing as npt
 
-from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, ServiceNotFound
+from skinware.errors import BadServiceFile, Closed, NamespaceError, PeerGone, RequestRefused, ServiceNotFound
 from skinware.memory import file_layout, segments
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.native_ring import ring_reader
@@ -20,6 +21,8 @@ from skinware.service.messages import OPERATIONS
 GENERATION_ENDED = file_layout.STATE_SUPERSEDED | file_layout.STATE_CLOSED
 
 _TELLING_SPAN_NS = NS_PER_S // 2
+_HASTE = 2
+"""So many times faster than its data came, a writer does not publish for long."""
 
 
 class Attachment(Generic[FrameT]):
@@ -95,13 +98,20 @@ class Attachment(Generic[FrameT]):
         """How often the writer publishes, from the times of the frames that the ring holds.
 
         None where they are too few to tell: after its start a writer may publish two frames at once and then wait.
+        After it was held up, it publishes what has waited at once; then the times of the data tell.
         """
         times = self._ring.publication_times_ns()
         span_ns = times[-1] - times[0] if times else 0
         is_full = len(times) >= self._ring.slot_count - 1  # the writer may be filling the last one
         if not span_ns or (span_ns < _TELLING_SPAN_NS and not is_full):
             return None
-        return round((len(times) - 1) * NS_PER_S / span_ns, 3)
+        rate_hz = (len(times) - 1) * NS_PER_S / span_ns
+        acquired_ns = [time_ns for _, time_ns in self._ring.acquisition_times_ns()]
+        intervals_ns = sorted(after - before for before, after in pairwise(acquired_ns))
+        usual_ns = intervals_ns[len(intervals_ns) // 2] if intervals_ns else 0
+        if span_ns < _TELLING_SPAN_NS and rate_hz * usual_ns > _HASTE * NS_PER_S:
+            rate_hz = NS_PER_S / usual_ns
+        return round(rate_hz, 3)
 
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns of the generation that is being read, read-only."""
@@ -132,10 +142,12 @@ class Attachment(Generic[FrameT]):
             RequestTimeout: so many requests wait already that this one cannot be sent.
             RequestRefused, PeerGone, Closed: as ``call``.
         """
-        if not self._keep_up() and not self._successor_lives():
-            unreadable = ", or is one that this program cannot read" if self._moved else ""
-            raise PeerGone(f"the writer of {self.name!r} is dead{unreadable}; start it again")
-        return self._client.send(operation, arguments)
+        self._require_writer()
+        try:
+            return self._client.send(operation, arguments)
+        except RequestRefused:
+            self._require_writer()  # it may have been closed meanwhile, with its socket
+            raise
 
     def operations(self, *, timeout_s: float = 5.0) -> dict[str, str]:
         """What ``call`` can ask for: descriptions by name.
@@ -174,6 +186,11 @@ class Attachment(Generic[FrameT]):
     def _require_open(self) -> None:
         if self._closed or self._ring.segment.descriptor.fd < 0:
             raise Closed(f"the reader of {self.name!r} was closed, or belongs to the process before a fork")
+
+    def _require_writer(self) -> None:
+        if not self._keep_up() and not self._successor_lives():
+            unreadable = ", or is one that this program cannot read" if self._moved else ""
+            raise PeerGone(f"the writer of {self.name!r} is dead{unreadable}; start it again") from None
 
     def _keep_up(self) -> bool:
         """Go over to a new generation if there may be one; whether the writer of the present one lives."""

@@ -199,10 +199,10 @@ class Ownership:
             segments.note_published(self._name_lock, segment.published)
             if segments.current_inode(self.namespace, self.name) == segment.inode:
                 self.namespace.ring_path(self.name).unlink()
-            if self._server is not None:
-                self._server.close()
             self._ring.set_state(file_layout.STATE_CLOSED)
             segment.descriptor.close()
+            if self._server is not None:
+                self._server.close()  # now: who finds no socket finds no living writer either
             self._name_lock.close()
 
     def _begin_generation(

@@ -18,6 +18,8 @@ _IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS, _IFLA_CAN_DATA_BITTI
 _HEADER, _INTERFACE = struct.Struct("=IHHII"), struct.Struct("=BxHiII")
 _ANSWER_BYTES = 1 << 16
 
+NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
+
 
 @dataclass(frozen=True)
 class Controller:

@@ -15,12 +15,16 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
+from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch, identifier_text
+from skinware_drivers.counters import BusCounters
+from skinware_drivers.samples import Samples
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
+_CLOSE_S = 0.8
+"""How long an interface may take to be closed; a driver ends within a second or so, whatever its interfaces do."""
 _NUMBERS = (int, float)
 _LISTENING: dict[str, dict[str, Any]] = {
     "cantact": {"monitor": True},
@@ -64,11 +68,7 @@ class PythonCanBus(Bus):
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self.interface = interface
         self._bus: can.BusABC | None = None
-        self._thread: threading.Thread | None = None
-        self._queue: deque[tuple[int, int, bytes]] = deque()
-        self._wake_fd = -1
-        self._stop = threading.Event()
-        self._failure: str | None = None
+        self._messages: _Messages | None = None
         self._was_open = False
 
     def open(self) -> None:
@@ -92,12 +92,7 @@ class PythonCanBus(Bus):
             why = f"bus {self.interface}:{self.channel} cannot be opened: {error}"
             raise BusNotAvailable(why, reason=BusReason.FAILED) from None
         self._was_open = True
-        self._failure = None
-        self._stop.clear()
-        self._queue.clear()
-        self._wake_fd = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._thread = threading.Thread(target=self._take_messages, name=f"bus {self.channel}", daemon=True)
-        self._thread.start()
+        self._messages = _Messages(self._bus, f"bus {self.interface}:{self.channel}", self.counters, self.samples)
 
     @property
     def note(self) -> str:
@@ -111,23 +106,25 @@ class PythonCanBus(Bus):
 
     def check(self) -> None:
         """Whether messages are still being taken; see :class:`skinware_drivers.bus.Bus`."""
-        if self._failure is not None and not self._queue:
-            why = f"bus {self.interface}:{self.channel} failed: {self._failure}"
+        messages = self._messages
+        if messages is not None and messages.failure is not None and not messages.queue:
+            why = f"bus {self.interface}:{self.channel} failed: {messages.failure}"
             raise BusNotAvailable(why, reason=BusReason.FAILED)
 
     def fileno(self) -> int:
         """An eventfd that is readable while messages wait, -1 while closed."""
-        return self._wake_fd
+        return self._messages.fd if self._messages is not None else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
         """Append the messages that wait; see :class:`skinware_drivers.bus.Bus`."""
-        if self._bus is None:
+        messages = self._messages
+        if messages is None:
             raise BusNotAvailable(f"bus {self.channel} is not open")
         with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self._wake_fd)
+            os.eventfd_read(messages.fd)
         count = 0
-        while self._queue and batch.free:
-            time_ns, identifier, payload = self._queue.popleft()
+        while messages.queue and batch.free:
+            time_ns, identifier, payload = messages.queue.popleft()
             if len(payload) > batch.payload_size:
                 self.counters.refused += 1
                 self.samples.note(Unused.REFUSED, identifier, payload)
@@ -136,8 +133,8 @@ class PythonCanBus(Bus):
             count += 1
         if not count:
             self.check()
-        if self._queue or self._failure is not None:  # the failure comes after the last messages: look again
-            os.eventfd_write(self._wake_fd, 1)
+        if messages.queue or messages.failure is not None:  # the failure comes after the last messages: look again
+            os.eventfd_write(messages.fd, 1)
         self.counters.frames += count
         return count
 
@@ -154,47 +151,80 @@ class PythonCanBus(Bus):
             bus.send(message, timeout=0)
         except Exception as error:  # noqa: BLE001  (see the class)
             self.counters.send_failures += 1
-            raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error})") from None
+            raise BusSendError(f"bus {self.channel}: frame {identifier_text(identifier)} not sent ({error})") from None
         self.counters.sent += 1
 
     def close(self) -> None:
-        """Stop the thread and shut the interface down. Idempotent."""
-        if self._bus is None:
-            return
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
+        """Stop taking messages and shut the interface down. Idempotent.
+
+        An interface that hangs in it is left to itself after 0.8 s, which is logged.
+        """
+        messages, self._bus, self._messages = self._messages, None, None
+        if messages is not None:
+            messages.close()
+
+
+class _Messages:
+    """The messages of one opened interface, taken by a thread, which also shuts the interface down: both may hang.
+
+    Args:
+        bus: the interface.
+        name: of the bus, for messages.
+        counters, samples: the bus' own.
+
+    Attributes:
+        queue: of each that waits: time of its arrival, identifier (with its flag), payload.
+        failure: why no more come; None as long as they may.
+        fd: an eventfd that was written to whenever one of the two changed; the thread's, until it ends.
+    """
+
+    def __init__(self, bus: can.BusABC, name: str, counters: BusCounters, samples: Samples) -> None:
+        self.queue: deque[tuple[int, int, bytes]] = deque()
+        self.failure: str | None = None
+        self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._bus, self._name, self._counters, self._samples = bus, name, counters, samples
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread, if it can be ended."""
+        self._closing.set()
+        self._thread.join(_CLOSE_S)
+        if self._thread.is_alive():
+            log.warning("%s: its interface hangs while it is closed, and is left to itself", self._name)
+
+    def _work(self) -> None:
+        try:
+            self._take_all()
+        except Exception as error:  # noqa: BLE001  (see PythonCanBus)
+            self.failure = str(error) or type(error).__name__
+            os.eventfd_write(self.fd, 1)
+        self._closing.wait()
         try:
             self._bus.shutdown()
-        except Exception as error:  # noqa: BLE001  (see the class)
-            log.debug("bus %s: %s", self.channel, error)
-        self._bus = None
-        os.close(self._wake_fd)
-        self._wake_fd = -1
+        except Exception as error:  # noqa: BLE001  (see PythonCanBus)
+            log.debug("%s: %s", self._name, error)
+        os.close(self.fd)
 
-    def _take_messages(self) -> None:
-        bus = self._bus
-        try:
-            while bus is not None and not self._stop.is_set():
-                message = bus.recv(_POLL_S)
-                if message is not None:
-                    self._take(message)
-        except Exception as error:  # noqa: BLE001  (see the class)
-            self._failure = str(error) or type(error).__name__
-            os.eventfd_write(self._wake_fd, 1)
+    def _take_all(self) -> None:
+        while not self._closing.is_set():
+            message = self._bus.recv(_POLL_S)
+            if message is not None:
+                self._take(message)
 
     def _take(self, message: can.Message) -> None:
+        identifier = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
         if message.is_error_frame:
-            self.counters.errors += 1
+            self._counters.errors += 1
         elif message.is_remote_frame:
-            self.counters.refused += 1
-            self.samples.note(Unused.REFUSED, message.arbitration_id, b"")
-        elif len(self._queue) >= _QUEUE_FRAMES:
-            self.counters.lost += 1
+            self._counters.refused += 1
+            self._samples.note(Unused.REFUSED, identifier, b"")
+        elif len(self.queue) >= _QUEUE_FRAMES:
+            self._counters.lost += 1
         else:
-            flag = EXTENDED_FLAG if message.is_extended_id else 0
-            self._queue.append((now_ns(), message.arbitration_id | flag, bytes(message.data)))
-            os.eventfd_write(self._wake_fd, 1)
+            self.queue.append((now_ns(), identifier, bytes(message.data)))
+            os.eventfd_write(self.fd, 1)
 
 
 def _typed(text: str) -> int | float | bool | str:

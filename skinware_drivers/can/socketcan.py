@@ -24,9 +24,18 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, Filter, FrameBatch, KernelSource, Received
+from skinware_drivers.bus import (
+    ERROR_FLAG,
+    REMOTE_FLAG,
+    Bus,
+    Filter,
+    FrameBatch,
+    KernelSource,
+    Received,
+    identifier_text,
+)
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
-from skinware_drivers.can.interface import read_controller
+from skinware_drivers.can.interface import NO_CAN, read_controller
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
 from skinware_drivers.can.wire_time import wire_bits
@@ -112,9 +121,7 @@ class SocketCanBus(Bus):
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
             if error.errno == errno.EAFNOSUPPORT:
-                raise BusNotAvailable(
-                    "this kernel has no CAN: load it (modprobe can-raw), or use a bus that needs none (--bus virtual)"
-                ) from None
+                raise BusNotAvailable(NO_CAN) from None
             raise BusNotAvailable(
                 f"bus {self.channel}: cannot open a CAN socket ({error.strerror})", reason=BusReason.REFUSED
             ) from None
@@ -266,7 +273,8 @@ class SocketCanBus(Bus):
             sock.send(frame)
         except OSError as error:
             self.counters.send_failures += 1
-            raise BusSendError(f"bus {self.channel}: frame {identifier:03X} not sent ({error.strerror})") from None
+            why = f"frame {identifier_text(identifier)} not sent ({error.strerror})"
+            raise BusSendError(f"bus {self.channel}: {why}") from None
         self.counters.sent += 1
 
     def _fd_frame(self, identifier: int, payload: bytes) -> bytes:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     import msgspec
 
+    from skinware.geometry import Geometry
     from skinware.realtime import Profile
     from skinware_drivers.adapter import AnyAdapter
     from skinware_drivers.bus import Bus
@@ -182,6 +183,7 @@ def command(
 
     On SIGHUP, a listener adds the modules that it has heard since it started, and the buses of the --config file are
     read again: new buses join, removed ones leave, those with changed options are opened again, the others continue.
+    So is the geometry file.
     Closing the terminal also sends SIGHUP; the driver then ends.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
@@ -232,9 +234,14 @@ def command(
                 )
             return bus
 
-    async def read_buses_again() -> None:
+    def geometry_of(settings: DriverConfig) -> Geometry | None:
+        path = geometry_file or settings.geometry
+        return read_geometry(path) if path else None
+
+    async def read_again() -> None:
+        new = _read(config)
+        geometry = geometry_of(new.settings)  # a mistake in it changes nothing else either
         if config is not None and not buses:  # what the command line names is not the file's to change
-            new = _read(config)
             wanted_driver = new.settings.driver or DEFAULT_DRIVER
             if is_of_file and wanted_driver != driver_name:
                 raise ConfigurationError(
@@ -243,8 +250,8 @@ def command(
             _refuse_twice([bus.name for bus in new.settings.bus])
             wanted = {bus.name: adapter_of(bus.name, new) for bus in new.settings.bus}
             await runner.buses.change_to(wanted, lambda name, adapter: bus_of(name, adapter, new))
+        await runner.change_geometry(geometry)
 
-    geometry_path = geometry_file or settings.geometry
     adapters = [adapter_of(bus_name, file) for bus_name in bus_names]
     runner = Runner(
         driver_type,
@@ -257,25 +264,25 @@ def command(
         namespace=Namespace(namespace),
         slots=slots,
         group=group,
-        geometry=read_geometry(geometry_path) if geometry_path else None,
+        geometry=geometry_of(settings),
         on_ready=lambda: _tell_ready(runner, as_json),
     )
     if profile is not None:
         profile.apply()
     with asyncio.Runner(loop_factory=FlowLoop) as loop:
-        loop.run(_run(runner, as_json, read_buses_again))
+        loop.run(_run(runner, as_json, read_again))
 
 
-async def _run(runner: Runner, as_json: bool, read_buses_again: Callable[[], Coroutine[Any, Any, None]]) -> None:
+async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine[Any, Any, None]]) -> None:
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(lambda _, context: _end(runner, context))  # by default it would be logged, and no more
     reading: set[asyncio.Task[None]] = set()
 
     async def read_again() -> None:
         try:
-            await read_buses_again()
+            await read_files()
         except (ConfigurationError, DriverError) as error:
-            log.error("buses stay as they are: %s", error)
+            log.error("buses and places stay as they are: %s", error)
 
     had_terminal = _has_terminal()
 

@@ -195,7 +195,8 @@ def _can_data(
 ) -> dict[str, Any]:
     import msgspec
 
-    from skinware_drivers.finding.interfaces import NO_CAN, NO_INTERFACE, kernel_has_can
+    from skinware_drivers.can.interface import NO_CAN
+    from skinware_drivers.finding.interfaces import NO_INTERFACE, kernel_has_can
 
     in_kernel = kernel_has_can()
     advice = []

@@ -27,7 +27,6 @@ _STATISTICS = ("rx_packets", "tx_packets", "rx_errors", "tx_errors", "rx_dropped
 _IP_TIMEOUT_S = 5.0
 _SYSTEM_PATH = "/usr/sbin:/sbin:/usr/bin:/bin"
 
-NO_CAN = "this kernel has no CAN: load it (sudo modprobe -a can-raw vcan), or use a bus that needs none (--bus virtual)"
 NO_INTERFACE = (
     "no CAN interface: is the adapter plugged in? For one without hardware:"
     " sudo modprobe vcan; sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up"

@@ -17,8 +17,6 @@
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,12 +27,11 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
+from skinware.toml_text import Keys, TomlText, wrong_value
 from skinware_drivers.options.names import is_file, nearest_name
 from skinware_drivers.options.texts import options_from_strings
-from skinware_drivers.options.toml_lines import Keys, line_of
 
 T = TypeVar("T", bound=msgspec.Struct)
-_KEYS_IN_ERROR = re.compile(r"\.(\w+)|\[(\d+)\]")
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,25 +89,18 @@ class ConfigFile:
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._path = path
-        self._text = ""
+        self._text = TomlText(path)
         self.settings = DriverConfig()
         if path is None:
             return
-        try:
-            self._text = path.read_text(encoding="utf-8")
-            data = tomllib.loads(self._text)
-        except OSError as error:
-            raise ConfigurationError(f"{path}: {error.strerror}") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"{path}: not TOML: {error}") from None
+        data = self._text.data
         try:
             _check_keys(DriverConfig, data)
             for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
                 _check_keys(BusConfig, bus, ("bus", number))
             settings = _convert(DriverConfig, data)
         except _Wrong as wrong:
-            raise ConfigurationError(f"{self._place(wrong.keys)}: {wrong}") from None
+            raise ConfigurationError(f"{self._text.place(wrong.keys)}: {wrong}") from None
         if is_file(settings.driver):
             settings = msgspec.structs.replace(settings, driver=str(path.parent / settings.driver))
         if settings.geometry:
@@ -139,9 +129,9 @@ class ConfigFile:
         except _Wrong as wrong:
             key = next(iter(wrong.keys), None)
             if key in of_bus or (key is None and of_bus):
-                place = self._place(("bus", number, "options", *wrong.keys))
+                place = self._text.place(("bus", number, "options", *wrong.keys))
             elif key in self.settings.options or (key is None and self.settings.options):
-                place = self._place(("options", *wrong.keys))
+                place = self._text.place(("options", *wrong.keys))
             else:
                 raise ConfigurationError(f"options of {bus_name}: {wrong}") from None
             raise ConfigurationError(f"{place}: options of {bus_name}: {wrong}") from None
@@ -155,10 +145,7 @@ class ConfigFile:
             numbers = [number for number, bus in enumerate(self.settings.bus) if bus.name == bus_name]
             if not numbers:
                 raise
-            raise ConfigurationError(f"{self._place(('bus', numbers[0], 'name'))}: {error}") from None
-
-    def _place(self, keys: Keys) -> str:
-        return f"{self._path}:{line_of(self._text, keys)}"
+            raise ConfigurationError(f"{self._text.place(('bus', numbers[0], 'name'))}: {error}") from None
 
 
 class _Wrong(Exception):
@@ -176,8 +163,7 @@ def _convert(struct: type[T], data: Mapping[str, Any]) -> T:
     except ConfigurationError as error:
         raise _Wrong(str(error), ()) from None
     except msgspec.ValidationError as error:
-        text = str(error).replace("`", "")
-        keys = tuple(int(number) if number else key for key, number in _KEYS_IN_ERROR.findall(text.rpartition("$")[2]))
+        text, keys = wrong_value(error)
         raise _Wrong(str(error.__cause__) if isinstance(error.__cause__, ConfigurationError) else text, keys) from None
 
 

@@ -20,6 +20,7 @@ HIGH_FILL = 0.5
 """Of the receive buffer."""
 SOFTNET = Path("/proc/net/softnet_stat")
 _LOOK_PAUSE_NS = NS_PER_S
+TROUBLESHOOTING = 'see "Troubleshooting" in the documentation'
 
 
 def share_of_time(bus: Bus, bits: float, passed_ns: int) -> float | None:
@@ -94,7 +95,7 @@ class BusLimits:
     def _tell(self, what: str, text: str) -> None:
         if what not in self._told:
             self._told.add(what)
-            log.warning("bus %s: %s; logged once, see docs/troubleshooting.md", self._name, text)
+            log.warning("bus %s: %s; logged once, %s", self._name, text, TROUBLESHOOTING)
 
 
 class MachineLimits:
@@ -129,8 +130,9 @@ class MachineLimits:
         if was_none and self.softnet_dropped:
             log.warning(
                 "this machine dropped %d network packets before any socket saw them, CAN frames perhaps among them;"
-                " more room: sysctl net.core.netdev_max_backlog=10000; logged once, see docs/troubleshooting.md",
+                " more room: sysctl net.core.netdev_max_backlog=10000; logged once, %s",
                 self.softnet_dropped,
+                TROUBLESHOOTING,
             )
 
     def _read(self) -> int:

@@ -18,6 +18,8 @@ from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import hook
+from skinware_drivers.running.limits import TROUBLESHOOTING
+from skinware_drivers.running.unused_frames import why_unused
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -91,8 +93,12 @@ class PatchCare:
             await asyncio.sleep((timer.deadline_ns - now_ns()) / NS_PER_S)
             timer.advance(now_ns())
             silent = self._patches_in(PatchState.EXPECTED)
-        for patch in silent:
-            log.warning("%s: %s sends no data", self._line.name, patch.name)
+        if silent:
+            names = ", ".join(patch.name for patch in silent)
+            who = f"{names} sends" if len(silent) == 1 else f"{len(silent)} patches send"
+            which = "" if len(silent) == 1 else f": {names}"
+            why = "".join(f"; {reason}" for reason in why_unused(self._line.adapter.layout, self._line.bus))
+            log.warning("%s: %s no data%s%s", self._line.name, who, which, why)
 
     async def recover_silent(self) -> None:
         """Ask silent patches whether they are there, and set up those that answer."""
@@ -132,9 +138,10 @@ class PatchCare:
                 set_ups.put_off()
                 log.warning(
                     "%s: %s answers, but its data finds no room: the bus is full; fewer boards, or a longer period"
-                    " (see docs/troubleshooting.md)",
+                    " (%s)",
                     line.name,
                     patch.name,
+                    TROUBLESHOOTING,
                 )
                 return False
         if not set_ups.begun:

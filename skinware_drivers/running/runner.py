@@ -196,6 +196,11 @@ class Runner:
         """Take in what has appeared on the buses since the start, as a new generation."""
         self._serving.join()
 
+    async def change_geometry(self, geometry: Geometry | None) -> None:
+        """Have these places of the sensors from now on; a new generation, if one of them moves."""
+        self._geometry = geometry
+        await self._build()
+
     async def _put_in(self, line: BusLine) -> None:
         """Begin with a bus that joins: users see a new generation."""
         async with self._built:

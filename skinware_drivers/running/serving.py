@@ -12,11 +12,12 @@ from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
 from skinware_drivers.adapter import Adapter
-from skinware_drivers.polling import Poller
+from skinware_drivers.polling import Poll, check_polls
 from skinware_drivers.running.bus_line import BusLine, are_patches
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import hook
 from skinware_drivers.running.patch_care import PatchCare
+from skinware_drivers.running.poller import Poller
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -137,8 +138,16 @@ class Serving:
                 line.aside.begin_again()
 
     async def _poll(self, line: BusLine) -> None:
+        told = {""}
+
+        def check(polls: Sequence[Poll]) -> None:
+            doubt = check_polls(polls, line.adapter.wire_s)
+            if doubt not in told:
+                told.add(doubt)
+                log.warning("%s: %s", line.name, doubt)
+
         with hook("polls", line.name):
-            await Poller(line.link, line.bus.counters).run(lambda: line.adapter.polls, line.lost.is_set)
+            await Poller(line.link, line.bus.counters, check).run(lambda: line.adapter.polls, line.lost.is_set)
 
     async def _join_on_request(self, line: BusLine) -> None:
         while True:

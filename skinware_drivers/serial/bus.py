@@ -76,6 +76,11 @@ class SerialBus(Bus):
         self._reads: list[tuple[int, int]] = []
         self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
+    @property
+    def baudrate(self) -> int:
+        """Bits per second, as the bus' name says or ``use`` did; a bus that is open may still have the one before."""
+        return self._serial_options.baudrate or self._baudrate
+
     def use(self, framing: Framing, commands: Encoding | None = None, baudrate: int | None = None) -> None:
         """Say what is on the line. What was received but not fetched is dropped.
 
@@ -109,7 +114,7 @@ class SerialBus(Bus):
 
     def _open_port(self) -> Port:
         path = find_port(self._path, self._serial_options)
-        return open_port(path, self._serial_options, self._serial_options.baudrate or self._baudrate)
+        return open_port(path, self._serial_options, self.baudrate)
 
     def fileno(self) -> int:
         """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""

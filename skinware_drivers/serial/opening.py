@@ -26,7 +26,9 @@ _READ_TIMEOUT_S = 0.1
 class SerialOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a serial bus."""
 
-    baudrate: Annotated[int | None, Meta(ge=1, description="bits per second; default: what the driver says")] = None
+    baudrate: Annotated[
+        Annotated[int, Meta(ge=1)] | None, Meta(description="bits per second; default: what the driver says")
+    ] = None
     serial_number: Annotated[str, Meta(description="of the USB device, in place of a path")] = ""
     vid_pid: Annotated[str, Meta(description="vendor and product of the USB device, as 0483:5700")] = ""
     parity: Annotated[Literal["none", "even", "odd"], Meta(description="parity bit")] = "none"

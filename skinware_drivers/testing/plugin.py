@@ -27,6 +27,7 @@ _NO_CAN = (
     " `pytest --skin-can-lab`, which runs these tests in a virtual machine that has CAN"
 )
 _numbers = itertools.count()
+_failed = pytest.StashKey[bool]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -67,6 +68,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("can")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """Remember whether the test itself failed."""
+    if call.when == "call":
+        item.stash[_failed] = call.excinfo is not None
+
+
 def has_can() -> bool:
     """Whether this kernel has CAN, and we may make interfaces."""
     try:
@@ -82,8 +90,11 @@ def ip(*arguments: str) -> None:
 
 
 @pytest.fixture
-def namespace(monkeypatch: pytest.MonkeyPatch) -> Iterator[Namespace]:
-    """A fresh namespace, also for child processes; afterwards no process, thread, descriptor or file may be left."""
+def namespace(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Namespace]:
+    """A fresh namespace, also for child processes; afterwards no process, thread, descriptor or file may be left.
+
+    After a test that failed, nobody looks: the report of the failure keeps what the test had.
+    """
     from skinware.memory.namespace import Namespace
     from skinware_drivers.testing.leaks import Belongings, files_left
 
@@ -93,7 +104,7 @@ def namespace(monkeypatch: pytest.MonkeyPatch) -> Iterator[Namespace]:
     yield place
     try:
         left = before.left_since() + files_left(place.path)
-        if left:
+        if left and not request.node.stash.get(_failed, False):
             pytest.fail(f"the test left behind: {', '.join(left)}", pytrace=False)
     finally:
         shutil.rmtree(place.path, ignore_errors=True)

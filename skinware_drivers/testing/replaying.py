@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.sequences import read_numbers
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
@@ -123,6 +124,21 @@ def record(
     return Recording(layout, tables, period_s, size, wire[own].copy(), time_ns[own].copy())
 
 
+def counter_values(recording: Recording) -> Indices:
+    """(k,) every number that the counter of the cycle has in the recording; empty if there is no counter."""
+    layout = recording.layout
+    if layout.cycle is None or not layout.cycle.counters:
+        return np.zeros(0, np.int64)
+    decoder = Decoder([layout], recording.tables)
+    _, kind, _ = decoder.name(_batch_of(decoder, recording.wire, recording.time_ns))
+    names = [frame.name for frame in layout.frames]
+    numbers = [
+        read_numbers(recording.wire["payload"][kind == names.index(member)], counter)
+        for member, counter in zip(layout.cycle.members, layout.cycle.counters, strict=True)
+    ]
+    return np.unique(np.concatenate(numbers))
+
+
 def try_troubles(recording: Recording, with_period: bool = True) -> Outcome:
     """Lose every run of frames up to two bursts long, hold up the sender in every way, and see what is shown.
 
@@ -219,4 +235,4 @@ def _marks(updates: Updates, n_sensors: int) -> Indices:
     return marks
 
 
-__all__ = ["BURSTS", "Outcome", "Recording", "Trouble", "find_torn", "record", "try_troubles"]
+__all__ = ["BURSTS", "Outcome", "Recording", "Trouble", "counter_values", "find_torn", "record", "try_troubles"]

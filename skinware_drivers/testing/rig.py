@@ -21,6 +21,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
 from skinware_drivers.running.runner import Runner
+from skinware_drivers.running.unused_frames import why_unused
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import (
@@ -37,7 +38,10 @@ NAME = "driver_under_test"
 _BUS = "bus"
 _SLOTS = 64
 _LONGEST_START_S = 12.0
-_NOT_TAKEN = ("unknown", "bad_length", "bad_content", "refused", "checksum_errors", "bad_form", "polls_unanswered")
+_NOT_TAKEN = (
+    *("unknown", "bad_length", "bad_content", "refused", "orphans", "checksum_errors", "bad_form"),
+    "polls_unanswered",
+)
 SHOWN_ANYWAY = int(Status.SUSPECT | Status.OUT_OF_RANGE)
 """Status bits of values that are shown as they were sent."""
 
@@ -303,15 +307,31 @@ class Running(Rig):
         else:
             defect(f"the devices sent no data {within}: does `start` start them? It sent: {self.sent_in_words()}")
         missing = np.flatnonzero(frame.status & ~np.uint8(SHOWN_ANYWAY))
-        counters = {name: count for name, count in self.counters().items() if count and name in _NOT_TAKEN}
         never = np.flatnonzero(frame.status & np.uint8(Status.NEVER_SEEN))
         named = ", ".join(sensor_name(frame.structure, sensor) for sensor in (never if len(never) else missing)[:3])
         what = "was never seen" if len(never) else "is not fresh"
         count = len(never) if len(never) else len(missing)
         why = "No frame of the layout writes them: is a frame, a module or a channel missing, or two channels `to` one?"
-        if counters:
-            why = f"What was not taken: {counters}{self.samples_in_words()}.\n{why}"
+        why = self._what_was_not_taken() + why
         defect(f"{within}, {count} of {frame.structure.n_sensors} declared sensors: {what}: {named}.\n{why}")
+
+    def _what_was_not_taken(self) -> str:
+        """Counters, samples, and what they say of the layout, in a line each; empty if all was taken."""
+        counters = {
+            name: count for name, count in self.counters().items() if count and name in (*_NOT_TAKEN, "orphans")
+        }
+        lone = counters.pop("orphans", 0)  # of the rest, it may be the consequence
+        if counters:
+            reasons = "".join(
+                f"{reason[0].upper()}{reason[1:]}.\n" for reason in why_unused(self.adapter.layout, self.bus)
+            )
+            return f"What was not taken: {counters}{self.samples_in_words()}.\n{reasons}"
+        if lone:
+            return (
+                f"{lone} frames found no partners: do all frames of a cycle come, in the order of its `members`, within"
+                " `maximum_age_s`, and with the same number, if it has a `counter`?\n"
+            )
+        return ""
 
     def counters(self) -> dict[str, int]:
         """Counters of the bus and those of all patches together, as of now; none before there is a structure."""

@@ -9,7 +9,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import defect, require
-from skinware_drivers.testing.replaying import BURSTS, Recording, record, try_troubles
+from skinware_drivers.testing.replaying import BURSTS, Recording, counter_values, record, try_troubles
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.testing.suite import Suite
@@ -37,6 +37,7 @@ class TornTests(Suite):
                 recording = heard.recording()
             if recording is None:
                 defect(f"the emulated devices send fewer than {BURSTS} bursts in {BURSTS + 4} periods")
+            _require_counting(recording)
             outcome = try_troubles(recording)
             require(outcome.shown >= 2 * outcome.tried, "hardly anything is shown when frames are lost now and then")
             if outcome.first is not None:
@@ -67,6 +68,16 @@ class TornTests(Suite):
                 require((shown_ns > end_ns).all(), "the sender is in order again, but not all modules are shown anew")
 
         play(scenario)
+
+
+def _require_counting(recording: Recording) -> None:
+    """A counter counts."""
+    numbers = counter_values(recording)
+    if len(numbers) == 1:
+        defect(
+            f"the `counter` of the cycle is {numbers[0]} in all frames of {BURSTS} bursts, so that it tells nothing"
+            " apart: look at its `offset`, `dtype` and `mask`"
+        )
 
 
 def _bursts(rig: Running) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -105,14 +106,23 @@ class ValueTests(Suite):
                 await rig.until_fresh()
                 await rig.sleep(2 * _BURSTS * rig.adapter.period_s)
                 for number in rig.numbers:
-                    times_ns = np.array([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])
-                    real_s = float(np.median(np.diff(times_ns))) / 1e9
+                    real_s = _mean_interval_s([burst.time_ns for burst in rig.truth.bursts[number]][-_BURSTS:])
                     require(
                         abs(real_s / rig.adapter.period_s - 1) < _RATE_TOLERANCE,
-                        f"`period_s` is {rig.adapter.period_s:g} s, but device {number} sends every {real_s:g} s",
+                        f"`period_s` is {rig.adapter.period_s:g} s, but device {number} sends every {real_s:.3g} s",
                     )
 
         play(scenario)
+
+
+def _mean_interval_s(times_ns: Sequence[int]) -> float:
+    """From burst to burst, s; pauses are left out.
+
+    A mean, as each time may be late by what buses wait to hand out several frames together: of 10 ms, the single
+    intervals are 8 or 12.
+    """
+    intervals_ns = np.diff(times_ns)
+    return float(np.mean(intervals_ns[intervals_ns < 2 * np.median(intervals_ns)])) / 1e9
 
 
 __all__ = ["ValueTests"]

@@ -16,6 +16,7 @@ from skinware import BusReason, BusState, Column, DriverReader, Namespace, Servi
 from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
+from skinware.memory.announcement import MOST_ANNOUNCEMENTS
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.service import Columns
@@ -271,6 +272,16 @@ def test_refused_files_are_problems_and_no_crash(namespace: Namespace, capsys: p
         finally:
             for path in strange:
                 path.unlink()
+
+
+def test_announcements_that_are_too_many_are_told(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a"):
+        for number in range(2 * MOST_ANNOUNCEMENTS + 1):
+            (namespace.readers_path / f"x.{number}.fake").touch()
+        (problem,) = told(capsys)["problems"]
+        assert problem.startswith(f"{namespace.readers_path}: more than 1000 files; ")
+        for _ in range(2):  # those of the dead are removed
+            assert told(capsys)["problems"] == []
 
 
 @pytest.mark.parametrize(

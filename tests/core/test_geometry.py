@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -114,14 +115,33 @@ def test_normals_of_few_digits_get_the_length_1(tmp_path: Path) -> None:
         (HEAD + GROUP + "radius_m = 0.0", "radius_m"),
         (HEAD + "group = 3", "group"),
         ("a = " + "[" * 5000, "not TOML"),
+        (HEAD + GROUP.replace("chest", "c" * 65), "is longer than 64 bytes - at $.group[0]"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, text: str, words: str) -> None:
     path = written(tmp_path / "g.toml", text)
     with pytest.raises(ConfigurationError) as caught:
         read_geometry(path)
-    assert str(caught.value).startswith(f"{path}: ")
+    assert re.match(rf"{re.escape(str(path))}(:\d+)?: ", str(caught.value))
     assert words.lower() in str(caught.value).lower()
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("\nx = ", 2),
+        (HEAD + "colour = 3", 1),
+        ('format = "skinware-geometry"\nversion = 2', 2),
+        (HEAD + GROUP.replace("0x70500", "-1"), 7),
+        (HEAD + GROUP + GROUP.replace("chest", "arm"), 13),
+        (HEAD + GROUP.replace("[1, 0, 0]]", "\n[1, nan, 0]]"), 4),
+        (HEAD + GROUP + "normal = 5", 9),
+    ],
+)
+def test_the_line_of_a_mistake_is_said(tmp_path: Path, text: str, line: int) -> None:
+    path = written(tmp_path / "g.toml", text)
+    with pytest.raises(ConfigurationError, match=rf"^{re.escape(str(path))}:{line}: "):
+        read_geometry(path)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
@@ -154,7 +174,7 @@ groups = st.fixed_dictionaries(
 @given(group=groups)
 def test_no_data_raises_anything_else(group: dict[str, Any]) -> None:
     try:
-        geometry = _from_data({"format": "skinware-geometry", "version": 1, "group": [group]}, "here")
+        geometry = _from_data({"format": "skinware-geometry", "version": 1, "group": [group]}, lambda _: "here")
     except ConfigurationError as error:
         assert str(error).startswith("here: ")  # noqa: PT017
     else:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinware import DriverWriter, Skin, Structure
+from skinware import DriverReader, DriverWriter, Skin, Structure
 from skinware.errors import StructureError
 from skinware.geometry import Geometry, GeometryGroup, geometry_to_toml, read_geometry
+from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 from tests.commands import run, running
 from tests.core.test_snapshot import publish, skin_of
@@ -95,6 +96,41 @@ def test_a_driver_publishes_the_file_that_its_configuration_names(tmp_path: Path
             places = skin.geometry("pressure")
             assert places.uid[places.known].tolist() == [0x80500, 0x80501]
             assert places.position_m[places.known].tolist() == [[0.01, 0.02, 0.03], [0.01, 0.03, 0.03]]
+        driver.process.send_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("by", ["--config", "--geometry"])
+def test_a_running_driver_reads_its_file_again(tmp_path: Path, by: str) -> None:
+    places, config = some_places(tmp_path, 0x80500), tmp_path / "torso.toml"
+    unnamed = '[[bus]]\nname = "virtual?boards=8"\n'
+    named = f'geometry = "{places.name}"\n{unnamed}'
+    config.write_text(named)
+    arguments = ["--config", config] if by == "--config" else ["--bus", "virtual?boards=8", "--geometry", places]
+
+    def known(skin: Skin) -> list[int]:
+        skin.read(timeout_s=60)
+        skin.refresh()
+        geometry = skin.geometry("pressure")
+        return [int(uid) for uid in geometry.uid[geometry.known]]
+
+    with running("skin-driver", *map(str, arguments)) as driver, Skin() as skin:
+        driver.wait_for("ready")
+        assert known(skin) == [0x80500]
+        with DriverReader("roboskin") as reader:
+            generation = reader.generation
+            driver.process.send_signal(signal.SIGHUP)  # nothing has changed
+            good = places.read_text()
+            places.write_text(good.replace("normal = [", "normal = [\n  [0.0, 2.0, 0.0],"))
+            driver.process.send_signal(signal.SIGHUP)
+            wait_until(lambda: f"places stay as they are: {places}:4: 1 uid, but 2 normal" in driver.errors)
+            assert reader.read().generation == reader.refresh()[0] == generation  # type: ignore[index]
+        some_places(tmp_path, 0x80500, 0x80501)
+        driver.process.send_signal(signal.SIGHUP)
+        wait_until(lambda: known(skin) == [0x80500, 0x80501])
+        if by == "--config":
+            config.write_text(unnamed)
+            driver.process.send_signal(signal.SIGHUP)
+            wait_until(lambda: known(skin) == [])
         driver.process.send_signal(signal.SIGINT)
 
 

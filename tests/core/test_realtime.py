@@ -43,7 +43,8 @@ def test_without_rights_each_refusal_is_one_line_and_the_rest_is_done() -> None:
     cpu = min(os.sched_getaffinity(0))
     told, warnings = result_of(without_rights(*command("fifo:50", cpus=str(cpu))))
     user = pwd.getpwuid(os.getuid()).pw_name
-    limits = "/etc/security/limits.d/skinware.conf and log in again (services, containers: docs/how-to/realtime.md)"
+    limits = "/etc/security/limits.d/skinware.conf and log in again (services, containers: see"
+    limits += ' "Keep a loop on time" in the documentation)'
     memory = "locked memory refused: RLIMIT_MEMLOCK is 64 KiB, not unlimited, without CAP_IPC_LOCK"
     policy = "SCHED_FIFO priority 50 refused: RLIMIT_RTPRIO is 0 without CAP_SYS_NICE"
     assert warnings == [

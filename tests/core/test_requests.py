@@ -239,3 +239,32 @@ def _publish_for(writer: ServiceWriter) -> bool:
         writer.commit(now_ns())
         request.reply(position=writer.position)
     return bool(requests)
+
+
+def test_a_writer_that_closes_after_the_look_at_its_life_is_gone() -> None:
+    """It is not one that takes no requests."""
+    writer = ServiceWriter("x", SMALL, operations=OPERATIONS)
+    writer.request_server()
+    with ServiceReader[Frame]("x") as reader, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(reader._client, "listen", lambda _: writer.close())  # what is done before connecting
+        with pytest.raises(PeerGone, match="the writer of 'x' is dead"):
+            reader.ask("add", a=1, b=2)
+
+
+def test_a_writer_whose_socket_is_withdrawn_counts_as_gone() -> None:
+    """Wherever it is in its closing."""
+    writer = ServiceWriter("x", SMALL, operations=OPERATIONS)
+    server = writer.request_server()
+    close = server.close
+
+    def close_and_be_asked() -> None:
+        close()
+        with pytest.raises(PeerGone, match="the writer of 'x' is dead"):
+            reader.ask("add", a=1, b=2)
+        found.append(writer.closed)
+
+    found: list[bool] = []
+    with ServiceReader[Frame]("x") as reader, pytest.MonkeyPatch.context() as patched:
+        patched.setattr(server, "close", close_and_be_asked)
+        writer.close()
+    assert found == [False]

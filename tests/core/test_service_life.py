@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -184,20 +184,32 @@ def test_a_reader_that_was_there_before_the_namespace_is_seen_later(namespace: N
         thread.join(30)
 
 
-def test_a_dead_readers_announcement_is_swept(namespace: Namespace) -> None:
-    with ServiceWriter("x", SMALL):
+@pytest.mark.parametrize(
+    "look", [lambda _: ServiceWriter("x", SMALL).close(), lambda place: list(living_readers(place))]
+)
+def test_a_dead_readers_announcement_is_removed_by_whoever_looks(
+    namespace: Namespace, look: Callable[[Namespace], object]
+) -> None:
+    with ServiceWriter("y", SMALL) as writer, ServiceReader[Frame]("y") as reader:
+        publish(writer, 1)
+        reader.read()
         dead = namespace.readers_path / "x.1.deadbeef"
         dead.write_bytes(b"left by a killed reader")
-        assert list(living_readers(namespace)) == []
-    with ServiceWriter("x", SMALL):
+        look(namespace)
         assert not dead.exists()
+        assert [record.service for record in living_readers(namespace)] == ["y"]
 
 
-def test_however_many_dead_announcements_delay_no_start(namespace: Namespace) -> None:
-    """So many are looked at by each start: whoever may announce may put any number there."""
+@pytest.mark.parametrize(
+    "look", [lambda _: ServiceWriter("x", SMALL).close(), lambda place: list(living_readers(place))]
+)
+def test_however_many_dead_announcements_delay_nobody(
+    namespace: Namespace, look: Callable[[Namespace], object]
+) -> None:
+    """So many are looked at each time: whoever may announce may put any number there."""
     namespace.create()
     for number in range(2500):
         (namespace.readers_path / f"x.{number}.fake").touch()
     for left in (1500, 500, 0):
-        ServiceWriter("x", SMALL).close()
+        look(namespace)
         assert len(list(namespace.reader_files())) == left

@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.memory import ring
 from skinware.memory.announcement import living_readers
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
 from skinware.realtime import now_ns
@@ -153,3 +154,33 @@ def test_overruns_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
             with pytest.raises(Overrun, match="64 times in a row"):
                 reader.read()
         assert reader.statistics.overruns == 1
+
+
+@pytest.mark.parametrize(
+    ("published_ms", "acquired_ms", "rate_hz"),
+    [
+        (20, 20, 50.0),
+        (1, 1, 1000.0),  # it is that fast
+        (0.05, 20, 50.0),  # what has waited is published at once
+        (0.05, 0, 20_000.0),  # nobody tells when the data came
+        (1, 1.5, 1000.0),
+        (100, 20, 10.0),  # slower than its data
+    ],
+)
+def test_a_rate_is_that_of_the_data_where_it_was_held_up(
+    monkeypatch: pytest.MonkeyPatch, published_ms: float, acquired_ms: float, rate_hz: float
+) -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        for number in range(20):
+            monkeypatch.setattr(ring, "now_ns", lambda number=number: round((100 + number * published_ms) * MS))
+            writer.begin()
+            writer.commit(round((5 + number * acquired_ms) * MS))
+        assert reader.rate_hz() == pytest.approx(rate_hz)
+
+
+def test_a_rate_after_a_pause_of_the_device() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        for number in range(20):
+            writer.begin()
+            writer.commit(round((5 + number * 20 + 10_000 * (number > 16)) * MS))
+        assert reader.rate_hz() == pytest.approx(50.0)

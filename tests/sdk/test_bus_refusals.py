@@ -77,7 +77,7 @@ def interface_flags(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 @pytest.mark.parametrize(
     ("attribute", "number", "words"),
     [
-        ("refuse_socket", errno.EAFNOSUPPORT, "this kernel has no CAN: load it (modprobe can-raw)"),
+        ("refuse_socket", errno.EAFNOSUPPORT, "this kernel has no CAN: load it (sudo modprobe can-raw)"),
         ("refuse_socket", errno.EPERM, "bus can0: cannot open a CAN socket"),
         ("refuse_bind", errno.ENODEV, "there is no CAN interface 'can0'; CAN interfaces here: "),
         ("refuse_bind", errno.EACCES, "bus can0: not permitted (EACCES); ask for access"),

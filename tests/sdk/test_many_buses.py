@@ -224,7 +224,7 @@ def test_sighup_reads_the_buses_of_the_file_again(tmp_path: Path) -> None:
         write(one, two)
         follow(reader, lambda f: f.structure.n_patches == 3 and not f.status.any())
         write(two, "nme = 3")
-        wait_until(lambda: f"buses stay as they are: {file}:5: bus 2: unknown key 'nme'" in driver.errors)
+        wait_until(lambda: f"buses and places stay as they are: {file}:5: bus 2: unknown key 'nme'" in driver.errors)
         write(one, f"{two}\noptions = {{ boards = [9], period_ms = 0 }}")
         wait_until(lambda: f"{file}:6: options of virtual?boards=8,9: " in driver.errors)
         text = file.read_text()

@@ -331,12 +331,38 @@ COUNTED = Device(2, "given", "module", 16, PERIOD_NS // 2)
             [(0, 0, 0.1), (1, LOST, LOST), (2, 2, 2.1), (3, 4.9, LOST), (4, LOST, LOST), (5, LOST, 5.1)],
             id="a sender that stands still in the cycle after one that was lost",
         ),
+        pytest.param(
+            [(0, 0, 0.1), (1, 1, 1.1), (1, 2, LOST), (2, LOST, 2.1), (3, 3, 3.1)],
+            id="a frame repeated a period later, in place of one that was lost",
+        ),
+        pytest.param(
+            [(0, 0, 0.1), (1, 1, 1.1), (1, LOST, 2.05), (2, 2, 2.1), (3, 3, 3.1)],
+            id="a frame repeated a period later, just before the one that belongs there",
+        ),
     ],
 )
 def test_without_a_counter_these_cannot_be_told_from_good_data(cycles: list[tuple[int, float, float]]) -> None:
     sent = two_halves(*cycles)
     assert torn(UNCOUNTED, sent) == 1
     assert torn(COUNTED, sent) == 0
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(
+    ("uncounted", "after"), [(False, 0.9), (False, 0.95), (False, 1.05), (True, 1.05), (True, 1.2), (True, 1.5)]
+)
+def test_a_frame_repeated_a_period_later_is_not_joined_with_the_other_half(
+    uncounted: bool, after: float, order: Order
+) -> None:
+    """Beside the frame that belongs there; without a counter only if it comes after that one (see above)."""
+    device = Device(2, order, "module", 1 if uncounted else 16, PERIOD_NS // 4)
+    cycles = [(cycle, cycle, cycle + 0.1) for cycle in range(8)]
+    for half in range(2):
+        again = (3, 3 + after, LOST) if half == 0 else (3, LOST, 3.1 + after)
+        sent = two_halves(*cycles, again)
+        assert torn(device, sent) == 0, half
+        shown, _ = device.joined([frame._replace(serial=number) for number, frame in enumerate(sent)])
+        assert len(shown) >= 6, half  # one cycle is disturbed, and the one after it may be
 
 
 def test_after_a_cycle_that_was_lost_whole_the_next_is_not_trusted_and_the_one_after_it_is() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -20,10 +21,11 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Bits, Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.options import NoOptions
-from skinware_drivers.polling import Poll, Poller
+from skinware_drivers.polling import Poll, check_polls
+from skinware_drivers.running.poller import Poller
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import WireFrame
@@ -275,11 +277,105 @@ def test_the_next_question_waits_for_the_answer() -> None:
 
 
 def test_a_device_that_does_not_answer_costs_its_timeout() -> None:
-    polling = poll_for(0.0999, lambda: IN_STEP, lambda p: _answer_after(p, 0.001, deaf=b"\2"))
-    assert polling.line.payloads == [b"\1", b"\2", b"\3"] * 5
-    assert polling.counters.polls_unanswered == 5
+    polling = poll_for(0.0599, lambda: IN_STEP, lambda p: _answer_after(p, 0.001, deaf=b"\2"))
+    assert polling.line.payloads == [b"\1", b"\2", b"\3"] * 3
+    assert polling.counters.polls_unanswered == 3
     times_s = polling.line.times_s
-    assert [times_s[i + 1] - times_s[i] for i in range(1, 15, 3)] == pytest.approx([0.01] * 5)
+    assert [times_s[i + 1] - times_s[i] for i in range(1, 9, 3)] == pytest.approx([0.01] * 3)
+
+
+def test_a_device_that_never_answers_is_asked_more_and_more_rarely_and_the_others_as_ever() -> None:
+    polling = poll_for(9.99, lambda: IN_STEP, lambda p: _answer_after(p, 0.001, deaf=b"\2"))
+    times_s = {payload: [t for t, _, sent in polling.line.sent if sent == payload] for payload in (b"\1", b"\2", b"\3")}
+    assert len(times_s[b"\1"]) == len(times_s[b"\3"]) == 500
+    assert np.diff(times_s[b"\2"]) == pytest.approx([0.02, 0.02, 0.26, 0.52, 1.02] + [2.02] * 4, abs=0.011)
+    assert polling.counters.polls_unanswered == len(times_s[b"\2"])
+    assert polling.counters.polls_missed == 0
+
+
+def test_a_device_that_answers_again_is_asked_as_often_as_before() -> None:
+    deaf = [True]
+
+    async def answer(polling: Polling) -> None:
+        answered = 0
+        while True:
+            await asyncio.sleep(0.0005)
+            for _, identifier, payload in polling.line.sent[answered:]:
+                answered += 1
+                if payload != b"\2" or not deaf[0]:
+                    polling.hear(identifier + 1, payload)
+
+    async def come_back(polling: Polling) -> None:
+        answering = asyncio.create_task(answer(polling))
+        await asyncio.sleep(1.5)
+        deaf[0] = False
+        await answering
+
+    line = poll_for(9.99, lambda: IN_STEP, come_back).line
+    times_s = np.array([time_s for time_s, _, payload in line.sent if payload == b"\2"])
+    pauses_s = np.diff(times_s)
+    back = np.flatnonzero(times_s > 1.5 + times_s[0])[0]
+    assert times_s[back] - times_s[0] < 1.5 + 2.1
+    assert pauses_s[back:] == pytest.approx(0.02, abs=0.002)
+
+
+@pytest.mark.parametrize("polls", [IN_STEP[:1], [replace(ASK, payload=bytes([n])) for n in range(3)]])
+def test_who_disturbs_nobody_is_asked_as_often_as_ever(polls: list[Poll]) -> None:
+    """One that is alone on its line, and those that nobody waits for."""
+    polling = poll_for(1.99, lambda: polls)
+    assert len(polling.line.sent) == 100 * len(polls)
+    assert polling.counters.polls_missed == 0
+
+
+class Hand(CanAdapter[NoOptions]):
+    """Three fingers that only answer."""
+
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint16
+    layout = Layout([Frame("answer", [Identifier(0x200, 0x7F0)], (2,), Values(0, "<u2", 1), patch=Bits(0, 4))])
+    patches = tuple(Patch(f"finger {n}", [Module(taxels(1, first_uid=n))], key=n) for n in (1, 2, 3))
+    polls = tuple(Poll(0x100 | n, b"", 0.02, answer=Match(0x200 | n), timeout_s=0.01) for n in (1, 2, 3))
+
+    async def revive(self, link: Link, patch: Patch) -> None:
+        """There is nothing to set up."""
+
+
+class Fingers(Device):
+    """Their other end; one can be pulled out.
+
+    Attributes:
+        out: which.
+        asked: how often each was.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.out = 0
+        self.asked = Counter[int]()
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        finger = identifier & 0xF
+        self.asked[finger] += 1
+        if finger != self.out:
+            self._answers.append(WireFrame(now_ns, 0x200 | finger, self.asked[finger].to_bytes(4, "little")[:2]))
+
+
+def test_a_finger_that_is_pulled_out_costs_the_others_little_and_comes_back() -> None:
+    fingers = Fingers()
+    with driving_lines([(Hand(NoOptions()), bus_with(fingers))], "hand") as running, DriverReader("hand") as reader:
+        read_until(reader, lambda f: not f.status.any())
+        fingers.out = 2
+        read_until(reader, lambda f: f.status.astype(bool).tolist() == [False, True, False])
+        before = fingers.asked.copy()
+        wait_until(lambda: fingers.asked[1] > before[1] + 100)
+        assert 1 <= fingers.asked[2] - before[2] <= 10
+        unanswered = running.status()["buses"][0]["polls_unanswered"]
+        assert unanswered <= 3 + 10 + (fingers.asked[2] - before[2])
+        fingers.out = 0
+        read_until(reader, lambda f: not f.status.any())
+        before = fingers.asked.copy()
+        wait_until(lambda: fingers.asked[1] > before[1] + 50)
+        assert fingers.asked[2] > before[2] + 40
 
 
 def test_devices_too_slow_for_the_period_have_their_turns_and_it_is_counted() -> None:
@@ -338,3 +434,55 @@ def test_an_answer_is_heard_among_the_data(caplog: pytest.LogCaptureFixture) -> 
 def test_polls_that_cannot_be_are_refused(make: Callable[[], Poll], words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         make()
+
+
+@pytest.mark.parametrize(
+    ("polls", "wire_s", "words"),
+    [
+        (IN_STEP, 0.004, ""),
+        (
+            IN_STEP,
+            0.007,
+            "all questions and answers take 105 % of the time that their periods leave on the line: ask for",
+        ),
+        ([replace(ASK, payload=b"")] * 9, 0.003, "all questions and answers take 135 % of the time"),
+        (
+            [replace(p, timeout_s=0.03) for p in IN_STEP],
+            0,
+            "poll 100 waits 30 ms for its answer, longer than its period",
+        ),
+        ([replace(IN_STEP[0], timeout_s=0.03)], 0, ""),  # nobody waits for it
+        ([replace(p, timeout_s=None) for p in IN_STEP], 0, ""),
+    ],
+)
+def test_polls_that_are_too_much_for_the_line_are_told(polls: list[Poll], wire_s: float, words: str) -> None:
+    doubt = check_polls(polls, lambda _: wire_s)
+    assert doubt.startswith(words)
+    assert bool(doubt) == bool(words)
+
+
+def test_polls_that_cannot_be_answered_in_time_are_refused() -> None:
+    words = "poll 100 waits 10 ms for its answer, but question and answer alone take 12 ms on the line: make timeout_s"
+    with pytest.raises(ConfigurationError, match=words):
+        check_polls(IN_STEP, lambda _: 0.012)
+
+
+def test_polls_are_checked_when_their_times_change_and_not_before_each_question() -> None:
+    checked: list[int] = []
+    line, called = Line(), itertools.count()
+
+    def polls() -> list[Poll]:
+        number = next(called)
+        return [replace(ASK, payload=bytes([number % 256]), period_s=0.001 if number < 20 else 0.0005)]
+
+    async def scenario() -> None:
+        poller = Poller(Link(line), BusCounters(), lambda polls: checked.append(len(polls)))  # type: ignore[arg-type]
+        task = asyncio.create_task(poller.run(polls, lambda: False))
+        async with asyncio.timeout(30):
+            while len(line.sent) < 60:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(scenario())
+    assert checked == [1, 1]

@@ -12,30 +12,25 @@ from contextlib import contextmanager
 
 import can
 import pytest
+from can.interfaces.virtual import VirtualBus
 
-from skinware.errors import BusNotAvailable
+from skinware.errors import BusNotAvailable, BusSendError
 from skinware.status import BusReason
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.testing.waiting import wait_until
 
 
 class Unplugged:
-    """An adapter that delivers some messages, and is unplugged right after them.
-
-    Attributes:
-        failed: set once it has failed.
-    """
+    """An adapter that delivers some messages, and is unplugged right after them."""
 
     def __init__(self, messages: int) -> None:
         self._left = messages
-        self.failed = threading.Event()
 
     def recv(self, _timeout: float) -> can.Message:
         if self._left:
             self._left -= 1
             return can.Message(arbitration_id=0x473, data=b"\x40" + bytes(7), is_extended_id=False)
-        self.failed.set()
         raise can.CanOperationError("adapter unplugged")
 
     def shutdown(self) -> None:
@@ -51,14 +46,14 @@ def test_an_adapter_that_is_unplugged_after_its_last_messages_is_noticed(
     monkeypatch.setattr(can, "Bus", lambda **_: adapter)
     bus = PythonCanBus("slcan", "/dev/ttyACM0")
     bus.open()
-    assert bus._thread is not None
-    bus._thread.join()  # messages and failure wait together
-    assert adapter.failed.is_set()
+    taken = bus._messages
+    assert taken is not None
+    wait_until(lambda: taken.failure is not None)  # messages and failure wait together
     received = 0
     with select.epoll() as epoll:
         epoll.register(bus.fileno(), select.EPOLLIN)
         with pytest.raises(BusNotAvailable, match="adapter unplugged") as raised:  # noqa: PT012
-            while epoll.poll(0):
+            while epoll.poll(30):
                 received += bus.receive(FrameBatch(rows), 0)
                 if by == "check" and received == messages:
                     bus.check()
@@ -102,3 +97,66 @@ def test_an_interface_that_cannot_only_listen_says_so() -> None:
     assert "acknowledges" in PythonCanBus("gs_usb", "0", listen_only=True).note
     assert PythonCanBus("gs_usb", "0").note == ""
     assert PythonCanBus("udp_multicast", "239.74.163.2", listen_only=True).note == ""
+
+
+class Hanging:
+    """An interface whose library does not return from one of its calls until it is told to.
+
+    Attributes:
+        told: lets it return.
+        shut_down: set once that has been done.
+    """
+
+    def __init__(self, hangs_in: str) -> None:
+        self.told, self.shut_down = threading.Event(), threading.Event()
+        self._hangs_in = hangs_in
+
+    def recv(self, _timeout: float) -> can.Message:
+        if self._hangs_in == "recv":
+            self.told.wait()
+        return can.Message(arbitration_id=0x473, data=bytes(8), is_extended_id=False)
+
+    def shutdown(self) -> None:
+        if self._hangs_in == "shutdown":
+            self.told.wait()
+        self.shut_down.set()
+
+
+@pytest.mark.parametrize("hangs_in", ["recv", "shutdown"])
+def test_an_interface_that_hangs_holds_nobody_up(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, hangs_in: str
+) -> None:
+    hanging, good = Hanging(hangs_in), Hanging("nothing")
+    opened = iter((hanging, good))
+    monkeypatch.setattr(can, "Bus", lambda **_: next(opened))
+    bus = PythonCanBus("slcan", "/dev/ttyACM0")
+    bus.open()
+    bus.close()
+    assert not hanging.shut_down.is_set()
+    assert [record.getMessage() for record in caplog.records] == [
+        "bus slcan:/dev/ttyACM0: its interface hangs while it is closed, and is left to itself"
+    ]
+    assert bus.fileno() == -1
+    bus.open()  # the next one has nothing to do with it
+    wait_until(lambda: bus.receive(FrameBatch(10), 0) > 0)
+    bus.close()
+    assert good.shut_down.is_set()
+    threads = threading.active_count()
+    hanging.told.set()
+    assert hanging.shut_down.wait(30)
+    wait_until(lambda: threading.active_count() < threads)
+    assert len(caplog.records) == 1
+
+
+def test_an_identifier_that_is_not_sent_is_named_as_candump_writes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise can.CanOperationError("no buffer space")
+
+    bus = PythonCanBus("virtual", "test-names")
+    bus.open()
+    monkeypatch.setattr(VirtualBus, "send", refuse)
+    with pytest.raises(BusSendError, match=r"^bus test-names: frame 18DA00F1 not sent \(no buffer space\)$"):
+        bus.send(EXTENDED_FLAG | 0x18DA00F1, b"")
+    with pytest.raises(BusSendError, match=r"frame 0F1 not sent"):
+        bus.send(0xF1, b"")
+    bus.close()

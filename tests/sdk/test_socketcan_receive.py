@@ -283,6 +283,9 @@ def test_a_frame_is_sent_as_the_kernel_wants_it_or_the_failure_is_counted(cable:
     assert cable.out.recv(100).hex() == "07020000" + "02000000" + "0700000000000000"
     cable.out.close()
     bus.send(0x207, b"\x07\x00")  # brings back that nobody is there any more
-    with pytest.raises(BusSendError, match="frame 207 not sent"):
+    with pytest.raises(BusSendError, match=r"^bus can0: frame 207 not sent"):
         bus.send(0x207, b"\x07\x00")
-    assert (bus.counters.sent, bus.counters.send_failures) == (2, 1)
+    bus.send(0x207, b"\x07\x00")
+    with pytest.raises(BusSendError, match=r"^bus can0: frame 18DA00F1 not sent"):
+        bus.send(EXTENDED_FLAG | 0x18DA00F1, b"")
+    assert (bus.counters.sent, bus.counters.send_failures) == (3, 2)

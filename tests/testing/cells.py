@@ -29,6 +29,7 @@ from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions
 
 CELLS = range(1, 21)
 DATA = EXTENDED_FLAG | 0x18D0_0000
+KEY = Bits(0, 5)
 
 
 def frames_of_a_cell(extended: int = EXTENDED_FLAG, lengths: Sequence[int] = (8, 8, 4)) -> list[Frame]:
@@ -64,6 +65,23 @@ class Cells(CanAdapter[NoOptions]):
 
 class ShiftedKeys(Cells):
     keys = range(2, 22)
+
+
+class ElevenBits(Cells):
+    """Its author took the identifiers for those of 11 bits."""
+
+    layout = Layout(
+        [
+            Frame(
+                f"part {p}",
+                [Identifier(p << 5, 0x7E0)],
+                [n],
+                Values(0, "<u2", n // 2, range(4 * p, 4 * p + n // 2)),
+                module=KEY,
+            )
+            for p, n in enumerate((8, 8, 4))
+        ]
+    )
 
 
 class NoTemperatures(Cells):

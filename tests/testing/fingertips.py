@@ -8,6 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import NoOptions
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
@@ -107,7 +108,44 @@ class EmulatedSigned(EmulatedFingertips):
         return [(0x100 | device.number, struct.pack(">B3h", half, *values[3 * half : 3 * half + 3])) for half in (0, 1)]
 
 
+class EmulatedCounting(EmulatedFingertips):
+    """The same with the number of the cycle in the upper half of the first byte."""
+
+    is_counting: ClassVar[bool] = True
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        number = device.cycle % 16 << 4 if self.is_counting else 0x50
+        parts = super().frames(device, values)
+        return [(identifier, bytes([payload[0] | number]) + payload[1:]) for identifier, payload in parts]
+
+
+class EmulatedStill(EmulatedCounting):
+    """It does not count."""
+
+    is_counting = False
+
+
+class Counting(Fingertips):
+    """The right driver for it."""
+
+    counter: ClassVar[SequenceNumber] = SequenceNumber(0, "u1", mask=0xF0)
+
+    @property
+    def layout(self) -> Layout:  # type: ignore[override]
+        """Halves are told apart by the lower half of the first byte."""
+        frames = [replace(f, when=[f.when[0], Byte(0, n, 0xF)]) for n, f in enumerate(layout().frames)]
+        return Layout(frames, Cycle(["proximal", "distal"], maximum_age_s=0.01, counter=self.counter))
+
+
 # Wrong in what frames mean
+
+
+class CountsPressures(Counting):
+    counter = SequenceNumber(2, "u1")
+
+
+class WrongLength(Fingertips):
+    layout = Layout([replace(f, length=[8, 64]) for f in layout().frames], layout().cycle)
 
 
 class SwappedBytes(Fingertips):

@@ -13,7 +13,7 @@ from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.patterns import extreme, lively
 from skinware_drivers.testing.vectors import decode_frames
 from skinware_drivers.virtual import EmulatorOptions
-from tests.testing.cells import DATA, Cells, EmulatedCells, NoTemperatures, ShiftedKeys
+from tests.testing.cells import DATA, Cells, ElevenBits, EmulatedCells, NoTemperatures, ShiftedKeys
 
 VALUES = "test_every_value_is_right_and_in_order"
 
@@ -33,6 +33,14 @@ class TestCells(DriverConformance):
             r"modules 0 to 18 \('skin'\) received what modules 1 to 19 \('skin'\) sent: the keys",
         ),
         (NoTemperatures, r"'bad_length': \d+}; for example bad_length 18D0..02 \[4\] .. .. .. ..,"),
+        (
+            NoTemperatures,
+            r"\nFrames 'part 2' have length 2, but 4 bytes came \(18D0..02 \[4\] .. .. .. ..\)\.\nNo frame",
+        ),
+        (
+            ElevenBits,
+            r"\nHeard 18D0.... \(29 bits\) where the layout has only identifiers of 11 bits: write EXTENDED_FLAG \|",
+        ),
     ],
 )
 @pytest.mark.usefixtures("namespace")

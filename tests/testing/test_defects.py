@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import threading
 from collections.abc import Iterator
 
@@ -44,6 +45,12 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
         VALUES,
         (),
         r"6 of 12 declared sensors: was never seen: finger 1, taxel 3 (?s:.*)a frame.*missing",
+    ),
+    (
+        f.WrongLength,
+        VALUES,
+        (),
+        r"\nFrames 'proximal' have length 8 or 64, but 7 bytes came \(10\d \[7\] 00 .*\)\.\n",
     ),
     (f.HalvesApart, VALUES, (), r"bursts before the rest of its module|not of the same burst"),
     (
@@ -100,6 +107,13 @@ class TestFingertips(DriverConformance):
     emulator = f.EmulatedFingertips
 
 
+class TestCounting(DriverConformance):
+    """Nor has one of fingertips that count."""
+
+    driver = f.Counting
+    emulator = f.EmulatedCounting
+
+
 @pytest.fixture
 def tidy() -> Iterator[None]:
     """Ends what wrong drivers leave behind."""
@@ -146,3 +160,41 @@ def test_signs(test: str) -> None:
     suite.driver = f.Fingertips  # type: ignore[misc]
     with pytest.raises(pytest.fail.Exception, match="the signed value as if it were unsigned"):
         getattr(suite, test)()
+
+
+@pytest.mark.parametrize(
+    ("driver", "emulator", "test", "words"),
+    [
+        (
+            f.Counting,
+            f.EmulatedStill,
+            "test_no_run_of_lost_frames_tears_a_burst",
+            r"the `counter` of the cycle is 5 in all frames of 8 bursts.*look at its `offset`",
+        ),
+        (
+            f.CountsPressures,
+            f.EmulatedCounting,
+            VALUES,
+            r"\n\d+ frames found no partners: .*with the same number, if it has a `counter`",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("namespace")
+def test_a_counter_that_does_not_count_is_named(
+    driver: type[AnyAdapter], emulator: type[f.EmulatedFingertips], test: str, words: str
+) -> None:
+    suite = TestFingertips()
+    suite.driver, suite.emulator = driver, emulator  # type: ignore[misc, assignment]
+    with pytest.raises(pytest.fail.Exception, match=words):
+        getattr(suite, test)()
+
+
+@pytest.mark.parametrize("real_s", [0.0083, 0.01, 0.0125, 0.05])
+@pytest.mark.usefixtures("namespace")
+def test_the_period_that_is_measured_is_the_real_one(real_s: float) -> None:
+    suite = TestFingertips()
+    suite.emulator = type("Emulated", (f.EmulatedFingertips,), {"period_s": real_s})  # type: ignore[misc, assignment]
+    with pytest.raises(pytest.fail.Exception, match=r"`period_s` is 0.02 s, but device 1 sends every") as raised:
+        suite.test_the_rate_is_the_one_it_tells()
+    (told,) = re.findall("sends every (.*) s", str(raised.value))
+    assert float(told) == pytest.approx(real_s, rel=0.02)

@@ -131,6 +131,20 @@ def test_what_a_test_leaves_behind_fails_it(tmp_path: Path) -> None:
     assert "the test left behind: thread 'mine'" in pytest_in(tmp_path)
 
 
+def test_a_test_that_failed_is_not_said_to_leave_anything_behind(tmp_path: Path) -> None:
+    """The report of its failure keeps the reader, and with it the file that this has mapped."""
+    (tmp_path / "test_it.py").write_text(
+        "import skinware\n"
+        "def test_it(namespace):\n"
+        "    with skinware.ServiceWriter('x', {'values': ('<u8', 4)}), skinware.ServiceReader('x') as reader:\n"
+        "        assert reader.alive is None\n"
+    )
+    told = pytest_in(tmp_path)
+    assert "1 failed" in told
+    assert "1 error" not in told
+    assert "left behind" not in told
+
+
 def test_loading_the_plug_in_imports_nothing_of_skinware() -> None:
     code = "import sys, skinware_drivers.testing.plugin; print([m for m in sys.modules if m in ('skinware', 'numpy')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

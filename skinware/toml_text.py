@@ -1,10 +1,17 @@
-"""In which line of a TOML file something stands, which its parser does not tell: for messages to people."""
+"""TOML files whose mistakes are told with file and line; the parser does not tell in which line a value stands."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from skinware.errors import ConfigurationError
 
 Keys = tuple[str | int, ...]
 """Where a value is: ``("bus", 1, "name")``."""
@@ -13,6 +20,47 @@ _KEY = r"""[\w-]+|"[^"]*"|'[^']*'"""
 _KEYS = rf"(?:{_KEY})(?:\s*\.\s*(?:{_KEY}))*"
 _HEADER = re.compile(rf"\s*(\[\[?)\s*({_KEYS})\s*\]")
 _PAIR = re.compile(rf"\s*({_KEYS})\s*=")
+_KEYS_IN_ERROR = re.compile(r"\.(\w+)|\[(\d+)\]")
+_WHERE = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
+
+
+class TomlText:
+    """A TOML file as it is now.
+
+    Args:
+        path: of the file; None: one that says nothing.
+
+    Attributes:
+        data: what it says.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is not TOML.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._text = ""
+        try:
+            if path is not None:
+                self._text = path.read_text(encoding="utf-8")
+            self.data: dict[str, Any] = tomllib.loads(self._text)
+        except OSError as error:
+            raise ConfigurationError(f"{path}: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+            where = _WHERE.search(str(error))
+            line = f":{where[1] or len(self._text.splitlines())}" if where else ""
+            raise ConfigurationError(f"{path}{line}: not TOML: {_WHERE.sub('', str(error))}") from None
+
+    def place(self, keys: Sequence[str | int]) -> str:
+        """File and line of a value, for messages."""
+        return f"{self._path}:{line_of(self._text, keys)}"
+
+
+def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:
+    """What is wrong with data that does not fit a struct, and where."""
+    text = str(error).replace("`", "")
+    keys = _KEYS_IN_ERROR.findall(text.rpartition("$")[2])
+    return text, tuple(int(number) if number else key for key, number in keys)
 
 
 def line_of(text: str, keys: Sequence[str | int]) -> int:

@@ -1,0 +1,147 @@
+"""Asks devices that only answer, at absolute deadlines."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+
+from skinware.errors import BusSendError
+from skinware.realtime import NS_PER_S, Periodic, now_ns
+from skinware_drivers.counters import BusCounters
+from skinware_drivers.link import Link, Match
+from skinware_drivers.polling import Poll
+from skinware_drivers.running.backoff import Backoff
+
+_LOOK_AGAIN_S = 0.05
+_PATIENT_TIMES = 3
+"""So often in a row an answer has to be missing before a device is asked more rarely."""
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
+
+
+class _Place:
+    """What is known of the polls at one place of the sequence.
+
+    Attributes:
+        timer: their deadlines.
+        asked_ns: when one was last sent, or would have been.
+        silent_until_ns: nobody is asked before, because nobody answered.
+    """
+
+    def __init__(self, timer: Periodic) -> None:
+        self.timer = timer
+        self.asked_ns = 0
+        self.answered()
+
+    def answered(self) -> None:
+        """The device is there."""
+        self.silent_until_ns = 0
+        self._missing = 0
+        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
+
+    def unanswered(self) -> None:
+        """The device did not answer."""
+        self._missing += 1
+        if self._missing >= _PATIENT_TIMES:
+            self.silent_until_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
+
+
+class Poller:
+    """Asks the polls of one bus, one after the other.
+
+    Every poll has deadlines of its own, by its place in the sequence: another payload at the same place keeps them. One
+    that cannot be kept (the bus took no more frames, the answer before came late, or this process had no processor
+    time) is counted as missed and not made up for: the next poll goes out at the next deadline.
+
+    In lock step, a device that does not answer costs the others its timeout. After three times in a row it is asked
+    more and more rarely, if there are others; once it has answered, as often as before.
+
+    Args:
+        link: the bus.
+        counters: of the bus; ``polls_missed`` and ``polls_unanswered`` are counted in them.
+        check: called with the polls before the first question, and when their number or their times have changed.
+    """
+
+    def __init__(
+        self, link: Link, counters: BusCounters, check: Callable[[Sequence[Poll]], None] = lambda _: None
+    ) -> None:
+        self._link = link
+        self._counters = counters
+        self._check = check
+        self._checked: list[tuple[float, float]] = []
+        self._places: list[_Place] = []
+
+    async def run(self, polls: Callable[[], Sequence[Poll]], is_away: Callable[[], bool]) -> None:
+        """Ask what ``polls`` names, the first of each at once, until it is cancelled.
+
+        What ``polls`` or ``check`` raises, it raises.
+
+        Args:
+            polls: called once before each question: what is to be asked may change. None: a pause, it is called again
+                after 50 ms.
+            is_away: the bus is lost: nothing is sent, and nothing missed.
+        """
+        while True:
+            await self._until_first_deadline()
+            asked = polls()
+            times = [(poll.period_s, poll.patience_s) for poll in asked]
+            if asked and times != self._checked:
+                self._check(asked)
+                self._checked = times
+            self._keep_time(asked)
+            if asked:
+                await self._ask_first(asked, is_away())
+            else:
+                await asyncio.sleep(_LOOK_AGAIN_S)
+
+    async def _until_first_deadline(self) -> None:
+        await asyncio.sleep(0)  # if it is late, others have their turn all the same
+        first_ns = min((place.timer.deadline_ns for place in self._places), default=0)
+        while (left_ns := first_ns - now_ns()) > 0:  # noqa: ASYNC110 - the loop's timers may come a little early
+            await asyncio.sleep(left_ns / NS_PER_S)
+
+    def _keep_time(self, asked: Sequence[Poll]) -> None:
+        """A timer for every poll: of one whose period changed, from its last deadline on."""
+        del self._places[len(asked) :]
+        for number, poll in enumerate(asked):
+            timer = Periodic(1 / poll.period_s)
+            if number == len(self._places):
+                timer.deadline_ns -= timer.period_ns
+                self._places.append(_Place(timer))
+            elif timer.period_ns != (before := self._places[number].timer).period_ns:
+                timer.deadline_ns = before.deadline_ns - before.period_ns + timer.period_ns
+                self._places[number].timer = timer
+
+    async def _ask_first(self, asked: Sequence[Poll], is_away: bool) -> None:
+        """Of the polls that are due, ask the one that has waited longest since it was asked, if there is any."""
+        time_ns = now_ns()
+        due = [pair for pair in zip(self._places, asked, strict=True) if pair[0].timer.deadline_ns <= time_ns]
+        if not due:
+            return
+        place, poll = min(due, key=lambda pair: pair[0].asked_ns)
+        missed_before = place.timer.missed
+        place.timer.advance(time_ns)
+        place.asked_ns = time_ns
+        if is_away:
+            place.answered()  # who knows
+            return
+        if len(asked) > 1 and time_ns < place.silent_until_ns:
+            return
+        self._counters.polls_missed += place.timer.missed - missed_before
+        try:
+            if poll.answer is None:
+                await self._link.send(poll.identifier, poll.payload, timeout_s=poll.period_s)
+            else:
+                await self._ask(poll, poll.answer, place)
+        except BusSendError:
+            self._counters.polls_missed += 1
+
+    async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
+        """In lock step."""
+        if await self._link.ask(poll.identifier, poll.payload, answer, timeout_s=poll.patience_s):
+            place.answered()
+        else:
+            self._counters.polls_unanswered += 1
+            place.unanswered()
+
+
+__all__ = ["Poller"]

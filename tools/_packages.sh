@@ -34,3 +34,9 @@ apt_get() {
         sleep 1
     done
 }
+
+# debian_mirror: where this machine's apt has Debian from; nothing where it does not say
+debian_mirror() {
+    ! command -v apt-get >/dev/null ||
+        apt-get indextargets --format '$(REPO_URI)' 'Created-By: Packages' 'Label: Debian' | awk 'NR == 1'
+}

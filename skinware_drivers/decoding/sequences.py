@@ -68,6 +68,6 @@ class Sequences:
         """A patch has restarted, and its numbers with it."""
         self.last[self._module_patch == patch] = _NONE_YET
 
-    def _by_patch(self, module: Indices, count: npt.NDArray[np.generic]) -> Indices:
+    def _by_patch(self, module: Indices, count: Indices | npt.NDArray[np.bool_]) -> Indices:
         found = np.bincount(self._module_patch[module], weights=count, minlength=self._n_patches)
         return found.astype(np.int64)

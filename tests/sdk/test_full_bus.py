@@ -42,7 +42,7 @@ def test_boards_that_find_no_room_are_not_taken_for_restarted(
         load = running.status()["buses"][0]["load"]
         assert load > 0.9
         first = reader.read()
-        wait_until(lambda: reader.read().module_time_ns.max() > first.module_time_ns.max() + 3 * 10**9)
+        wait_until(lambda: bool(reader.read().module_time_ns.max() > first.module_time_ns.max() + 3 * 10**9))
     set_up = [identifier for _, identifier, payload in commands(log) if payload.startswith("4d")]
     assert sorted(set_up) == [0x200 | board for board in boards]  # once each
     assert "has restarted" not in caplog.text

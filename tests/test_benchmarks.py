@@ -17,7 +17,7 @@ import paper, paper_run
 from skinware import Namespace
 trials = paper.grid((2,), (3,), (1,), 1) + [paper_run.Trial(0, 2, 3, 1, mode) for mode in ("asap", "skin")]
 for _ in range(2):  # the second run finds everything done
-    paper.run(trials, Path(sys.argv[1]), 0.3, Namespace())
+    paper.run(trials, Path(sys.argv[1]), 1.0, Namespace())
 print(json.dumps(paper_run.COLUMNS))
 """
 

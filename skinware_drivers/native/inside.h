@@ -17,6 +17,7 @@ struct words { /* what Python sees and sets between calls */
     int64_t sequence;              /* of the newest frame */
     int64_t must_leave;            /* the event loop has something to do */
     int64_t entry, kind;           /* addresses of what is known of the rows */
+    int64_t ring;                  /* address of the ring's end: another one if somebody removed its file */
 };
 
 struct update { /* followed by int32_t sensors[width], values[width], uint8_t status[width] */
@@ -32,7 +33,6 @@ struct path {
     const struct plan *plan;
     struct batch *batch;
     struct words *words;
-    skinware_ring_writer *ring;
     int64_t failed; /* memory ran out */
 
     /* (capacity,) of the batch: what is known of each row */

@@ -76,8 +76,7 @@ static void lay_out_updates(struct path *path)
 }
 
 /* A data path over what Python owns; NULL: there is no memory. */
-SKINWARE_EXPORT struct path *skinware_path_new(const struct plan *plan, struct batch *batch, struct words *words,
-                                               skinware_ring_writer *ring)
+SKINWARE_EXPORT struct path *skinware_path_new(const struct plan *plan, struct batch *batch, struct words *words)
 {
     struct path *path = calloc(1, sizeof *path);
     int64_t n_keys = 0;
@@ -86,7 +85,6 @@ SKINWARE_EXPORT struct path *skinware_path_new(const struct plan *plan, struct b
     path->plan = plan;
     path->batch = batch;
     path->words = words;
-    path->ring = ring;
     for (int64_t i = 0; i < plan->n_cycles; i++)
         if (plan->cycles[i].is_timed && plan->cycles[i].n * plan->n_modules > n_keys)
             n_keys = plan->cycles[i].n * plan->n_modules;

@@ -100,7 +100,8 @@ static void write_frame(struct path *path, int64_t time_ns)
     const struct columns *columns = &plan->columns;
     int64_t n_timing = plan->n_patches * BUCKETS;
     count_timing(path, time_ns);
-    uint8_t *slot = skinware_ring_begin(path->ring);
+    skinware_ring_writer *ring = (skinware_ring_writer *)(intptr_t)path->words->ring;
+    uint8_t *slot = skinware_ring_begin(ring);
     fill(plan->values, slot, columns->values, plan->n_sensors * plan->value_bytes);
     fill(plan->module_time_ns, slot, columns->module_time_ns, plan->n_modules * 8);
     fill_status(path, slot + columns->status, time_ns);
@@ -117,7 +118,7 @@ static void write_frame(struct path *path, int64_t time_ns)
     fill(plan->latency_ns, slot, columns->latency_ns, 8);
     fill(plan->data_path, slot, columns->data_path, 1);
     int64_t acquired_ns = path->words->newest_ns ? path->words->newest_ns : time_ns;
-    path->words->sequence = (int64_t)skinware_ring_commit(path->ring, acquired_ns, 0);
+    path->words->sequence = (int64_t)skinware_ring_commit(ring, acquired_ns, 0);
 }
 
 /* Oldest stamp of what is new in this frame; if nothing is, the frame says so as of now. */

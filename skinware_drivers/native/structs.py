@@ -185,7 +185,7 @@ class Words(ctypes.Structure):
 
     _fields_ = _fields(
         "fixed_ns carried n_updates n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
-        " hastened store sequence must_leave entry kind"
+        " hastened store sequence must_leave entry kind ring"
     )
 
 

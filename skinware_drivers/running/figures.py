@@ -47,7 +47,7 @@ def figures(
             }
         )
     way = {"data_path": "python" if generation.native is None else "native", "why_python": generation.why_python}
-    latency = {"latency_ms": publisher.latency_ns[0] / 1e6}
+    latency = {"latency_ms": int(publisher.latency_ns[0]) / 1e6}
     figures = {"sequence": writer.sequence, **way, **latency, "buses": buses, "patches": patches}
     return {**figures, "machine": _machine(machine)}
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import skinware.native
 from skinware.errors import PlatformError
 from skinware.native import Library
 from skinware.realtime import now_ns
@@ -38,9 +39,9 @@ def path_for(decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> tuple
     if library is None:
         return None, native.why_python()
     if publisher.ring_address is None:
-        return None, "shared memory is written by Python"
+        return None, skinware.native.why_python()
     why = why_not(decoder)
-    return (None, why) if why else (NativePath(library, decoder, publisher, batch, publisher.ring_address), "")
+    return (None, why) if why else (NativePath(library, decoder, publisher, batch), "")
 
 
 class NativePath:
@@ -51,7 +52,6 @@ class NativePath:
         decoder: what frames mean, and what is known of the skin.
         publisher: when frames are published, and what they say beside values.
         batch: what buses fill.
-        ring: address of the ring's end.
 
     Attributes:
         hear: shown the new rows of each batch, before anything else, while somebody waits for a frame that is data.
@@ -61,7 +61,7 @@ class NativePath:
         heard: told that frames came on a bus that is watched.
     """
 
-    def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch, ring: int) -> None:
+    def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self.hear: Callable[[Rows], None] | None = None
         self.offer: Callable[[Rows], Rows] | None = None
@@ -77,10 +77,9 @@ class NativePath:
         self._hooks = self._make_hooks()
         self._set_hooks()
         self._load(library)
-        self._words.sequence = publisher.sequence
         self._words.last_published_ns = now_ns()
         made = library.quick.skinware_path_new(
-            ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words), ctypes.c_void_p(ring)
+            ctypes.byref(self._plan), ctypes.byref(self._rows), ctypes.byref(self._words)
         )
         if not made:
             raise MemoryError("no memory for the data path of a driver")
@@ -153,6 +152,7 @@ class NativePath:
         self._skipped_before[:] = counts[:, self._skipped_column]
         self._words.fixed_ns = 0 if now_ns is _real_now_ns else now_ns()
         self._words.wanted_ns = self._publisher.wanted_ns
+        self._words.ring, self._words.sequence = self._publisher.ring_address or 0, self._publisher.sequence
         self._set_hooks()
 
     def _leave(self) -> None:

@@ -62,7 +62,7 @@ def restarted_on_demand(emulator: Any) -> Any:
 
 
 class EveryFrame:
-    """Reads in the driver's own thread, in order, after each publication: no machine is too busy for that.
+    """Reads in the driver's own thread, in order, after each take: no machine is too busy for that.
 
     Attributes:
         taken: the frames.
@@ -74,15 +74,28 @@ class EveryFrame:
         assert running.runner.writer is not None
         self.taken: list[DriverFrame] = []
         self.reader: DriverReader = DriverReader(name)
-        writer, commit = running.runner.writer, running.runner.writer.commit
+        assert running.runner.generation is not None
+        generation = running.runner.generation
+        frames = self.reader.in_order(timeout_s=30)
 
-        def commit_and_read(acquired_ns: int) -> int:
-            sequence = commit(acquired_ns)
-            self.taken.append(next(self.reader.in_order(timeout_s=30)))
-            return sequence
+        def and_read(publish: Callable[..., None]) -> Callable[..., None]:
+            def call(*arguments: Any) -> None:
+                publish(*arguments)
+                while self.reader.latest != (self.taken[-1].position if self.taken else None):
+                    self.taken.append(next(frames))
 
-        running.do(lambda: setattr(writer, "commit", commit_and_read))
-        self._forget: Callable[[], None] = lambda: running.do(lambda: setattr(writer, "commit", commit))
+            return call
+
+        def read() -> None:
+            for name in ("digest", "publish_if_due"):
+                setattr(generation, name, and_read(getattr(generation, name)))
+
+        def forget() -> None:
+            for name in ("digest", "publish_if_due"):
+                delattr(generation, name)
+
+        running.do(read)
+        self._forget: Callable[[], None] = lambda: running.do(forget)
 
     def __enter__(self) -> Self:
         return self

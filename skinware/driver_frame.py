@@ -19,8 +19,8 @@ from skinware.structure import Structure
 class DriverFrame(Frame):
     """One frame of a skin. Arrays of a copy may be kept and changed; those of a view are read-only.
 
-    Every array is coherent with every other: they were published in one piece. Properties are whole columns of the
-    frame; methods take a sensor type and give what belongs to its sensors, as those of a snapshot do.
+    All arrays are coherent: they were published together. Properties are whole columns of the
+    frame; methods take a sensor type and return the part of its sensors, as those of a snapshot do.
     """
 
     __slots__ = ()

@@ -30,7 +30,7 @@ _REQUIRED = ("values", "status", "module_time_ns", "patch_state", "bus_state")
 
 
 class DriverWriter:
-    """A driver's end: a structure, and the frames that go with it.
+    """Publishes a skin: its structure and its frames.
 
     Args:
         name: name of the driver in the namespace.
@@ -179,7 +179,7 @@ class DriverWriter:
 
 
 class DriverReader(ServiceReader[DriverFrame]):
-    """A user's end of one driver. Everything of :class:`skinware.service.ServiceReader`, and the structure.
+    """Reads one driver: a :class:`skinware.service.ServiceReader` that also knows the skin's structure.
 
     Raises:
         BadServiceFile: the service is not a driver, or its tables contradict each other.

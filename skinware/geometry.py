@@ -58,11 +58,11 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         type: name of their sensor type.
-        frame: whose axes the numbers are in.
+        frame: name of the coordinate frame of the numbers.
         uid: of each sensor.
         position_m: of each sensor, m.
-        normal: of each sensor, of length 1, outwards; NaN where it is not known, None where none is.
-        radius_m: of each of them, m; None where it is not known.
+        normal: of each sensor, of length 1, outwards; NaN where it is not known, None if no normal is known.
+        radius_m: of each of them, m; None if it is not known.
         name: for people.
     """
 
@@ -104,12 +104,12 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Geometry:
-    """Places of n sensors.
+    """Positions of n sensors.
 
     Attributes:
         type_name: (n,) str, name of each sensor's type.
         uid: (n,) uint64.
-        frame: (n,) str, whose axes the numbers are in; empty where the place is not known.
+        frame: (n,) str, name of the coordinate frame; empty where the position is not known.
         position_m: (n, 3) float64, m; NaN where it is not known.
         normal: (n, 3) float64 of length 1; NaN where it is not known.
         radius_m: (n,) float64, m; NaN where it is not known.

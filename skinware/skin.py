@@ -38,17 +38,17 @@ class _Reader(Tap[DriverFrame], DriverReader):
 
 
 class Skin:
-    """All living drivers of a namespace as one skin; drivers may come and go at any time.
+    """All running drivers of a namespace as one skin; drivers may come and go at any time.
 
     A driver joins with its first frame, and leaves when it stops or dies. The change happens between two snapshots,
-    never within one. Not for several threads at once.
+    never within one. Use it in one thread at a time.
 
     A callback that raises is logged, and everything else goes on.
 
     Args:
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
-        drivers: names of those to take part. Default: all. What others publish is not read, and wakes nobody.
-        types: only drivers that have sensors of one of these types, whole. Default: all.
+        drivers: names of the drivers to read. Default: all. The others are not read, and wake nobody.
+        types: only drivers with sensors of one of these types; all of their sensors are read. Default: all.
         on_attach: called with a driver's name and structure when it joins, before the first snapshot that has it.
         on_detach: called with its name and last structure when it leaves.
         on_structure: called with its name and new structure when it came back with another one.

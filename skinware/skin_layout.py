@@ -17,7 +17,7 @@ from skinware.structure import Index, Structure
 
 @dataclass(frozen=True, eq=False)
 class SkinLayout:
-    """Which drivers the skin is made of at a time. A hot-plug makes a new one; this one never changes.
+    """Which drivers the skin consists of. It never changes; if a driver joins or leaves, there is a new one.
 
     Attributes:
         drivers: names, sorted; the order of everything below.

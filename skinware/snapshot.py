@@ -17,10 +17,10 @@ from skinware.skin_layout import SkinLayout
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The newest frame of every driver. Each is coherent in itself; between drivers, see ``spread_s``.
+    """The newest frame of every driver. Each frame is coherent; for the time between them, see ``spread_s``.
 
     Attributes:
-        layout: which drivers; the same object as long as nothing was plugged in or out.
+        layout: which drivers; the same object as long as no driver joins, leaves or changes.
         frames: one per driver of ``layout``.
     """
 

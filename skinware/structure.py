@@ -52,20 +52,20 @@ class Structure:
 
     Attributes:
         types: the sensor types of this driver.
-        buses: names of the buses that the patches hang on.
+        buses: names of the buses that the patches are attached to.
         patch_name: (n_patches,) bytes.
         patch_bus: (n_patches,) uint32, index into ``buses``.
         module_patch: (n_modules,) uint32, index of the module's patch.
         module_kind: (n_modules,) bytes; hardware-specific (``triangle``, ``fingertip``).
-        module_name: (n_modules,) bytes; within its patch (``triangle 3``), empty where the driver gives none.
+        module_name: (n_modules,) bytes; within its patch (``triangle 3``), empty if the driver gives none.
         sensor_uid: (n_sensors,) uint64, unique per type.
         sensor_type: (n_sensors,) uint32, id of a type in ``types``.
         sensor_module: (n_sensors,) uint32, index of the sensor's module.
         dtype: dtype of the values, one of :data:`VALUE_DTYPES`.
-        geometry: where the n_sensors sensors are, in their order; None where the driver does not tell.
+        geometry: positions of the n_sensors sensors, in the same order; None if the driver does not publish them.
 
     Raises:
-        StructureError: tables that contradict each other; the message names the row.
+        StructureError: the tables contradict each other; the message names the row.
     """
 
     def __init__(

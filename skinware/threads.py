@@ -44,11 +44,11 @@ class _Stoppable(Protocol):
 
 
 class Worker(Generic[T]):
-    """A thread that calls a function again and again.
+    """A thread that calls a function repeatedly.
 
     Args:
         name: of the thread.
-        owned: what it works on; closed at its end.
+        owned: what it works on; closed when the thread ends.
         items: what the function is called with.
         function: called in the thread; if it raises, the worker ends (``error``).
         profile: how the thread is scheduled.
@@ -219,12 +219,12 @@ def write(writer: ServiceWriter, function: Callable[[dict[str, npt.NDArray[Any]]
 
 
 class SkinReplica(Worker[Snapshot]):
-    """The whole skin, kept up to date by a thread, for any number of other threads to look at.
+    """The whole skin, kept up to date by a thread; any number of other threads can look at it.
 
-    Every snapshot is whole and never changes: per driver it is one published frame.
+    A snapshot never changes: it has one published frame of each driver.
 
     Args:
-        skin: belongs to the thread from now on.
+        skin: used only by the thread from now on.
         function: called in the thread with each new snapshot.
         rate_hz: None: each time a driver publishes; otherwise at this rate.
         profile: how the thread is scheduled.

@@ -13,10 +13,9 @@ from skinware.snapshot import Snapshot
 
 
 class Window:
-    """The last frames of a sensor type, for filters and everything else that looks back.
+    """The last frames of one sensor type, for filters and other computations that need past values.
 
-    It holds what it is given, from whatever loop: frames of one driver (``in_order`` gives every one) or snapshots of a
-    skin::
+    Add frames of one driver (``in_order`` returns every one) or snapshots of a skin::
 
         window = Window("pressure", 100)
         for frame in reader.in_order():

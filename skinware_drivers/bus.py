@@ -217,13 +217,13 @@ class Bus(ABC):
 
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
-        opens_slowly: ``open`` may take long, and is called in a thread once other buses are running.
+        opens_slowly: ``open`` may take long; once other buses run, it is called in a thread.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
-        narrows: frames that nobody wants can be left out, see ``narrow``.
+        narrows: it can leave out frames that nobody wants, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
-        fullest: largest share of the receive buffer in use after a take, since somebody set it to 0.
+        fullest: largest share of the receive buffer in use after a ``receive``, since it was last set to 0.
 
     Frames of one bus arrive in order. Frames can be lost: ``counters.lost`` says how many. A bus that goes
     down or away raises :class:`skinware.errors.BusNotAvailable` from ``receive`` once and is then closed and

@@ -15,7 +15,7 @@ class Identifier:
     Attributes:
         value: what the masked bits are; of a 29-bit identifier, with the flag: ``EXTENDED_FLAG | 0x18DA00F1``.
         mask: bits that count; default: all.
-        extended: the identifier has 29 bits, not 11. To be left out: the value says it.
+        extended: whether the identifier has 29 bits. Do not give it: the value says it.
     """
 
     value: int

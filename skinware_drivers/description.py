@@ -31,13 +31,13 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Module:
-    """A module.
+    """A part of a patch, with sensors on its channels.
 
     Attributes:
-        channels: what each channel is; None = not a sensor, its values are dropped.
-        key: how frames name it within its patch.
+        channels: the sensor on each channel; None: no sensor, its values are dropped.
+        key: the number by which frames name it within its patch.
         kind: hardware-specific, for people and geometry.
-        name: within its patch, for people (``triangle 3``); empty: its kind, and a number where the patch has several.
+        name: within its patch, for people (``triangle 3``); default: its kind, numbered if the patch has several.
     """
 
     channels: Sequence[Sensor | None]
@@ -48,12 +48,12 @@ class Module:
 
 @dataclass(frozen=True)
 class Patch:
-    """A patch.
+    """One microcontroller with its modules.
 
     Attributes:
         name: for people, unique on the bus.
         modules: its modules, in the order of the frame.
-        key: how frames name it on its bus.
+        key: the number by which frames name it on its bus.
     """
 
     name: str

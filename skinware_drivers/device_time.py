@@ -38,9 +38,9 @@ machine or the line was held up is followed at once by what does not."""
 class DeviceClock:
     """Brings the stamps of one device onto CLOCK_MONOTONIC.
 
-    The times never lie after the receipt, and never go back. After ``restarts`` (a stamp that goes back, or that lies
-    in the future) nothing that was known of the clock counts any more. Nor does it after ``stops`` (a clock that stands
-    still, or goes far too slowly): what was received then has the time of its receipt.
+    The resulting times are never after the time of receipt, and never go back. After a restart (a stamp that goes back,
+    or that lies in the future) or a stop (a clock that stands still, or goes far too slowly), all that was known of the
+    clock is discarded. What is received while it stands still gets the time of its receipt.
 
     A gap in the stream, or a frame that is late, may be as long as half the time in which the stamps wrap around; the
     time of receipt tells how often they did meanwhile.

@@ -46,7 +46,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class Values:
-    """Where sensor values lie in a payload.
+    """Where sensor values are in a payload.
 
     Attributes:
         offset: first byte.
@@ -84,7 +84,7 @@ class Flag:
         offset: first byte of the word.
         dtype: unsigned numpy dtype with byte order (``">u2"``).
         mask: any of these bits set the status of the whole module. 0: none does.
-        each: (channel, bit of the word) pairs: that bit sets the status of that channel alone.
+        each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
     """
 
     status: Status
@@ -96,7 +96,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class Sentinel:
-    """A value that is none: every value equal to it (or NaN, if it is NaN) sets a status bit of its sensor."""
+    """A value that means "no value": each value equal to it (or NaN, if it is NaN) sets a status bit of its sensor."""
 
     status: Status
     value: float
@@ -117,13 +117,13 @@ class StatusBytes:
 
 @dataclass(frozen=True)
 class Expand:
-    """The escape for what values cannot say (run lengths, nibble maps, text): a vectorised function.
+    """For payloads that ``Values`` cannot describe (run lengths, nibble maps, text): a vectorised function.
 
     ``function(payload, length)`` gets (n, size) uint8 and (n,) uint8 and returns three arrays of equal length:
     the row of ``payload``, the channel, and the value.
 
-    It gets what comes over the wire, garbage too. A frame for which it raises, or returns a value that the dtype cannot
-    hold, is counted as bad content and not shown.
+    It gets whatever comes over the wire, also garbage. A frame for which it raises, or returns a value that the dtype
+    cannot hold, is counted as bad content and not shown.
     """
 
     function: Callable[
@@ -138,8 +138,8 @@ class Frame:
 
     Attributes:
         name: for the cycle and for messages.
-        when: all of these hold; none: every frame of the bus is of this kind (but not those of 29-bit identifiers).
-        length: payload lengths that are right; others are counted as bad and not shown.
+        when: conditions that must all hold; none: every frame of the bus with an 11-bit identifier is of this kind.
+        length: correct payload lengths; frames of other lengths are counted and not shown.
         values: where the values are, in one run or in several.
         patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
             None: the bus has one patch.
@@ -147,7 +147,7 @@ class Frame:
             the patch has one module.
         flags: what sets status bits.
         sequence: sequence number, if there is one that the frames of a cycle do not share (see :class:`Cycle`).
-        time: the device's own time, if it tells it.
+        time: the device's own time, if the frame has it.
         stamp: the old name of ``sequence``; to be removed in release 0.2.
     """
 
@@ -187,7 +187,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Cycle:
-    """Frames that make one coherent update of a module together; without all of them none is shown.
+    """Frames that together are one coherent update of a module; it is shown only if all of them arrived.
 
     With a ``counter``, frames of different cycles are never joined. Without one, only order and time tell cycles
     apart: see :doc:`/explanation/layout` for what they can tell, and what they cannot.
@@ -200,8 +200,8 @@ class Cycle:
             member last.
         maximum_age_s: longest time from the first to the last of them. Two cycles must not fit into it: it is shorter
             than a period (``any``: half a period), or so many periods as the counter has values.
-        counter: the number that all frames of a cycle share, and that is another in the next: of the module's cycles,
-            or of the patch's. One field that all members have, or one for each.
+        counter: the number that all frames of a cycle have in common and that changes with each cycle of the module
+            (or patch). One field that all members have, or one for each member.
         period_s: nominal time from one cycle to the next, of the modules that are the fastest; default: the driver's.
     """
 

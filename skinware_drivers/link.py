@@ -66,7 +66,7 @@ class Match(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """What a listener tells frames apart by."""
+    """By what :meth:`Link.listen` distinguishes frames."""
 
     identifier: int
     first_byte: int
@@ -74,10 +74,10 @@ class Heard(NamedTuple):
 
 
 class Link:
-    """One bus as a driver's handshakes see it. Everything runs in the runner's one event loop, without a thread.
+    """One bus for a driver's handshakes. Everything runs in the runner's event loop; there are no threads.
 
-    Frames that the layout does not claim are offered to whoever waits; nobody waiting costs nothing. However much a
-    driver sends, it sends at a pace, and everything else has its turn between.
+    Frames that are not data of the layout are offered to handshakes that wait for answers. Frames are sent at a limited
+    pace, so that reception and everything else continues meanwhile.
 
     Args:
         bus: the bus.

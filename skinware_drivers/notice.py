@@ -6,7 +6,7 @@ import enum
 
 
 class Notice(enum.Enum):
-    """What a device says of itself beside its data."""
+    """What a device reports about itself, besides its data."""
 
     RESTARTED = "restarted"
     """It lost its configuration: ``revive`` is called for it, and for it alone."""

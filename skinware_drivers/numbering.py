@@ -11,7 +11,7 @@ import numpy as np
 class SequenceNumber:
     """A number in the payload that the device counts up: with a module's frames, or with its cycles.
 
-    What it skips or repeats is counted. In a :class:`Cycle` it also says which frames belong together.
+    Skipped and repeated numbers are counted. In a :class:`Cycle` the number also says which frames belong together.
 
     Attributes:
         offset: first byte of the word that it is in.
@@ -63,7 +63,7 @@ class SequenceNumber:
 class DeviceTime:
     """The time in a payload at which the device took the values, by its own clock.
 
-    The frame's time then is that time on our clock, and not that of the receipt. All frames of a patch have one clock.
+    The frame then has this time, converted to CLOCK_MONOTONIC, instead of the time of receipt. A patch has one clock.
 
     Attributes:
         offset: first byte.

@@ -19,8 +19,8 @@ class Operation:
 
     Attributes:
         method: coroutine function (adapter, link, patches, ...).
-        sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
-        looks: it changes nothing.
+        sets_up: it sets its patches up anew: doubts about their values end.
+        looks: it only looks and changes nothing.
         alone: it is for ``skin-config`` on a bus without a running driver, which would not know what happened.
     """
 
@@ -44,7 +44,7 @@ def operation(*, sets_up: bool = False, looks: bool = False, alone: bool = False
     (their names). What it returns must be something that JSON can hold; what it raises is told to the program.
 
     Args:
-        sets_up: afterwards its patches are as if newly set up: what was held against their values is forgotten.
+        sets_up: it sets its patches up anew: doubts about their values end.
         looks: it changes nothing, so nobody need be asked first, and patches need not be known.
         alone: a running driver does not offer it; ``skin-config`` does, on a bus without one.
     """

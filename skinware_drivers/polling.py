@@ -12,16 +12,16 @@ from skinware_drivers.link import Match
 
 @dataclass(frozen=True)
 class Poll:
-    """A question that is asked again and again, so that a device answers it with data.
+    """A request that is sent periodically, so that a device answers with data.
 
-    Without ``answer`` it goes out every ``period_s``, whatever comes back. With ``answer`` it is asked *in lock step*:
-    nothing else is sent on this bus until the answer came, or until ``timeout_s`` has passed.
+    Without ``answer`` it is sent every ``period_s``, whatever comes back. With ``answer`` it is sent *in lock step*:
+    nothing else is sent on this bus until the answer has arrived, or ``timeout_s`` has passed.
 
     Attributes:
         identifier: of the frame.
         payload: of the frame.
         period_s: time from one to the next, s.
-        answer: which frames, of data or not, are an answer.
+        answer: which frames answer it; they may be data.
         timeout_s: how long to wait for it, s; default: ``period_s``.
 
     Raises:

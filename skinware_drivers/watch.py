@@ -11,7 +11,7 @@ from skinware_drivers.description import SkinTables
 
 
 class Watch:
-    """Looks at every update of all buses, to mark values that the wire alone does not call doubtful.
+    """Sees every update of all buses and marks doubtful values that no single frame shows as such.
 
     Attributes:
         module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.

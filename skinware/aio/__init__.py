@@ -55,13 +55,13 @@ class _Awaited:
 
 
 class Reader(_Awaited, Generic[FrameT]):
-    """A reader of one service, awaited.
+    """A reader of one service for asyncio.
 
     Args:
-        reader: belongs to this one from now on, which closes it.
+        reader: from now on used and closed by this object.
 
     Attributes:
-        sync: that reader, for whatever does not wait.
+        sync: that reader, for everything that does not wait.
     """
 
     def __init__(self, reader: ServiceReader[FrameT]) -> None:
@@ -127,13 +127,13 @@ class Reader(_Awaited, Generic[FrameT]):
 
 
 class Skin(_Awaited):
-    """All living drivers as one skin, awaited.
+    """All running drivers as one skin, for asyncio.
 
     Args:
-        skin: belongs to this one from now on, which closes it. Default: ``skinware.Skin()``.
+        skin: from now on used and closed by this object. Default: ``skinware.Skin()``.
 
     Attributes:
-        sync: that skin, for whatever does not wait.
+        sync: that skin, for everything that does not wait.
     """
 
     def __init__(self, skin: skinware.skin.Skin | None = None) -> None:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from skinware.cli._health import SkinHealth, health_of
 from skinware.driver_service import DriverFrame, DriverReader
@@ -13,6 +17,14 @@ from skinware.realtime import NS_PER_S, now_ns
 _LOOK_EVERY_NS = NS_PER_S // 4
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _SAMPLE_EVERY_NS = NS_PER_S // 10
+
+
+class _Sample(NamedTuple):
+    """One frame: when it was published, its number, and (n_patches,) how often modules of each patch were updated."""
+
+    time_ns: int
+    sequence: int
+    updates: npt.NDArray[np.int64]
 
 
 class LiveDriver:
@@ -26,7 +38,7 @@ class LiveDriver:
     def __init__(self, reader: DriverReader) -> None:
         self.reader = reader
         self.frame: DriverFrame | None = None
-        self._samples: deque[tuple[int, int]] = deque()  # (published_ns, sequence) of one generation
+        self._samples: deque[_Sample] = deque()  # of one generation
 
     @property
     def name(self) -> str:
@@ -60,11 +72,30 @@ class LiveDriver:
     @property
     def rate_hz(self) -> float | None:
         """Frames per second over the last two seconds; shortly after a start, over the frames in the ring."""
-        if len(self._samples) > 1:
-            (first_ns, first), (last_ns, last) = self._samples[0], self._samples[-1]
-            if last_ns - first_ns >= _RATE_WINDOW_NS // 4:
-                return (last - first) * NS_PER_S / (last_ns - first_ns)
-        return self.reader.rate_hz()
+        passed_s = self._passed_s
+        if not passed_s:
+            return self.reader.rate_hz()
+        return (self._samples[-1].sequence - self._samples[0].sequence) / passed_s
+
+    @property
+    def patch_rates_hz(self) -> list[float | None]:
+        """Updates per second of each patch's modules over the last two seconds.
+
+        None shortly after a start, and of a driver that does not count them.
+        """
+        structure, passed_s = self.reader.structure if self.frame is None else self.frame.structure, self._passed_s
+        if not passed_s or not self._samples[-1].updates.any():
+            return [None] * structure.n_patches
+        modules = np.bincount(structure.module_patch, minlength=structure.n_patches)
+        updates = self._samples[-1].updates - self._samples[0].updates
+        rates: list[float | None] = (updates / np.maximum(modules, 1) / passed_s).tolist()
+        return rates
+
+    @property
+    def _passed_s(self) -> float:
+        """What the samples span, s; 0 if that is too little to tell a rate."""
+        passed_ns = self._samples[-1].time_ns - self._samples[0].time_ns if self._samples else 0
+        return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
 
     def health(self) -> SkinHealth:
         """The driver in a few figures."""
@@ -74,10 +105,12 @@ class LiveDriver:
         samples = self._samples
         if self.frame is not None and frame.generation != self.frame.generation:
             samples.clear()
-        if samples and frame.published_ns - samples[-1][0] < _SAMPLE_EVERY_NS:
+        if samples and frame.published_ns - samples[-1].time_ns < _SAMPLE_EVERY_NS:
             return
-        samples.append((frame.published_ns, frame.sequence))
-        while frame.published_ns - samples[0][0] > _RATE_WINDOW_NS:
+        samples.append(
+            _Sample(frame.published_ns, frame.sequence, frame.patch_interval_counts.sum(axis=1).astype(np.int64))
+        )
+        while frame.published_ns - samples[0].time_ns > _RATE_WINDOW_NS:
             samples.popleft()
 
 

@@ -127,6 +127,7 @@ class SkinTop(App[None]):
         self._marks = Static(id="marks", markup=False)
         self._detail = Static(id="detail", markup=False)
         self._rows: list[Row] = []
+        self._heading = ""
         self._pointed: int | None = None
         self._missed: RowKey | None = None  # the chosen row, while its driver is away
         self._must_draw = True
@@ -247,14 +248,24 @@ class SkinTop(App[None]):
             for driver in self._drivers.look():
                 self._drivers.poll(driver)
                 count += 1
-                rows += rows_of(driver.reader, driver.frame, driver.health())
+                rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
         except NamespaceError as error:
             why = str(error)
-        _say(self._head, f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}")
+        self._heading = f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}"
         _say(self._why, why)
         self._nothing.display, self._all.display = not rows, bool(rows)
         self._fill(rows)
+        self._say_what_is_hidden()
         self._must_draw = True  # counters and ages, even if no frame comes
+
+    def _say_what_is_hidden(self) -> None:
+        """How many rows of the list there are above and below those that are seen, and how to get there."""
+        seen = max(0, self._table.size.height - 1)  # under the titles
+        above = min(int(self._table.scroll_offset.y), len(self._rows))
+        below = max(0, len(self._rows) - above - seen)
+        hidden = [f"↑ {above} more"] * bool(above) + [f"↓ {below} more"] * bool(below)
+        is_laid_out = self._all.display and seen
+        _say(self._head, "   ".join([self._heading, *(hidden if is_laid_out else [])]))
 
     def _fill(self, rows: list[Row]) -> None:
         table, before = self._table, self._rows
@@ -288,7 +299,8 @@ class SkinTop(App[None]):
         picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
         if picture.arrangement is not None:
             self._heat_map.show(picture.arrangement, picture.pixels)
-        _say(self._title, picture.title)
+        hidden = 0 if picture.arrangement is None else picture.arrangement.lines - size.height
+        _say(self._title, picture.title + f" (PgUp, PgDn: {plural(hidden, 'more line')})" * (hidden > 0))
         _say(self._scale, picture.scale)
         _say(self._marks, picture.marks)
         if self._pointed is not None and self._pointed < frame.structure.n_sensors:

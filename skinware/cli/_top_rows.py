@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from skinware.cli._health import (
     bus_state_name,
     patch_ages_ns,
     patch_state_name,
+    rate_now_hz,
     status_now,
 )
 from skinware.driver_service import DriverFrame, DriverReader
@@ -54,8 +56,20 @@ class Row(NamedTuple):
     """Every counter that the driver publishes for this row, by name."""
 
 
-def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth) -> list[Row]:
-    """The driver, then each of its buses with its patches below it."""
+def rows_of(
+    reader: DriverReader,
+    frame: DriverFrame | None,
+    health: SkinHealth,
+    patch_rates_hz: Sequence[float | None] = (),
+) -> list[Row]:
+    """The driver, then each of its buses with its patches below it.
+
+    Args:
+        reader: of the driver.
+        frame: its newest.
+        health: the driver in a few figures.
+        patch_rates_hz: updates per second of each patch, where they are known.
+    """
     name, n_fresh = health.name, health.statuses.get("fresh", 0)
     shown = health.life if frame is None else state_shown(health.life, n_fresh, health.sensors)
     first = Row(
@@ -76,7 +90,8 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
     if frame is None:
         return [first]
     structure = frame.structure
-    patches = _patch_rows(reader, frame, health.life)
+    rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
+    patches = _patch_rows(reader, frame, health.life, rates)
     was = "was " if health.life in WITHOUT_NEWS else ""
     rows = [first]
     for bus, counters in enumerate(reader.bus_counters(frame)):
@@ -90,7 +105,7 @@ def rows_of(reader: DriverReader, frame: DriverFrame | None, health: SkinHealth)
     return rows
 
 
-def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row]:
+def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str, rates_hz: Sequence[float | None]) -> list[Row]:
     structure, status = frame.structure, status_now(life, frame)
     was = "was " if life in WITHOUT_NEWS else ""
     total = np.bincount(structure.sensor_patch, minlength=structure.n_patches).tolist()
@@ -102,7 +117,7 @@ def _patch_rows(reader: DriverReader, frame: DriverFrame, life: str) -> list[Row
         cells = (
             f"    {structure.patch_name[patch].decode()}",
             state,
-            "",
+            "" if rates_hz[patch] is None else rate_text(rate_now_hz(life, rates_hz[patch])),
             age_text(ages_ns[patch]),
             f"{fresh[patch]}/{total[patch]}",
             "",

@@ -62,7 +62,9 @@ _LIFE_COLOURS = {
 )
 @click.argument("name", required=False)
 @click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
-@click.option("--watch", is_flag=True, help="Update every second, until interrupted.")
+@click.option(
+    "--watch", is_flag=True, help="Update every second; many patches share a line where the terminal is too low."
+)
 @namespace_option
 @json_option
 @version_option
@@ -90,17 +92,21 @@ def command(name: str | None, sensors: bool, watch: bool, namespace: str | None,
             click.echo("\n".join(as_text(found)))
 
 
-def as_text(found: dict[str, Any]) -> list[str]:
+def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     """The report for people, as lines with colours (which ``click.echo`` takes out where there is no terminal).
 
     On a terminal no line is wider than it.
+
+    Args:
+        found: the report.
+        brief: patches of a bus that are in order share a line.
     """
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
     if not drivers and not services:
         lines += ["", "Nothing runs here yet. Start a driver:", "  skin-driver --bus virtual    (needs no hardware)"]
     for driver in drivers:
-        lines += ["", *_driver_lines(driver)]
+        lines += ["", *_driver_lines(driver | {"patch_list": _summed_up(driver)} if brief else driver)]
     for service in services:
         own = [*_column_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
         lines += ["", _life_line("service", service), *_indented(own)]
@@ -162,6 +168,28 @@ def _path_lines(driver: dict[str, Any]) -> list[str]:
         "",
         f"{driver['data_path']} data path; {rest}" if driver["latency_ms"] else f"{driver['data_path']} data path",
     ]
+
+
+def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
+    """Patches of which something is to be told, each; the others of each bus as if they were one."""
+    good: dict[str, list[dict[str, Any]]] = {}
+    for patch in driver["patch_list"]:
+        if driver["state"] == patch["state"] == "live" and patch["fresh"] == patch["sensors"]:
+            good.setdefault(patch["bus"], []).append(patch)
+    entries = [patch for patch in driver["patch_list"] if patch not in good.get(patch["bus"], ())]
+    for bus, patches in good.items():
+        entry = dict(patches[0])
+        if len(patches) > 1:
+            entry |= {"name": f"{len(patches)} patches", "bus": bus, "state": "live"}
+            entry["age_ms"] = max(patch["age_ms"] for patch in patches)
+            for key, first in patches[0].items():
+                if isinstance(first, int):
+                    entry[key] = sum(patch[key] for patch in patches)
+            for key in _OF_A_PATCH.values():
+                if key in entry:
+                    entry[key] = max((patch[key] for patch in patches), key=lambda told: told["p99_ns"] or 0)
+        entries.append(entry)
+    return entries
 
 
 def _column_lines(service: dict[str, Any]) -> list[str]:
@@ -339,7 +367,9 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         if as_json:
             print_json(found)
         elif sys.stdout.isatty():
-            _redraw(as_text(found))
+            lines = as_text(found)
+            fits = len(lines) < shutil.get_terminal_size().lines
+            _redraw(lines if fits else as_text(found, brief=True))
         else:
             click.echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
         time.sleep(_WATCH_PERIOD_S)

@@ -70,44 +70,44 @@ extern "C" {
 /* A deadline that never comes. */
 #define SKINWARE_FOREVER INT64_MAX
 
-/* What the functions return. skinware_text says each in words. */
+/* Results of the functions. skinware_text describes each. */
 typedef enum skinware_result {
     SKINWARE_OK = 0,
 
-    /* What waiting and reading can end with in a healthy system. */
-    SKINWARE_TIMEOUT = 1,           /* the deadline came first; the writer lives, but published nothing newer */
+    /* Normal results of waiting and reading. */
+    SKINWARE_TIMEOUT = 1,           /* the deadline passed; the writer is running but has published nothing newer */
     SKINWARE_EMPTY = 2,             /* this generation has published nothing yet */
-    SKINWARE_PAUSED = 3,            /* the writer says that it publishes nothing for now */
+    SKINWARE_PAUSED = 3,            /* the writer has paused */
     SKINWARE_GONE = 4,              /* the writer died or was closed; its last frame can still be read */
     SKINWARE_RESTARTED = 5,         /* there is a newer generation of the service: call skinware_reattach */
-    SKINWARE_STRUCTURE_CHANGED = 6, /* reattached, and everything must be looked up anew: other columns or sensors */
+    SKINWARE_STRUCTURE_CHANGED = 6, /* reattached, but columns or sensors have changed: look everything up again */
     SKINWARE_INTERRUPTED = 7,       /* a signal handler ran during the wait */
 
     /* Errors; skinware_reason has the details. */
-    SKINWARE_OVERRUN = 16,      /* the writer was faster than the copy, many times in a row */
+    SKINWARE_OVERRUN = 16,      /* the writer overwrote the frame during each of many attempts to copy it */
     SKINWARE_NOT_FOUND = 17,    /* no such service, or no such namespace */
-    SKINWARE_BAD_NAME = 18,     /* not a name that a service or namespace can have */
+    SKINWARE_BAD_NAME = 18,     /* not a valid name of a service or namespace */
     SKINWARE_BAD_NAMESPACE = 19, /* the namespace's folder cannot be trusted or read */
     SKINWARE_BAD_FILE = 20,     /* the service's file cannot be read safely */
     SKINWARE_NO_MEMORY = 21,    /* out of memory, or the file is too large for this process */
-    SKINWARE_SYSTEM = 22        /* the operating system refused something that must work; errno has the number */
+    SKINWARE_SYSTEM = 22        /* a system call failed unexpectedly; errno has the reason */
 } skinware_result;
 
-/* Bits of skinware_state. Ignore bits that you do not know. */
+/* Bits of skinware_state. Ignore unknown bits. */
 #define SKINWARE_STATE_PAUSED 1u     /* the writer publishes nothing until it resumes */
 #define SKINWARE_STATE_SUPERSEDED 2u /* a newer generation exists under the same name */
 #define SKINWARE_STATE_CLOSED 4u     /* the writer closed it in good order */
 
-/* Bits of a sensor's status (column "status" of a driver); 0 means fresh and good. Take unknown bits for "not good". */
+/* Bits of a sensor's status (column "status" of a driver); 0 means fresh and good. Treat unknown bits as "not good". */
 #define SKINWARE_STATUS_NEVER_SEEN 1u     /* no value since the driver started; the value is meaningless */
 #define SKINWARE_STATUS_STALE 2u          /* older than the patch's last update, or the patch went silent */
-#define SKINWARE_STATUS_OUT_OF_RANGE 4u   /* the true value lies beyond what the hardware can express */
+#define SKINWARE_STATUS_OUT_OF_RANGE 4u   /* the true value is beyond the measuring range */
 #define SKINWARE_STATUS_NO_ACK 8u         /* the transducer does not answer its patch's microcontroller */
 #define SKINWARE_STATUS_NOT_CONNECTED 16u /* the hardware says that no transducer is connected */
 #define SKINWARE_STATUS_MASKED 32u        /* switched off by configuration */
 #define SKINWARE_STATUS_SUSPECT 64u       /* something happened that makes the value doubtful */
 
-/* What a bus is doing (column "bus_state" of a driver). Take a state that you do not know for "not live". */
+/* What a bus is doing (column "bus_state" of a driver). Treat an unknown state as "not live". */
 #define SKINWARE_BUS_CONNECTING 0u
 #define SKINWARE_BUS_LIVE 1u
 #define SKINWARE_BUS_SILENT 2u
@@ -115,8 +115,8 @@ typedef enum skinware_result {
 #define SKINWARE_BUS_GONE 4u
 
 /*
- * Why (column "bus_reason", which a driver need not have; since when: "bus_since_ns", CLOCK_MONOTONIC ns). A live bus can
- * have a reason too. Take a reason that you do not know for "something is wrong".
+ * Why a bus is in its state (column "bus_reason", which not every driver has; since when: "bus_since_ns",
+ * CLOCK_MONOTONIC ns). A live bus can have a reason too. Treat an unknown reason as "something is wrong".
  */
 #define SKINWARE_BUS_REASON_NONE 0u
 #define SKINWARE_BUS_REASON_NOTHING_HEARD 1u
@@ -159,12 +159,12 @@ typedef struct skinware_type {
 
 /* One frame: a private copy (skinware_read), or the ring's own memory (skinware_view). */
 typedef struct skinware_frame {
-    uint64_t generation;  /* which incarnation of the service; 0: this frame was never filled */
-    uint64_t sequence;    /* 1, 2, 3 ... within the generation; a gap is frames that you did not take */
+    uint64_t generation;  /* which generation of the service; 0: this frame was never filled */
+    uint64_t sequence;    /* 1, 2, 3 ... within the generation; a gap: frames that you did not read */
     int64_t acquired_ns;  /* newest time stamp of the data in it */
-    int64_t published_ns; /* when the writer handed it out */
+    int64_t published_ns; /* when the writer published it */
     uint64_t flags;       /* bits for the service's own use */
-    int stale;            /* the writer was dead or closed when it was taken: this is its last word */
+    int stale;            /* the writer was dead or closed when the frame was read: no newer one follows */
 
     /* The rest belongs to this header. */
     const unsigned char *bytes;
@@ -173,7 +173,7 @@ typedef struct skinware_frame {
     size_t capacity;
 } skinware_frame;
 
-/* How a frame begins its life. End it with skinware_frame_free. */
+/* The initial value of a frame. Free it with skinware_frame_free. */
 #define SKINWARE_FRAME_INIT {0, 0, 0, 0, 0, 0, NULL, 0, NULL, 0}
 
 /* -- attaching ---------------------------------------------------------------------------------------------------- */
@@ -191,15 +191,15 @@ typedef struct skinware_frame {
 skinware_result skinware_attach(skinware_reader **reader, const char *name_space, const char *service);
 
 /*
- * Go over to the present generation of the service, after a RESTARTED.
+ * Attach to the current generation of the service, after RESTARTED.
  *
- * OK: the structure is the same. Columns and types that were looked up still hold; tables and views do not.
- * STRUCTURE_CHANGED: attached as well, but look everything up anew.
- * Anything else (as skinware_attach): the reader is as it was.
+ * OK: the structure is the same. Columns and types that were looked up are still valid; tables and views are not.
+ * STRUCTURE_CHANGED: also attached, but look everything up again.
+ * Anything else (as skinware_attach): the reader is unchanged.
  */
 skinware_result skinware_reattach(skinware_reader *reader);
 
-/* Detach; NULL is allowed. Copied frames stay as they are, views do not. */
+/* Detach; NULL is allowed. Copied frames remain valid, views do not. */
 void skinware_detach(skinware_reader *reader);
 
 /* -- frames ------------------------------------------------------------------------------------------------------- */
@@ -210,19 +210,19 @@ void skinware_detach(skinware_reader *reader);
  * OK: there is one; read it. RESTARTED: the service came back; reattach.
  * GONE, PAUSED: told at once (a killed writer within 50 ms), but only once: the next call waits until its deadline for
  * the writer to come back, so that a loop around this function never spins.
- * TIMEOUT, and GONE or PAUSED once more: the deadline came. A deadline that has passed already makes this a question.
+ * TIMEOUT, and GONE or PAUSED once more: the deadline came. If it has passed already, this function does not wait.
  * INTERRUPTED: a signal handler ran. A signal that comes just before the wait does not end it: keep deadlines short
  * where handlers set a flag.
- * SYSTEM: the kernel refuses to wait.
+ * SYSTEM: the kernel refused to wait.
  */
 skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *newer_than, int64_t deadline_ns);
 
 /*
  * Copy the newest frame; all its columns were published at the same moment. Does not wait.
  *
- * The frame's memory is allocated by the first call and used again by later ones.
- * Returns OK, EMPTY, OVERRUN or NO_MEMORY. After an OVERRUN the frame is as if it was never filled; after the other two
- * it is unchanged.
+ * The first call allocates the frame's memory; later ones reuse it.
+ * Returns OK, EMPTY, OVERRUN or NO_MEMORY. After OVERRUN the frame is as if it had never been filled; after the other
+ * two it is unchanged.
  */
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame);
 
@@ -237,10 +237,10 @@ skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame);
 /* Whether a frame is whole so far: always 1 for a copy, 1 for a view until the writer begins to overwrite it. */
 int skinware_valid(const skinware_frame *frame);
 
-/* The elements of a column in a frame, aligned to 64 bytes in views and to 16 in copies; NULL if it has no such. */
+/* The elements of a column in a frame, aligned to 64 bytes in views and to 16 in copies; NULL if there are none. */
 const void *skinware_data(const skinware_frame *frame, const skinware_column *column);
 
-/* Give a frame's memory back. */
+/* Free a frame's memory. */
 void skinware_frame_free(skinware_frame *frame);
 
 /* -- what a service is made of ------------------------------------------------------------------------------------ */
@@ -251,7 +251,7 @@ const skinware_column *skinware_find_column(const skinware_reader *reader, const
 /* A table (static column) by name ("sensor_uid", "module_patch" ...), NULL if there is none. */
 const skinware_column *skinware_find_table(const skinware_reader *reader, const char *name);
 
-/* The elements of a table, read-only shared memory; NULL if it is none of this reader's. */
+/* The elements of a table, in read-only shared memory; NULL if the table is not one of this reader. */
 const void *skinware_table_data(const skinware_reader *reader, const skinware_column *table);
 
 /* All columns and tables, in the order of the file. */
@@ -266,13 +266,13 @@ double skinware_number(const skinware_column *column, const void *data, size_t i
 /* Whether the service is a driver: a skin with sensors. Its tables were then checked, and agree with each other. */
 int skinware_is_driver(const skinware_reader *reader);
 
-/* The sensor types of a driver; 0 for a service that is none. */
+/* The sensor types of a driver; 0 if the service is no driver. */
 size_t skinware_type_count(const skinware_reader *reader);
 const skinware_type *skinware_type_at(const skinware_reader *reader, size_t index);
 const skinware_type *skinware_find_type(const skinware_reader *reader, const char *name);
 
 /*
- * Where the sensors of a type are in "values" and "status": positions, ascending.
+ * Positions of the sensors of a type in "values" and "status", ascending.
  *
  * Writes at most capacity of them; returns how many there are, so skinware_sensors(reader, type, NULL, 0) counts them.
  */
@@ -289,12 +289,12 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
                          const uint32_t *positions, size_t count, float *out);
 
 /*
- * Which of a driver's sensors can be trusted now: out[i] is 1 if the sensor at positions[i] has the status 0, data that is
- * not too old, and a driver that lived when the frame was taken; else 0. A status alone is as of the frame: a driver that
- * hangs leaves it at 0.
+ * Which of a driver's sensors can be trusted now: out[i] is 1 if the sensor at positions[i] has the status 0, data that
+ * is not too old, and a driver that was running when the frame was read; else 0. The status alone is not enough: it
+ * belongs to the frame, and a driver that hangs leaves it at 0.
  *
- * max_age_ns: the age beyond which nothing is fresh; 0: three of the driver's periods and at least 0.2 s, or 1 s if it has no
- * period.
+ * max_age_ns: data that is older is not fresh; 0 for the default: three of the driver's periods and at least 0.2 s, or
+ * 1 s if it has no period.
  *
  * Returns how many are fresh; 0 also if this is no driver's frame, or a position lies outside it.
  */
@@ -303,7 +303,7 @@ size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame
 
 /* -- the state of things ------------------------------------------------------------------------------------------ */
 
-/* Whether the writer of this generation lives; it may still be silent. One system call. */
+/* Whether the writer of this generation is running (it may still publish nothing). One system call. */
 int skinware_is_alive(const skinware_reader *reader);
 
 /* SKINWARE_STATE_* bits of this generation. */
@@ -312,7 +312,7 @@ uint32_t skinware_state(const skinware_reader *reader);
 /* Sequence of the newest frame, 0 before the first. */
 uint64_t skinware_latest(const skinware_reader *reader);
 
-/* Which incarnation of the service this is; unique per creation. */
+/* The number of the generation that is being read; no two generations of a service have the same. */
 uint64_t skinware_generation(const skinware_reader *reader);
 
 /*
@@ -324,13 +324,13 @@ uint64_t skinware_published_before(const skinware_reader *reader);
 /* The writer's nominal period, 0 if it has none. */
 int64_t skinware_period_ns(const skinware_reader *reader);
 
-/* Frames that the ring holds, 2 to 64. */
+/* Number of frames that the ring holds, 2 to 64. */
 uint32_t skinware_slot_count(const skinware_reader *reader);
 
 /* Process id of the writer, in its own pid namespace. */
 uint64_t skinware_writer_pid(const skinware_reader *reader);
 
-/* What the columns mean: "driver", "data". */
+/* Kind of service: "driver" or "data". */
 const char *skinware_kind(const skinware_reader *reader);
 
 /* 32 bytes that are equal for services of equal structure. */
@@ -339,10 +339,10 @@ const unsigned char *skinware_digest(const skinware_reader *reader);
 /* CLOCK_MONOTONIC, nanoseconds. */
 int64_t skinware_now_ns(void);
 
-/* A result in words. */
+/* A description of a result. */
 const char *skinware_text(skinware_result result);
 
-/* What exactly was wrong with the last call of this thread that returned an error; "" if there is nothing to say. */
+/* Details of the last error that a call of this thread returned; "" if there are none. */
 const char *skinware_reason(void);
 
 #ifdef __cplusplus

@@ -39,11 +39,11 @@ class Namespace:
 
     Args:
         name: default: environment variable ``SKINWARE_NAMESPACE``, else ``default``.
-        owner: a user (name or id) whose namespace is accepted beside mine and root's; default: environment
+        owner: a user (name or id) whose namespace is accepted besides one's own and root's; default: environment
             variable ``SKINWARE_OWNER``.
 
     Raises:
-        ConfigurationError: a name that cannot be one, or an unknown owner.
+        ConfigurationError: an invalid name, or an unknown owner.
     """
 
     def __init__(self, name: str | None = None, *, owner: str | int | None = None) -> None:

@@ -74,11 +74,11 @@ class Histogram(msgspec.Struct):
 
 
 class WriterStatistics(msgspec.Struct):
-    """What a writer tells of one generation of its service.
+    """What a writer counts in one generation of its service.
 
     Attributes:
         published: frames.
-        missed_periods: periods that passed unused.
+        missed_periods: periods in which it published nothing because it was late.
         before_boot: frames whose ``acquired_ns`` lay before this machine booted, and counts as 0.
         wall: from ``begin`` to ``commit``.
         cpu: from one publication to the next, on a processor.

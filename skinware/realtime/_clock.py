@@ -33,7 +33,7 @@ class Periodic:
     """Absolute deadlines of a periodic loop: no drift, and no catch-up burst after a late period.
 
     Attributes:
-        missed: periods that passed unused because the loop came back too late.
+        missed: periods that were skipped because the loop came back too late.
         deadline_ns: the next deadline.
     """
 

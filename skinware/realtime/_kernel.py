@@ -27,7 +27,7 @@ class Refusal:
 
     Attributes:
         what: what was asked for.
-        why: the limit, capability or setting that stands against it.
+        why: the limit, capability or setting that prevents it.
         remedy: what a person can do about it.
     """
 

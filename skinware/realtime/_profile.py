@@ -23,13 +23,13 @@ class Profile:
     """How the kernel and Python are to treat the loop of this thread; begin with :meth:`normal` or :meth:`fifo`.
 
     Attributes:
-        policy: ``fifo``: before every normal thread of its CPU, until it waits (SCHED_FIFO); or ``normal``.
+        policy: ``fifo`` (SCHED_FIFO: runs before every normal thread of its CPU until it waits) or ``normal``.
         priority: 1 (lowest) to 99 for ``fifo``, 0 for ``normal``.
-        cpus: the only CPUs to run on; empty leaves that as it is.
-        lock_memory: keep in memory whatever this process has touched or will touch; False leaves that as it is.
-        timer_slack_ns: how late the kernel may be on purpose to save wake-ups, 1 or more; Linux starts processes
+        cpus: the only CPUs to run on; empty changes nothing.
+        lock_memory: keep all memory that this process uses in RAM; False changes nothing.
+        timer_slack_ns: by how much the kernel may delay timers to save wake-ups, 1 or more; Linux starts processes
             with 50000. ``fifo`` has none in any case, so there it counts only if ``fifo`` is refused.
-        freeze_gc: collect garbage once, and leave what exists then out of all later collections.
+        freeze_gc: collect garbage once, and exclude all objects that exist then from later collections.
 
     Raises:
         ConfigurationError: a priority that does not fit the policy, a CPU that is not there, or a slack below 1 ns.

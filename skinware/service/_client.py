@@ -33,7 +33,7 @@ _ERRORS: dict[str, type[Exception]] = {
 
 
 class PendingRequest:
-    """A request that was sent. Not for several threads at once.
+    """A request that was sent. Use it in one thread at a time.
 
     Attributes:
         operation: what was asked for.

@@ -40,7 +40,7 @@ class Ownership:
         operations: what programs may ask for.
 
     Raises:
-        NameInUse: a living writer has this name.
+        NameInUse: a running writer has this name.
         NamespaceError: the namespace cannot be used, or shared memory is full.
         ConfigurationError: a bad name, slot count or column.
     """

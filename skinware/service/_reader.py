@@ -22,7 +22,7 @@ Position = tuple[int, int]
 
 
 class ServiceReader(Attachment[FrameT]):
-    """A reader of one service: it re-attaches by itself when the writer comes back.
+    """Reads one service, and attaches again by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
     slow loses frames (``lost`` counts them exactly, over restarts too) and never disturbs the writer or other readers.

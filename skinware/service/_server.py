@@ -52,7 +52,7 @@ class _Peer:
 
 
 class Request:
-    """One request that waits for its answer: ``reply`` or ``fail``, once.
+    """A request that waits for its answer: call ``reply`` or ``fail`` once.
 
     Attributes:
         operation: what is asked for.

@@ -22,24 +22,24 @@ _LONGEST_WAIT_S = 1.0
 
 
 class ServiceWriter(Ownership):
-    """The one writer of a service. It never waits for a reader.
+    """Publishes a service; each service has one writer. It never waits for a reader.
 
     Args:
         name: unique in the namespace, 1 to 47 letters, digits, ``_`` or ``-``.
-        columns: of every array of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
+        columns: the arrays of a frame, by name: (dtype, length or shape), or a :class:`Column` that also has a
             unit and a description. A dtype may be a structure.
-        static: arrays that are written once and that readers find beside the ring.
+        static: arrays that are written once, for readers, besides the frames.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
-        kind: says what the columns mean (``data``, ``driver``).
+        kind: of the service (``data``, ``driver``).
         slots: frames that the ring holds, 2 to 64.
         rate_hz: nominal rate, told to readers; None for no fixed rate.
-        group: group whose members may read; a namespace that is there already must have it.
+        group: group whose members may read; an existing namespace must have the same.
         description: of the service, for people.
-        operations: what programs may ask for beside a frame: name to function, called in the writer's own loop
+        operations: what programs may ask for besides a frame: name to function, called in the writer's own loop
             (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
 
     Raises:
-        NameInUse: a living writer has this name.
+        NameInUse: a running writer has this name.
         NamespaceError: the namespace cannot be used, or shared memory is full.
         ConfigurationError: a bad name, slot count or column.
     """

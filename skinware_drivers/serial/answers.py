@@ -11,7 +11,7 @@ from skinware.errors import BusError
 
 
 class Refused(BusError):
-    """A device does not do what it was told.
+    """A device refused a command.
 
     Attributes:
         status: the number with which it answered.
@@ -27,7 +27,7 @@ class Answers:
     """How devices of one kind answer commands.
 
     Attributes:
-        device: what they are called in messages.
+        device: name of the devices in messages.
         reasons: what a status other than 0 means, in words.
         offset: first byte of the status.
         dtype: of the status: unsigned, with byte order.

@@ -15,7 +15,7 @@ from skinware_drivers.serial.stuffing import Stuffing
 class Delimited(Framing):
     """Frames that end with a delimiter: header, body and checksum, stuffed.
 
-    What is left of a frame that was damaged ends at the next delimiter, and the frame behind it is found.
+    The rest of a damaged frame ends at the next delimiter, and the frame after it is found.
 
     Attributes:
         stuffing: ``LINES``, ``COBS``, ``SLIP`` or ``HDLC``.

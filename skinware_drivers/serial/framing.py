@@ -69,8 +69,8 @@ class Framed(NamedTuple):
     """A frame that was found.
 
     Attributes:
-        identifier: number that tells kinds of frame apart; 0 where the framing has none.
-        body: what it carries.
+        identifier: number that distinguishes kinds of frames; 0 if the framing has none.
+        body: its content.
         end: bytes of the stream up to the end of the frame.
     """
 
@@ -101,7 +101,7 @@ class Encoding(ABC):
 
 
 class Framing(Encoding):
-    """How frames lie in a stream of bytes.
+    """How frames are arranged in a stream of bytes.
 
     Attributes:
         maximum_body: bytes of the longest body.

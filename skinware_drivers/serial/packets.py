@@ -19,10 +19,10 @@ Pattern = Sequence[int | Collection[int]]
 
 @dataclass(frozen=True)
 class Length:
-    """The length of a frame is what a field says, and some bytes more.
+    """A field says how long a frame is, apart from a constant number of bytes.
 
     Attributes:
-        field: where it is said.
+        field: place of the length.
         more: bytes of the whole frame that the field does not count.
     """
 
@@ -32,7 +32,7 @@ class Length:
 
 @dataclass(frozen=True)
 class LengthTable:
-    """A byte of the header tells how long a frame is.
+    """A byte of the header determines how long a frame is.
 
     Attributes:
         offset: place of the byte.
@@ -45,15 +45,15 @@ class LengthTable:
 
 @dataclass(frozen=True, kw_only=True)
 class Packet(Framing):
-    """Frames of known beginning and length: header, body, checksum and trailer.
+    """Frames with a known beginning and length: header, body, checksum and trailer.
 
-    A beginning can lie by chance in a body, or in what a damaged frame left. If a frame then does not hold what it
-    promises (checksum, trailer, a length that can be), the search goes on one byte after that beginning, and the next
-    whole frame is found. Until as many bytes have arrived as a false beginning promises, it cannot be told.
+    The bytes of a beginning can also occur in a body, or in the rest of a damaged frame. If the checksum, the trailer
+    or the length is then wrong, the search continues one byte later, and the next whole frame is found. This is known
+    only when as many bytes have arrived as the false beginning claims.
 
     Attributes:
         sync: first bytes of every frame.
-        length: bytes of a whole frame, or how it is told.
+        length: bytes of a whole frame, or where the frame says it.
         maximum: bytes of the longest whole frame; needed with :class:`Length`.
         checksum: of the bytes ``covers``.
         checksum_at: place of the checksum in the header; default: behind the body.
@@ -61,7 +61,7 @@ class Packet(Framing):
             Default: everything before the checksum, or (with ``checksum_at``) everything behind it.
         bare_when_empty: a frame whose length field says 0 has no checksum (Schunk DSACON32).
         trailer: last bytes of every frame.
-        identifier: number in the header that tells kinds of frame apart.
+        identifier: number in the header that distinguishes kinds of frames.
         header: bytes before the body; default: up to the last of sync, length, identifier and checksum in front.
         confirmed: a frame that does not follow another one at once counts only if the next one begins right behind
             it (and, with a trailer, ends as it should). For devices without a checksum; costs one frame of delay
@@ -69,7 +69,7 @@ class Packet(Framing):
             that can be checked that a shortened one passes together with the beginning of the next.
 
     Raises:
-        ConfigurationError: what it says cannot be.
+        ConfigurationError: the declaration contradicts itself.
     """
 
     sync: Pattern = ()

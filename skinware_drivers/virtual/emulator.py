@@ -104,22 +104,22 @@ class Device:
 
 
 class Emulator(Stage, HasOptions[OptionsT]):
-    """Emulated devices on one bus. A subclass says what follows; faults and time are taken care of.
+    """Emulated devices on one bus. Subclasses define the following; faults and time are handled here.
 
-    In the brackets is named which options it has: ``class EmulatedThumb(Emulator[EmulatedThumbOptions])``.
+    The brackets name its options: ``class EmulatedThumb(Emulator[EmulatedThumbOptions])``.
 
     Args:
         options: which devices, what they feel, and what is wrong with them.
-        log: takes the :mod:`.events`; a list will do.
+        log: receives the :mod:`.events`, for example a list.
         source: the values of every burst, instead of what is felt.
 
     Attributes:
-        medium: what the devices are connected by; for serial lines see :mod:`.serial_device`.
+        medium: kind of bus; for serial lines see :mod:`.serial_device`.
         Options: those options; they become those of ``skin-emulate`` and of ``--bus virtual?...``.
         numbers: of the devices. To be set before ``Emulator.__init__`` where the options say which there are.
-        identifiers: every one that the devices or their host can use: no foreign device does.
+        identifiers: all that the devices or their host can use; emulated foreign devices use others.
         period_s: time from burst to burst of a device that sends by itself; an option ``period_ms`` sets it.
-        full_scale: greatest value that a device can send. This, and the next three: one number, or one for each value.
+        full_scale: greatest value that a device can send. This and the next three: one number, or one for each value.
         lowest: least value that it can send.
         rest: value of a sensor that nobody touches.
         swing: what a firm press adds to it.

@@ -24,7 +24,7 @@ OptionsT = TypeVar("OptionsT", bound=SerialEmulatorOptions)
 
 
 class SerialEmulator(Emulator[OptionsT]):
-    """Emulated devices on one serial line, by default one with the number 1. All that goes over it are bytes.
+    """Emulated devices on one serial line, by default one with the number 1.
 
     A subclass says which :meth:`messages` a device sends and where the values are felt (``places``); one whose devices
     hear something says how to :meth:`cut` commands out of what they hear, and how they :meth:`answer`.

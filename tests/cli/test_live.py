@@ -4,6 +4,7 @@ from contextlib import closing
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from skinware import Namespace, ServiceWriter, native
@@ -107,21 +108,35 @@ def test_two_frames_at_once_right_after_a_start_make_no_rate(monkeypatch: pytest
 
 
 def test_the_rate_is_measured_over_two_seconds() -> None:
-    reader = SimpleNamespace(rate_hz=lambda: 7.0, name="a")
+    reader = SimpleNamespace(rate_hz=lambda: 7.0, name="a", structure=fake_structure(2, 2))
     driver = LiveDriver(cast(Any, reader))
 
     def take(sequence: int, published_ns: int, generation: int = 1) -> None:
-        frame = SimpleNamespace(sequence=sequence, published_ns=published_ns, generation=generation)
+        counts = np.zeros((2, 32), np.uint64)
+        counts[:, 5] = 2 * sequence, sequence // 2  # the second patch has half as many
+        frame = SimpleNamespace(
+            sequence=sequence,
+            published_ns=published_ns,
+            generation=generation,
+            patch_interval_counts=counts,
+            structure=fake_structure(2, 2),
+        )
         driver._sample(cast(Any, frame))
         driver.frame = cast(Any, frame)
 
     assert driver.rate_hz == 7.0  # that of the ring
+    assert driver.patch_rates_hz == [None, None]
     for tenth in range(50):
         take(2 * tenth + 1, tenth * 100_000_000)  # every other frame at 20 Hz
     assert driver.rate_hz == pytest.approx(20.0)
+    assert driver.patch_rates_hz == pytest.approx([20.0, 5.0])
     assert len(driver._samples) <= 21
     for tenth in range(50, 100):
         take(4 * tenth, tenth * 100_000_000)  # then at 40 Hz
     assert driver.rate_hz == pytest.approx(40.0)
-    take(1, 10 * 10**9, generation=2)
+    take(0, 10 * 10**9, generation=2)
+    take(0, 11 * 10**9, generation=2)
+    assert driver.patch_rates_hz == [None, None]  # nobody counts
+    driver._samples.clear()
+    take(1, 12 * 10**9, generation=2)
     assert driver.rate_hz == 7.0

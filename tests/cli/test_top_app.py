@@ -151,6 +151,25 @@ def test_what_a_newcomer_sees_at_80_by_24() -> None:
     go(scene)
 
 
+def test_what_does_not_fit_is_told_of() -> None:
+    async def scene() -> None:
+        with publishing(FakeSkin("torso", fake_structure(20, 16))):
+            async with shown() as (app, pilot):
+                table = app.query_one(DataTable)
+                await until(pilot, lambda: len(listed(app)) == 22)
+                await until(pilot, lambda: f"↓ {22 - (table.size.height - 1)} more" in line(app, "head"))
+                assert "↑" not in line(app, "head")
+                await until(pilot, lambda: "(PgUp, PgDn: " in line(app, "title"))
+                for _ in range(21):
+                    await pilot.press("down")
+                await until(pilot, lambda: f"↑ {22 - (table.size.height - 1)} more" in line(app, "head"))
+                assert "↓" not in line(app, "head")
+                await until(pilot, lambda: line(app, "title").startswith("board 26: "))
+                assert "PgDn" not in line(app, "title")
+
+    go(scene)
+
+
 def test_a_driver_dies_and_returns_changed() -> None:
     async def scene() -> None:
         async with shown() as (app, pilot):

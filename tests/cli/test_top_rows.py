@@ -102,6 +102,16 @@ def test_a_row_per_driver_bus_and_patch() -> None:
     assert patches_of(RowKey("torso", BUS, 9), frame) == []
 
 
+def test_patches_have_rates_as_far_as_they_are_known() -> None:
+    with FakeSkin("torso", fake_structure(3, 2)) as skin, DriverReader("torso") as reader:
+        skin.publish()
+        frame = reader.read()
+        health = health_of(reader, frame, 20.0)
+        rates = [row.cells[2] for row in rows_of(reader, frame, health, [19.96, 0.0, None])]
+        assert rates == ["20.0 Hz", "", "20.0 Hz", "0.0 Hz", ""]
+        assert [row.cells[2] for row in rows_of(reader, frame, health, [19.96])][2:] == [""] * 3  # of another structure
+
+
 def test_a_driver_without_a_frame_is_one_row() -> None:
     with FakeSkin("torso") as _, DriverReader("torso") as reader:
         (row,) = rows_of(reader, None, health_of(reader, None, None))

@@ -40,6 +40,7 @@ from skinware_drivers.layout_check import check_layout
 _TYPES = [PRESSURE.measured(unit="counts")]
 _EXTENDED_BASE = EXTENDED_FLAG | 0x18DA_0000
 _SLOT_SHIFT, _PATCH_SHIFT, _KEY_BITS = 8, 4, 4
+DTYPES = ("u1", "<i2", "<u2", "<i4", "<f4")
 _WHOLE = ["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<u4", ">u4", "<i4", ">i4", "<u8", ">i8"]
 _REAL = ["<f4", ">f4"]
 _UNSIGNED = ["u1", "<u2", ">u2", "<u4", ">u4", "<u8", ">u8"]
@@ -236,12 +237,21 @@ def _naming(draw: st.DrawFn, shortest: int) -> _Naming:
 
 
 @st.composite
-def bus_designs(draw: st.DrawFn, dtype: str, first_uid: int = 0) -> BusDesign:
-    """A bus with one to three patches, of which the frames may be members of a cycle."""
+def bus_designs(
+    draw: st.DrawFn, dtype: str, members: Sequence[int] = (0, 0, 2, 2, 3, 5), most_alone: int = 2
+) -> BusDesign:
+    """A bus with one to three patches.
+
+    Args:
+        dtype: of the driver's values.
+        members: how many frames the cycle may have; 0: none.
+        most_alone: frames beside the cycle, at the most (one if there is none).
+    """
+    first_uid = 0
     shortest = draw(st.sampled_from([4, 6, 8, 8, 8, 20, 70]))
     naming = draw(_naming(shortest))
-    n_members = draw(st.sampled_from([0, 0, 2, 2, 3, 5]))
-    n_frames = n_members + draw(st.integers(0 if n_members else 1, 2))
+    n_members = draw(st.sampled_from(members))
+    n_frames = n_members + draw(st.integers(0 if n_members else 1, max(most_alone, not n_members)))
     of_member = draw(st.integers(1, 3))
     n_channels = max(1, of_member * max(1, n_members))
     has_counter = bool(n_members) and draw(st.booleans())
@@ -307,7 +317,7 @@ def bus_designs(draw: st.DrawFn, dtype: str, first_uid: int = 0) -> BusDesign:
 @st.composite
 def skins(draw: st.DrawFn) -> SkinDesign:
     """One to three buses; one of them may be like the one before, or have no layout yet."""
-    dtype = draw(st.sampled_from(["u1", "<i2", "<u2", "<i4", "<f4"]))
+    dtype = draw(st.sampled_from(DTYPES))
     buses = [draw(bus_designs(dtype))]
     for _ in range(draw(st.sampled_from([0, 0, 1, 2]))):
         what = draw(st.sampled_from(["another", "alike", "unknown"]))
@@ -318,3 +328,34 @@ def skins(draw: st.DrawFn) -> SkinDesign:
         else:
             buses.append(BusDesign(None, [], buses[0].period_s))
     return SkinDesign(buses, dtype)
+
+
+@st.composite
+def plain_skins(draw: st.DrawFn) -> SkinDesign:
+    """One to four patches of modules with one value, on one bus or two: what matters is when they send."""
+    frame = Frame("data", [Identifier(0x100, 0x700)], [8], Values(0, "u1", 1), Bits(4, 4), Bits(0, 4))
+    period_s = draw(st.sampled_from([0.02, 0.005]))
+    buses = []
+    for _ in range(draw(st.integers(1, 2))):
+        patches = []
+        for key in range(draw(st.integers(1, 3))):
+            modules = [
+                Module(taxels(1, first_uid=16 * key + module), module) for module in range(draw(st.integers(1, 6)))
+            ]
+            patches.append(Patch(f"patch {key}", modules, key))
+        buses.append(BusDesign(Layout([frame]), patches, period_s))
+    return SkinDesign(buses, "u1")
+
+
+@st.composite
+def cycled_skins(draw: st.DrawFn) -> SkinDesign:
+    """One bus of patches that send cycles, and hardly anything else."""
+    dtype = draw(st.sampled_from(DTYPES))
+    return SkinDesign([draw(bus_designs(dtype, members=(2, 2, 3, 4, 5), most_alone=1))], dtype)
+
+
+@st.composite
+def skins_of_frames(draw: st.DrawFn) -> SkinDesign:
+    """One bus without cycles: what matters is what is in the frames."""
+    dtype = draw(st.sampled_from(DTYPES))
+    return SkinDesign([draw(bus_designs(dtype, members=(0,), most_alone=3))], dtype)

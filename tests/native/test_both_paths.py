@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
-from hypothesis import HealthCheck, Phase, event, given, settings
+from hypothesis import HealthCheck, Phase, assume, event, given, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.testing.clock import HandClock
 from tests.native.pair import Pair, Publishing, hand_clock, needs_native
-from tests.native.skins import SkinDesign, skins
-from tests.native.traffic import Event, Player, scripts
+from tests.native.skins import SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
+from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
 
 pytestmark = [needs_native, pytest.mark.timeout(600)]  # a failure takes long to shrink
 EXAMPLES = int(os.environ.get("SKINWARE_EXAMPLES", "0"))
@@ -45,12 +47,59 @@ def clock() -> Iterator[HandClock]:
         yield clock
 
 
+@contextmanager
+def playing(clock: HandClock, design: SkinDesign, publishing: Publishing) -> Iterator[Player]:
+    """Both paths for such a skin, and who feeds them; where numpy alone can do it, there is nothing to compare."""
+    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing) as pair:
+        event(pair.why_not or "both")
+        assume(not pair.why_not)
+        yield Player(design, pair)
+        event(f"{min(pair.frames, 10)} frames or more")
+
+
 @examples(150)
 @given(design=skins(), publishing=publishings, script=scripts)
 def test_whatever_comes(clock: HandClock, design: SkinDesign, publishing: Publishing, script: Sequence[Event]) -> None:
-    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing) as pair:
-        event(pair.why_not or "both")
-        if pair.why_not:
-            return
-        Player(design, pair).play(script)
-        event(f"{min(pair.frames, 10)} frames or more")
+    with playing(clock, design, publishing) as player:
+        player.play(script)
+
+
+@examples(100)
+@given(
+    design=plain_skins(),
+    publishing=publishings,
+    senders=senders,
+    cuts=st.lists(st.sampled_from([7, 1, 2, 3, 12, 30, 100]), min_size=1, max_size=6),
+    is_watched=st.booleans(),
+)
+def test_bursts(
+    clock: HandClock,
+    design: SkinDesign,
+    publishing: Publishing,
+    senders: Sequence[Sender],
+    cuts: Sequence[int],
+    is_watched: bool,
+) -> None:
+    with playing(clock, design, replace(publishing, period_s=design.periods_s[0])) as player:
+        player.play_senders(senders, cuts, is_watched)
+
+
+@examples(100)
+@given(
+    design=cycled_skins(),
+    publishing=publishings,
+    senders=senders,
+    cuts=st.lists(st.sampled_from([7, 1, 2, 3, 12, 30, 100]), min_size=1, max_size=6),
+)
+def test_cycles(
+    clock: HandClock, design: SkinDesign, publishing: Publishing, senders: Sequence[Sender], cuts: Sequence[int]
+) -> None:
+    with playing(clock, design, replace(publishing, period_s=design.periods_s[0])) as player:
+        player.play_senders(senders, cuts, is_watched=True)
+
+
+@examples(100)
+@given(design=skins_of_frames())
+def test_values_and_flags(clock: HandClock, design: SkinDesign) -> None:
+    with playing(clock, design, Publishing()) as player:
+        player.play([event for value in range(24) for event in (Burst(value=value), Digest(), Pass())])

@@ -6,8 +6,9 @@ on their own.
 
 from __future__ import annotations
 
+import itertools
 import random
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +23,7 @@ from tests.native.skins import SkinDesign
 Wire = tuple[int, int, int, bytes]
 """Bus, time_ns, identifier, payload."""
 _ARRIVAL_NS = 50_000
+_PATTERNS = (b"\0", b"\xff", b"\x01\x00\xa0\x7f", b"\x7f\xa0\x00\x01", b"\x00\x00\xc0\xff", b"\x80")
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,25 @@ class Happen:
     patch: int = 0
 
 
+@dataclass(frozen=True)
+class Sender:
+    """A patch that sends bursts by a clock of its own; times are thousandths of the nominal period.
+
+    Attributes:
+        phase: when the first begins.
+        period: from one to the next.
+        length: from the first frame of one to its last.
+        lost: frames that never come, counted from the first of all.
+        stalls: (frame, how long it and all after it are held up) each; then it catches up.
+    """
+
+    phase: int = 0
+    period: int = 1000
+    length: int = 300
+    lost: Sequence[int] = ()
+    stalls: Sequence[tuple[int, int]] = ()
+
+
 Event = Burst | Stray | Digest | Pass | Happen
 
 FAULTS = (
@@ -123,6 +144,21 @@ _events = st.one_of(
     st.builds(Happen, st.sampled_from(["ask", "ask", "restart", "suspect", "calm"]), st.integers(0, 5)),
 )
 scripts = st.lists(_events, min_size=1, max_size=30)
+_places = st.integers(0, 150)
+senders = st.lists(
+    st.builds(
+        Sender,
+        phase=st.integers(0, 1000),
+        period=st.sampled_from([1000, 970, 1030, 500, 2000, 250, 90]),
+        length=st.sampled_from([300, 0, 10, 600, 850, 1500]),
+        lost=st.lists(_places, max_size=6),
+        stalls=st.lists(st.tuples(_places, st.sampled_from([100, 400, 900, 1000, 1100, 3000])), max_size=2),
+    ),
+    min_size=1,
+    max_size=4,
+)
+BURSTS, _PACE_NS = 10, 20_000
+"""That each sender sends; and the time between two frames of one that catches up."""
 
 
 @dataclass
@@ -169,6 +205,45 @@ class Player:
                     self._happen(event)
         self._digest()
         self._pass(Pass(400))
+
+    def play_senders(self, senders: Sequence[Sender], cuts: Sequence[int], is_watched: bool) -> None:
+        """What patches send, each by its own clock, in batches.
+
+        Args:
+            senders: in the order of the patches; more or less of them than there are patches.
+            cuts: frames of a batch, over and over.
+            is_watched: what is due between two batches is published then.
+        """
+        stream = [
+            wire
+            for (bus, layout, patch), sender in zip(self._patches, itertools.cycle(senders), strict=False)
+            for wire in self._sent_by(sender, bus, layout, patch)
+        ]
+        stream.sort(key=lambda wire: wire[1])
+        sizes = itertools.cycle(cuts)
+        while stream:
+            size = next(sizes)
+            self._waiting, stream = stream[:size], stream[size:]
+            while is_watched and self.pair.deadline_ns < self._waiting[0][1]:
+                self.pair.clock.now_ns = max(self.pair.clock.now_ns, self.pair.deadline_ns)
+                self.pair.publish_if_due()
+            self._digest()
+        self._pass(Pass(400))
+
+    def _sent_by(self, sender: Sender, bus: int, layout: Layout, patch: Patch) -> Iterator[Wire]:
+        sent = [(module.key, frame) for module in patch.modules for frame in layout.frames]
+        held_ns = before_ns = 0
+        for burst in range(BURSTS):
+            for place, (key, frame) in enumerate(sent):
+                number = burst * len(sent) + place
+                due = sender.phase + burst * sender.period + sender.length * place // len(sent)
+                due_ns = self._stamp_ns + due * self._period_ns // 1000
+                for _, length in (stall for stall in sender.stalls if stall[0] == number):
+                    held_ns = due_ns + length * self._period_ns // 1000
+                before_ns = max(due_ns, held_ns, before_ns + _PACE_NS)
+                payload = self._payload(layout, frame, patch.key, key, Burst(value=burst + 2), place, ())
+                if number not in sender.lost and payload is not None:
+                    yield bus, before_ns, identifier_of(frame, patch.key, key), payload
 
     def _digest(self, interrupted: Sequence[int] = ()) -> None:
         clock = self.pair.clock
@@ -303,7 +378,7 @@ def put_bits(payload: bytearray, bits: Bits, key: int) -> None:
 
 
 def _bytes(value: int, count: int) -> bytes:
-    """So many bytes, the same for the same value; 0 and 1: all bits 0 and 1."""
-    if value < 2:
-        return bytes([0xFF * value]) * count
+    """So many bytes, the same for the same value; the first few are what does not come by chance."""
+    if value < len(_PATTERNS):
+        return (_PATTERNS[value] * count)[:count]
     return random.Random(value).randbytes(count)

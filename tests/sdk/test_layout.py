@@ -197,6 +197,13 @@ def test_a_frame_of_a_wrong_length_or_an_unknown_module_is_counted_once(
     assert tuple(decoder.state.bus_counters[0, :3].tolist()) == counted
 
 
+def test_a_frame_longer_than_all_that_are_right_fits_into_its_row() -> None:
+    """Rows have multiples of 8 bytes."""
+    layout = one(Values(0, "u1", 1), length=257)
+    decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, bytes(n)) for n in (257, 258, layout.payload_size)])
+    assert decoder.state.bus_counters[0, 1] == 2
+
+
 def test_sentinels_and_flags() -> None:
     flags = [
         Sentinel(Status.NOT_CONNECTED, 0xFFFF),

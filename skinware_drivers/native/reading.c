@@ -104,12 +104,14 @@ static void read_run(const struct run *run, const uint8_t *payload, uint8_t *val
         return;
     }
     for (int64_t i = 0; i < run->count; i++) {
+        const uint8_t *at = payload + run->offset + i * (run->type == PACKED ? 0 : bytes_of_type[run->type]);
         if (run->type == PACKED)
             store(values + i * size, to, (struct value){.integer = unpack(payload, run, i)}, I8);
-        else {
-            const uint8_t *at = payload + run->offset + i * bytes_of_type[run->type];
+        else if (run->type == to) { /* as it is: a double would make a quiet NaN of a signaling one */
+            uint64_t word = read_word(at, to, run->is_swapped);
+            memcpy(values + i * size, &word, (size_t)size);
+        } else
             store(values + i * size, to, read_value(at, run->type, run->is_swapped), run->type);
-        }
     }
 }
 

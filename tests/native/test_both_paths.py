@@ -11,9 +11,11 @@ import pytest
 from hypothesis import HealthCheck, Phase, assume, event, given, settings
 from hypothesis import strategies as st
 
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.testing.clock import HandClock
 from tests.native.pair import Pair, Publishing, hand_clock, needs_native
-from tests.native.skins import SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
+from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
 from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
 
 pytestmark = [needs_native, pytest.mark.timeout(600)]  # a failure takes long to shrink
@@ -103,3 +105,13 @@ def test_cycles(
 def test_values_and_flags(clock: HandClock, design: SkinDesign) -> None:
     with playing(clock, design, Publishing()) as player:
         player.play([event for value in range(24) for event in (Burst(value=value), Digest(), Pass())])
+
+
+def test_signaling_nans_stay_what_they_are(clock: HandClock) -> None:
+    raw = bytes.fromhex("7FA00001")
+    values = [Values(0, ">f4", 1), Values(4, "<f4", 1, to=[1])]
+    layout = Layout([Frame("data", [Identifier(0x100)], [8], values)])
+    design = SkinDesign([BusDesign(layout, [Patch("p", [Module(taxels(2))])], 0.02)], "<f4")
+    with Pair(clock, design.layouts, design.tables(), design.periods_s) as pair:
+        pair.feed([(0, clock.now_ns, 0x100, raw + raw[::-1])])
+        assert pair.native.decoder.state.values.tobytes() == 2 * raw[::-1]

@@ -328,18 +328,6 @@ class Pair:
 
         self.do(take)
 
-    def feed_rows(self, wire: npt.NDArray[Any], time_ns: npt.NDArray[np.int64], bus: npt.NDArray[np.uint16]) -> None:
-        """A batch of rows as buses write them."""
-
-        def take(way: Way) -> None:
-            way.empty()
-            rows = slice(way.batch.stop, way.batch.stop + len(wire))
-            way.batch.wire[rows], way.batch.time_ns[rows], way.batch.bus[rows] = wire, time_ns, bus
-            way.batch.stop = rows.stop
-            way.digest(())
-
-        self.do(take)
-
     def publish_if_due(self) -> None:
         self.do(lambda way: way.publish_if_due())
 

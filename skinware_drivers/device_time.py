@@ -158,7 +158,7 @@ class DeviceClock:
         """Keep the points of least delay, and put the line under them."""
         above = delay_ns - self._slope * device_ns
         parts = received // _PART_NS
-        edges = np.flatnonzero(np.diff(parts, prepend=-1))
+        edges = np.flatnonzero(np.diff(parts, prepend=parts[:1] - 1))
         for start, stop in zip(edges.tolist(), [*edges[1:].tolist(), len(parts)], strict=True):
             best = start + int(np.argmin(above[start:stop]))
             point = int(parts[start]), float(device_ns[best]), float(delay_ns[best])

@@ -307,8 +307,18 @@ def _check_frame(frame: Frame) -> None:
             raise refuse(f"byte {condition.offset} is not in every right payload")
     if frame.sequence is not None and frame.sequence.wrong(min(frame.length)):
         raise refuse(frame.sequence.wrong(min(frame.length)))
+    for flag in frame.flags:
+        if isinstance(flag, Flag) and not _has_bits(flag):
+            raise refuse(f"a flag's `mask` and `each` are bits of an unsigned word, not of {flag.dtype!r}: {flag}")
     if frame.time is not None and frame.time.end > min(frame.length):
         raise refuse("the device's time is not in every right payload")
+
+
+def _has_bits(flag: Flag) -> bool:
+    """Whether the word of a flag is unsigned, and has all the bits that are meant."""
+    word = np.dtype(flag.dtype)
+    bits = 8 * word.itemsize
+    return word.kind == "u" and 0 <= flag.mask < 1 << bits and all(0 <= shift < bits for _, shift in flag.each)
 
 
 def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+_MOST_BITS = 32
+"""Of a sequence number."""
+
 
 @dataclass(frozen=True)
 class SequenceNumber:
@@ -16,7 +19,7 @@ class SequenceNumber:
     Attributes:
         offset: first byte of the word that it is in.
         dtype: unsigned numpy dtype of that word, with byte order.
-        modulo: it wraps to 0 here; default: the range of its bits.
+        modulo: it wraps to 0 here, at most 2**32; default: the range of its bits.
         mask: the bits of the word that it is made of, side by side (``0xF0``: the upper half of a byte); default: all.
     """
 
@@ -54,9 +57,11 @@ class SequenceNumber:
         plain = self.bits >> self.shift if self.bits > 0 else 0
         if not plain or plain & (plain + 1) or self.bits >> 8 * np.dtype(self.dtype).itemsize:
             return f"mask {self.bits:#x} of the sequence number: give bits of a {self.dtype!r} that lie side by side"
-        return (
-            "" if 2 <= self.turn <= plain + 1 else f"modulo {self.modulo} of the sequence number: its bits do not fit"
-        )
+        if not 2 <= self.turn <= plain + 1:
+            return f"modulo {self.modulo} of the sequence number: its bits do not fit"
+        if self.turn > 1 << _MOST_BITS:
+            return f"the sequence number counts to more than {_MOST_BITS} bits: give its lowest as `mask`"
+        return ""
 
 
 @dataclass(frozen=True)

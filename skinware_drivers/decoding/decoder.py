@@ -94,8 +94,8 @@ class Decoder:
         by_payload = np.array([kind.module_by_byte is not None for kind in self.kinds], bool)
         self.payload_names: Flags = self.addresses.sets @ by_payload
         self._compile_assemblies(first_of)
-        longest = max((max(frame.length) for frame in self.frames), default=0)
-        self.length_ok = np.zeros((256, max(256, longest + 1)), bool)  # by kind; the last row: right for any frame
+        lengths = 1 + max((layout.payload_size for layout in self.layouts if layout is not None), default=0)
+        self.length_ok = np.zeros((256, max(256, lengths)), bool)  # by kind; the last row: right for any frame
         for kind, frame in enumerate(self.frames):
             self.length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self.header = self._compile_header()

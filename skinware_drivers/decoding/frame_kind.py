@@ -17,6 +17,7 @@ log: logging.Logger = logging.getLogger("skinware.driver.expand")
 Bytes = npt.NDArray[np.uint8]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
+Words = npt.NDArray[np.uint64]
 
 
 class FrameKind:
@@ -77,6 +78,10 @@ class FrameKind:
         Returns:
             (n, width) values; (n, width) bool, which of them the frames have; and the frames for which it raised.
         """
+        values = np.zeros((len(payload), len(self.channels)), self._dtype)
+        found, failed = np.zeros(values.shape, bool), []
+        if not len(payload):
+            return values, found, np.zeros(0, np.int64)
         try:
             values, found = self._expand(expand, payload, length)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever it stumbles over
@@ -93,14 +98,13 @@ class FrameKind:
         else:
             return values, found, np.zeros(0, np.int64)
         # the others need not suffer from it
-        nothing = np.zeros((1, len(self.channels)), np.uint8), np.zeros((1, len(self.channels)), bool)
-        each, failed = [nothing] * len(payload), []
         for row in range(len(payload)):
+            one = slice(row, row + 1)
             try:
-                each[row] = self._expand(expand, payload[row : row + 1], length[row : row + 1])
+                values[one], found[one] = self._expand(expand, payload[one], length[one])
             except (Exception, SystemExit):  # noqa: BLE001
                 failed.append(row)
-        return np.concatenate([v for v, _ in each]), np.concatenate([f for _, f in each]), np.array(failed, np.int64)
+        return values, found, np.array(failed, np.int64)
 
     def _expand(self, expand: Expand, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], Flags]:
         row, channel, value = expand.function(payload, length)
@@ -131,7 +135,7 @@ class FrameKind:
             columns: where this frame's values are among them.
             channels: (all,) channel of each of them.
         """
-        words: dict[tuple[int, str], tuple[Indices, npt.NDArray[np.uint32]]] = {}  # several flags share one
+        words: dict[tuple[int, str], tuple[Indices, Words]] = {}  # several flags share one
         for flag in self.frame.flags:
             if isinstance(flag, Sentinel):
                 hit = np.isnan(raw) if flag.value != flag.value else raw == flag.value
@@ -140,7 +144,8 @@ class FrameKind:
             if isinstance(flag, StatusBytes):
                 end = flag.offset + raw.shape[1]
                 rows = np.flatnonzero(length >= end)
-                status[rows, columns] |= payload[rows, flag.offset : end] & np.uint8(flag.mask)
+                if len(rows):  # else it may lie behind all payloads
+                    status[rows, columns] |= payload[rows, flag.offset : end] & np.uint8(flag.mask)
                 continue
             place = flag.offset, np.dtype(flag.dtype).str
             if place not in words:
@@ -158,23 +163,25 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
     return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
 
 
-def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, npt.NDArray[np.uint32]]:
+def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, Words]:
     """The frames in which a flag's word is there and not 0 (few, as a rule), and the word of each."""
     dtype = np.dtype(flag.dtype)
     end = flag.offset + dtype.itemsize
+    if end > payload.shape[1]:
+        return np.zeros(0, np.int64), np.zeros(0, np.uint64)
     word = np.ascontiguousarray(payload[:, flag.offset : end]).view(dtype)[:, 0]
     flagged = np.flatnonzero(word)
     if len(flagged):
         flagged = flagged[length[flagged] >= end]
-    return flagged, word[flagged].astype(np.uint32)
+    return flagged, word[flagged].astype(np.uint64)
 
 
-def _flag_bits(flag: Flag, flagged: Indices, word: npt.NDArray[np.uint32], status: Bytes, channels: Indices) -> None:
+def _flag_bits(flag: Flag, flagged: Indices, word: Words, status: Bytes, channels: Indices) -> None:
     bit = np.uint8(flag.status)
     if flag.mask:
-        status[flagged[(word & flag.mask) != 0]] |= bit
+        status[flagged[(word & np.uint64(flag.mask)) != 0]] |= bit
     for channel, shift in flag.each:
-        rows = flagged[np.flatnonzero(word >> shift & 1)]
+        rows = flagged[np.flatnonzero(word & np.uint64(1 << shift))]
         if len(rows):
             status[np.ix_(rows, np.flatnonzero(channels == channel))] |= bit
 

@@ -22,9 +22,9 @@ def read_numbers(payload: Bytes, sequence: SequenceNumber) -> Indices:
         sequence: where it is.
     """
     word = np.ascontiguousarray(payload[:, sequence.offset : sequence.end]).view(sequence.dtype)[:, 0]
-    plain = word.astype(np.int64)
     if sequence.mask is not None:
-        plain = (plain & sequence.mask) >> sequence.shift
+        word = (word & word.dtype.type(sequence.mask)) >> word.dtype.type(sequence.shift)
+    plain: Indices = word.astype(np.int64)
     return plain
 
 

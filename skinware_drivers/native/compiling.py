@@ -18,7 +18,6 @@ _PACKED = len(_TYPES)
 _ORDERS = ("given", "any", "ends_with")
 _SENTINEL, _STATUS_BYTES, _WORD = range(3)
 _MOST_MEMBERS = 32
-_LARGEST_TURN = 1 << 62
 
 
 def why_not(decoder: Decoder) -> str:
@@ -107,7 +106,7 @@ def _number(sequence: SequenceNumber | None) -> structs.Number:
     if sequence is None:
         return structs.Number()
     mask, shift = (-1, 0) if sequence.mask is None else (sequence.mask, sequence.shift)
-    return structs.Number(1, sequence.offset, *_type(sequence.dtype), mask, shift, min(sequence.turn, _LARGEST_TURN))
+    return structs.Number(1, sequence.offset, *_type(sequence.dtype), mask, shift, sequence.turn)
 
 
 def _form(form: Any, arrays: structs.Arrays) -> structs.Form:
@@ -183,14 +182,15 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
 def _sentinel(flag: Sentinel, values: np.dtype[Any]) -> structs.Flag:
     """Compared as numpy compares an array of ``values`` with the number."""
     found = structs.Flag(form=_SENTINEL, status=int(flag.status), is_possible=True)
+    value = flag.value.item() if isinstance(flag.value, np.generic) else flag.value
     if values.kind == "f":
-        found.real = float(values.type(flag.value))
-    elif isinstance(flag.value, float):
-        found.is_float, found.real = True, flag.value
+        found.real = float(values.type(value))
+    elif isinstance(value, float):
+        found.is_float, found.real = True, value
     else:
         limits = np.iinfo(values)
-        found.is_possible = limits.min <= flag.value <= limits.max
-        found.integer = flag.value if flag.value < 1 << 63 else flag.value - (1 << 64)
+        found.is_possible = limits.min <= value <= limits.max
+        found.integer = value if value < 1 << 63 else value - (1 << 64)
     return found
 
 

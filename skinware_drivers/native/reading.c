@@ -47,7 +47,7 @@ uint64_t read_word(const uint8_t *at, int64_t type, int64_t is_swapped)
 int64_t read_number(const uint8_t *payload, const struct number *number)
 {
     uint64_t word = read_word(payload + number->offset, number->type, number->is_swapped);
-    return (int64_t)(word & (uint64_t)number->mask) >> number->shift;
+    return (int64_t)((word & (uint64_t)number->mask) >> number->shift);
 }
 
 static struct value read_value(const uint8_t *at, int64_t type, int64_t is_swapped)
@@ -104,12 +104,14 @@ static void read_run(const struct run *run, const uint8_t *payload, uint8_t *val
         return;
     }
     for (int64_t i = 0; i < run->count; i++) {
+        const uint8_t *at = payload + run->offset + i * (run->type == PACKED ? 0 : bytes_of_type[run->type]);
         if (run->type == PACKED)
             store(values + i * size, to, (struct value){.integer = unpack(payload, run, i)}, I8);
-        else {
-            const uint8_t *at = payload + run->offset + i * bytes_of_type[run->type];
+        else if (run->type == to) { /* as it is: a double would make a quiet NaN of a signaling one */
+            uint64_t word = read_word(at, to, run->is_swapped);
+            memcpy(values + i * size, &word, (size_t)size);
+        } else
             store(values + i * size, to, read_value(at, run->type, run->is_swapped), run->type);
-        }
     }
 }
 
@@ -149,14 +151,13 @@ static void flag_word(const struct path *path, const struct assembly *assembly, 
     int64_t width = path->plan->width;
     if (length < flag->offset + bytes_of_type[flag->type])
         return;
-    uint64_t whole = read_word(payload + flag->offset, flag->type, flag->is_swapped);
-    uint32_t word = (uint32_t)whole;
-    if (!whole)
+    uint64_t word = read_word(payload + flag->offset, flag->type, flag->is_swapped);
+    if (!word)
         return;
-    for (int64_t i = 0; word & (uint32_t)flag->mask && i < width; i++)
+    for (int64_t i = 0; word & (uint64_t)flag->mask && i < width; i++)
         status[i] |= (uint8_t)flag->status;
     for (const struct channel_bit *each = flag->each; each < flag->each + flag->n_each; each++) {
-        if (each->shift > 31 || !(word >> each->shift & 1))
+        if (!(word >> each->shift & 1))
             continue;
         for (int64_t i = 0; i < width; i++)
             if (assembly->channels[i] == each->channel)
@@ -281,7 +282,7 @@ void compare_sequence(struct path *path, const struct number *sequence, int64_t 
     const struct plan *plan = path->plan;
     int64_t module = path->entry[row], number = read_number(payload_of(path->batch, row), sequence);
     int64_t before = plan->last_sequence[module];
-    int64_t step = before == -1 ? 1 : floor_mod(number - before, sequence->turn);
+    int64_t step = before == -1 ? 1 : floor_mod((int64_t)((uint64_t)number - (uint64_t)before), sequence->turn);
     int64_t *counters = plan->patch_counters + plan->module_patch[module] * N_PATCH_COUNTERS;
     bool is_back = step > sequence->turn / 2;
     plan->last_sequence[module] = number;

@@ -77,7 +77,7 @@ class Publisher:
         self.watch = watch
         self.period_ns = round(period_s * NS_PER_S)
         self.by_cycle = by_cycle
-        self._desk, self.on_request = desk, on_request
+        self._desk, self.on_request = desk, on_request and desk is not None
         self.most_at_once = most_at_once
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
         self.patience_ns = self.period_ns * 3 // 2
@@ -178,7 +178,7 @@ class Publisher:
         self._last_published_ns = time_ns
 
     def _wanted(self, time_ns: int) -> bool:
-        if self._desk is None or not self.on_request or not self._writer.sequence:
+        if not self.on_request or not self._writer.sequence:
             return True
         return self.wanted_ns <= self._oldest_new_ns(time_ns)
 
@@ -243,7 +243,7 @@ class Publisher:
 
     def _show(self, updates: Updates) -> None:
         self._state.show(updates)
-        if updates.flagged:
+        if updates.flagged and updates.status.any():  # not only others of the same batch
             self.look(updates)
 
     def look(self, updates: Updates) -> None:

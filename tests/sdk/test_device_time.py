@@ -181,6 +181,11 @@ def test_what_was_held_up_for_long_has_the_time_at_which_it_was_stamped(held_up_
     assert abs(error[1500:] - 200_000).max() < 300_000
 
 
+def test_frames_from_before_this_machine_booted() -> None:
+    received = [-MS, 0, 2 * S]
+    assert DeviceClock(1e-6).convert([5, 1005, 2_001_005], received).tolist() == received
+
+
 def test_nothing_gives_nothing() -> None:
     assert DeviceClock(1e-3).convert([], []).tolist() == []
     assert DeviceClock(1e-3).convert([5], [123]).tolist() == [123]

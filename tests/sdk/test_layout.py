@@ -197,6 +197,13 @@ def test_a_frame_of_a_wrong_length_or_an_unknown_module_is_counted_once(
     assert tuple(decoder.state.bus_counters[0, :3].tolist()) == counted
 
 
+def test_a_frame_longer_than_all_that_are_right_fits_into_its_row() -> None:
+    """Rows have multiples of 8 bytes."""
+    layout = one(Values(0, "u1", 1), length=257)
+    decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, bytes(n)) for n in (257, 258, layout.payload_size)])
+    assert decoder.state.bus_counters[0, 1] == 2
+
+
 def test_sentinels_and_flags() -> None:
     flags = [
         Sentinel(Status.NOT_CONNECTED, 0xFFFF),
@@ -214,6 +221,15 @@ def test_sentinels_and_flags() -> None:
     assert decoder.state.status.tolist() == [int(Status.NOT_CONNECTED), 0]
 
 
+def test_flags_in_the_upper_half_of_a_long_word() -> None:
+    flags = [Flag(Status.NO_ACK, 0, "<u8", mask=1 << 63), Flag(Status.MASKED, 0, "<u8", each=[(1, 40)])]
+    layout, modules = one(Values(0, "u1", 2), flags=flags), [Module(taxels(2))]
+    highest = decode(layout, modules, "u1", [(0x100, (1 << 63).to_bytes(8, "little"))])
+    assert highest.state.status.tolist() == [Status.NO_ACK, Status.NO_ACK]
+    other = decode(layout, modules, "u1", [(0x100, (1 << 40).to_bytes(8, "little"))])
+    assert other.state.status.tolist() == [0, Status.MASKED]
+
+
 def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
     mask = Status.NO_ACK | Status.SUSPECT
     frame = Frame("d", [Identifier(0x100)], (2, 4), Values(0, "u1", 2, to=(1, 0)), flags=[StatusBytes(2, mask)])
@@ -223,6 +239,26 @@ def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
     assert decoder.state.values.tolist() == [6, 5]
     decoder = decode(Layout([frame]), modules, "u1", [(0x100, bytes((5, 6, 0xF7, 0x08))), (0x100, bytes((7, 8)))])
     assert decoder.state.status.tolist() == [0, 0]
+
+
+def test_flags_behind_all_payloads_are_never_set() -> None:
+    flags = [Flag(Status.NO_ACK, 8, "<u2", mask=0xFFFF), StatusBytes(7, mask=Status.MASKED)]
+    decoder = decode(one(Values(0, "u1", 2), flags=flags), [Module(taxels(2))], "u1", [(0x100, bytes([255] * 8))])
+    assert decoder.state.values.tolist() == [255, 255]
+    assert not decoder.state.status.any()
+
+
+@pytest.mark.parametrize(
+    "sequence", [SequenceNumber(0, "<u8", mask=0xFFFF_FFFF << 32), SequenceNumber(0, "<u8", modulo=1000)]
+)
+def test_sequence_numbers_in_long_words(sequence: SequenceNumber) -> None:
+    sent = [(0x100, (number << sequence.shift).to_bytes(8, "little")) for number in (997, 998, 1, 1)]
+    decoder = decode(one(Values(0, "u1", 1), sequence=sequence), [Module(taxels(1))], "u1", sent)
+    lost, repeated, back = (
+        decoder.state.patch_counters[0, PATCH_COUNTERS.index(f"sequence_{what}")]
+        for what in ("lost", "repeated", "back")
+    )
+    assert (lost, repeated, back) == ((2, 1, 0) if sequence.modulo else (0, 1, 1))
 
 
 def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
@@ -300,6 +336,25 @@ def test_an_expand_that_raises_costs_the_frames_for_which_it_does(caplog: pytest
     assert "test_layout.py:" in told.getMessage()
 
 
+def test_an_expand_is_not_asked_about_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Half a cycle that never became whole leaves no frame to expand."""
+
+    def needs_a_frame(payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]) -> Expanded:
+        row = np.arange(len(payload))
+        return row, row * 0, payload[:, int(length.max()) - 1]
+
+    layout = Layout(
+        [
+            Frame("expanded", [Identifier(0x100)], [8], Expand(needs_a_frame)),
+            Frame("beside", [Identifier(0x101)], [8], Values(0, "u1", 1, to=[1])),
+        ],
+        Cycle(["expanded", "beside"], 0.01),
+    )
+    decoder = decode(layout, [Module(taxels(2))], "u1", [(0x101, bytes(8))])
+    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 1
+    assert not caplog.records
+
+
 def test_half_a_cycle_that_cannot_be_expanded_shows_nothing() -> None:
     layout = Layout(
         [
@@ -360,6 +415,10 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
         (lambda: one(Values(0, "u1", 1), sequence=SequenceNumber(7, "<u2")), "sequence number is not in every"),
         (lambda: Layout([Frame("f", [Byte(9, 1)], (8,), Values(0, "u1", 1))]), "byte 9 is not in every"),
+        (lambda: one(Values(0, "u1", 1), sequence=SequenceNumber(0, "<u8")), "to more than 32 bits"),
+        (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", mask=0x100)]), "bits of an unsigned word"),
+        (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", each=[(0, 8)])]), "bits of an unsigned"),
+        (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "<i2", mask=1)]), "unsigned word, not of '<i2'"),
     ],
 )
 def test_layouts_that_cannot_be_decoded_are_refused(make: Any, words: str) -> None:

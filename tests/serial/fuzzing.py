@@ -6,6 +6,9 @@ frames, bytes that are no frames.
 
 from __future__ import annotations
 
+import random
+from collections.abc import Sequence
+
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framing
@@ -38,6 +41,26 @@ class Script:
         taken = self._data[self._at : self._at + count]
         self._at += count
         return taken.ljust(count, b"\0")
+
+
+def changed(inputs: Sequence[bytes], rng: random.Random, longest: int) -> bytes:
+    """One input with parts of others and of itself, flipped bits and random bytes."""
+    data = bytearray(rng.choice(inputs))
+    for _ in range(rng.randint(1, 6)):
+        at = rng.randint(0, len(data))
+        what = rng.randrange(5)
+        if what == 0 and data:
+            data[at % len(data)] ^= 1 << rng.randrange(8)
+        elif what == 1:
+            data[at:at] = rng.randbytes(rng.randint(1, 16))
+        elif what == 2:
+            del data[at : at + rng.randint(1, 16)]
+        elif what == 3:
+            data[at:at] = data[rng.randint(0, len(data)) :][:64]
+        else:
+            other = rng.choice(inputs)
+            data[at:] = other[rng.randint(0, len(other)) :]
+    return bytes(data[:longest])
 
 
 def run(example: Example, data: bytes) -> None:

@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 
 from tests.serial.framings import EXAMPLES
-from tests.serial.fuzzing import examples_of_drivers, run
+from tests.serial.fuzzing import changed, examples_of_drivers, run
 
 SEEDS = Path(__file__).parent / "seeds"
 NAMES = sorted(path.stem for path in SEEDS.iterdir())
@@ -20,26 +20,6 @@ LONGEST = 600
 
 def seeds_of(name: str) -> list[bytes]:
     return [bytes.fromhex(line) for line in (SEEDS / f"{name}.hex").read_text().split()]
-
-
-def changed(inputs: list[bytes], rng: random.Random) -> bytes:
-    """One input with parts of others and of itself, flipped bits and random bytes."""
-    data = bytearray(rng.choice(inputs))
-    for _ in range(rng.randint(1, 6)):
-        at = rng.randint(0, len(data))
-        what = rng.randrange(5)
-        if what == 0 and data:
-            data[at % len(data)] ^= 1 << rng.randrange(8)
-        elif what == 1:
-            data[at:at] = rng.randbytes(rng.randint(1, 16))
-        elif what == 2:
-            del data[at : at + rng.randint(1, 16)]
-        elif what == 3:
-            data[at:at] = data[rng.randint(0, len(data)) :][:64]
-        else:
-            other = rng.choice(inputs)
-            data[at:] = other[rng.randint(0, len(other)) :]
-    return bytes(data[:LONGEST])
 
 
 def test_every_framing_has_seeds() -> None:
@@ -52,7 +32,7 @@ def test_seeds_and_what_comes_of_them() -> None:
     known = {**EXAMPLES, **examples_of_drivers()}
     for name in NAMES:
         inputs, rng = seeds_of(name), random.Random(1)
-        for data in [*inputs, *(changed(inputs, rng) for _ in range(N_CHANGED))]:
+        for data in [*inputs, *(changed(inputs, rng, LONGEST) for _ in range(N_CHANGED))]:
             try:
                 run(known[name], data)
             except BaseException as error:

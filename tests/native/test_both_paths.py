@@ -1,0 +1,117 @@
+"""The data path in C does what numpy does, whatever a layout says and whatever comes over the wire."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, Phase, assume, event, given, settings
+from hypothesis import strategies as st
+
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.testing.clock import HandClock
+from tests.native.pair import Pair, Publishing, hand_clock, needs_native
+from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
+from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
+
+pytestmark = [needs_native, pytest.mark.timeout(600)]  # a failure takes long to shrink
+EXAMPLES = int(os.environ.get("SKINWARE_EXAMPLES", "0"))
+"""Of each test here; 0: few, and the same each time."""
+
+publishings = st.builds(
+    Publishing,
+    period_s=st.sampled_from([0.02, 0.005, 0.1]),
+    by_cycle=st.sampled_from([True, True, True, False]),
+    on_request=st.sampled_from([False, False, False, True]),
+    slots=st.sampled_from([8, 2, 3, 64]),
+    has_desk=st.booleans(),
+)
+
+
+def examples(few: int) -> settings:
+    return settings(
+        max_examples=EXAMPLES or few,
+        derandomize=not EXAMPLES,
+        suppress_health_check=list(HealthCheck),
+        phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
+        report_multiple_bugs=False,
+        deadline=None,
+    )
+
+
+@pytest.fixture(scope="module")
+def clock() -> Iterator[HandClock]:
+    with hand_clock() as clock:
+        yield clock
+
+
+@contextmanager
+def playing(clock: HandClock, design: SkinDesign, publishing: Publishing) -> Iterator[Player]:
+    """Both paths for such a skin, and who feeds them; where numpy alone can do it, there is nothing to compare."""
+    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing) as pair:
+        event(pair.why_not or "both")
+        assume(not pair.why_not)
+        yield Player(design, pair)
+        event(f"{min(pair.frames, 10)} frames or more")
+
+
+@examples(150)
+@given(design=skins(), publishing=publishings, script=scripts)
+def test_whatever_comes(clock: HandClock, design: SkinDesign, publishing: Publishing, script: Sequence[Event]) -> None:
+    with playing(clock, design, publishing) as player:
+        player.play(script)
+
+
+@examples(100)
+@given(
+    design=plain_skins(),
+    publishing=publishings,
+    senders=senders,
+    cuts=st.lists(st.sampled_from([7, 1, 2, 3, 12, 30, 100]), min_size=1, max_size=6),
+    is_watched=st.booleans(),
+)
+def test_bursts(
+    clock: HandClock,
+    design: SkinDesign,
+    publishing: Publishing,
+    senders: Sequence[Sender],
+    cuts: Sequence[int],
+    is_watched: bool,
+) -> None:
+    with playing(clock, design, replace(publishing, period_s=design.periods_s[0])) as player:
+        player.play_senders(senders, cuts, is_watched)
+
+
+@examples(100)
+@given(
+    design=cycled_skins(),
+    publishing=publishings,
+    senders=senders,
+    cuts=st.lists(st.sampled_from([7, 1, 2, 3, 12, 30, 100]), min_size=1, max_size=6),
+)
+def test_cycles(
+    clock: HandClock, design: SkinDesign, publishing: Publishing, senders: Sequence[Sender], cuts: Sequence[int]
+) -> None:
+    with playing(clock, design, replace(publishing, period_s=design.periods_s[0])) as player:
+        player.play_senders(senders, cuts, is_watched=True)
+
+
+@examples(100)
+@given(design=skins_of_frames())
+def test_values_and_flags(clock: HandClock, design: SkinDesign) -> None:
+    with playing(clock, design, Publishing()) as player:
+        player.play([event for value in range(24) for event in (Burst(value=value), Digest(), Pass())])
+
+
+def test_signaling_nans_stay_what_they_are(clock: HandClock) -> None:
+    raw = bytes.fromhex("7FA00001")
+    values = [Values(0, ">f4", 1), Values(4, "<f4", 1, to=[1])]
+    layout = Layout([Frame("data", [Identifier(0x100)], [8], values)])
+    design = SkinDesign([BusDesign(layout, [Patch("p", [Module(taxels(2))])], 0.02)], "<f4")
+    with Pair(clock, design.layouts, design.tables(), design.periods_s) as pair:
+        pair.feed([(0, clock.now_ns, 0x100, raw + raw[::-1])])
+        assert pair.native.decoder.state.values.tobytes() == 2 * raw[::-1]

@@ -181,6 +181,7 @@ class KernelSource(NamedTuple):
         lost_before: frames that were lost before the socket was opened.
         is_counted: count bits on the wire.
         speed_up: by how much the payload of CAN FD frames that switch is faster.
+        is_small: the receive buffer is full after a few frames.
     """
 
     fd: int
@@ -191,6 +192,7 @@ class KernelSource(NamedTuple):
     lost_before: int
     is_counted: bool
     speed_up: float
+    is_small: bool
 
 
 class Received(NamedTuple):

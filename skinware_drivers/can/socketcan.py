@@ -58,6 +58,8 @@ MOST_FILTERS = 512
 """``CAN_RAW_FILTER_MAX`` of linux/can/raw.h."""
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
+_SMALL_BUFFER = 1 << 17  # it may be full before so many frames wait that C asks for losses
+
 WANTED_BUFFER_BYTES = 8 << 20
 """Receive buffer that is asked for: about 10,900 frames, 1.3 s of a full 1 Mbit/s bus."""
 
@@ -253,6 +255,7 @@ class SocketCanBus(Bus):
             self._lost_before,
             self.bit_rate > 0,
             self._speed_up,
+            self.granted_buffer < _SMALL_BUFFER,
         )
 
     def take_back(self, received: Received) -> None:

@@ -6,7 +6,7 @@
 #include <sys/epoll.h>
 #include <time.h>
 
-enum { TURNS = 8, MOST_EVENTS = 64 };
+enum { TURNS = 8, MOST_EVENTS = 64, FEW = 4 };
 #define TURN_NS INT64_C(20000000)
 
 enum taken { NOTHING, ALL, SOME };
@@ -25,23 +25,44 @@ static struct source *source_of(const struct flow *flow, int fd)
     return NULL;
 }
 
-/* Fill the batch from buses that have something, each with its share; whether one of them has more. */
-static bool fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns)
+/* Fill the batch from buses, each with its share; how many of them had something, and whether one has more. */
+static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns, bool *is_behind)
 {
     struct batch *batch = path->batch;
-    bool is_behind = false, is_news = false;
+    int64_t n_heard = 0;
+    bool is_news = false;
     batch->stop = batch->headroom;
+    *is_behind = false;
     for (int64_t i = 0; i < n; i++) {
         batch->limit = batch->stop + (batch->capacity - batch->stop) / (n - i);
-        if (!receive(path, ready[i]))
+        if (ready[i]->fd < 0 || !receive(path, ready[i]))
             continue;
+        n_heard++;
         ready[i]->heard_ns = time_ns;
-        is_behind |= batch->stop == batch->limit;
+        *is_behind |= batch->stop == batch->limit;
         is_news |= ready[i]->is_watched;
     }
     if (is_news && path->plan->hooks.heard)
         path->plan->hooks.heard();
-    return is_behind;
+    return n_heard;
+}
+
+/* The buses that have something, -1: Python has to read one of them. Of a few, all are asked without a look before. */
+static int64_t find_ready(struct flow *flow, struct source **ready)
+{
+    struct epoll_event events[MOST_EVENTS];
+    if (flow->n_sources <= FEW) {
+        for (int64_t i = 0; i < flow->n_sources; i++)
+            ready[i] = &flow->sources[i];
+        return flow->n_sources;
+    }
+    int n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
+    for (int i = 0; i < n; i++) {
+        ready[i] = source_of(flow, events[i].data.fd);
+        if (!ready[i])
+            return -1;
+    }
+    return n;
 }
 
 /* Take what has arrived. OTHER: a bus that Python has to read has something. */
@@ -49,22 +70,16 @@ static enum taken take(struct path *path, struct flow *flow, bool *is_other)
 {
     int64_t begun_ns = path_time_ns(path);
     for (int turn = 0; turn < TURNS; turn++) {
-        struct epoll_event events[MOST_EVENTS];
         struct source *ready[MOST_EVENTS];
-        int64_t time_ns = path_time_ns(path);
+        int64_t time_ns = path_time_ns(path), n;
+        bool is_behind;
         if (time_ns - begun_ns > TURN_NS)
             return SOME;
-        int n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
-        if (n <= 0)
-            return turn ? ALL : NOTHING;
-        for (int i = 0; i < n; i++) {
-            ready[i] = source_of(flow, events[i].data.fd);
-            *is_other |= !ready[i];
-        }
-        if (*is_other)
+        n = find_ready(flow, ready);
+        *is_other |= n < 0;
+        if (n <= 0 || !fill(path, ready, n, time_ns, &is_behind))
             return turn ? ALL : NOTHING;
         flow->takes++;
-        bool is_behind = fill(path, ready, n, time_ns);
         decode_batch(path);
         if (path->failed)
             return ALL;
@@ -73,6 +88,20 @@ static enum taken take(struct path *path, struct flow *flow, bool *is_other)
             return ALL;
     }
     return SOME;
+}
+
+/* Whether a bus has fallen silent that Python takes for a living one; if not, when that will be. */
+static bool is_any_silent(const struct flow *flow, int64_t time_ns, int64_t *until_ns)
+{
+    bool any = false;
+    for (const struct source *source = flow->sources; source < flow->sources + flow->n_sources; source++) {
+        if (source->fd < 0 || source->is_watched)
+            continue;
+        any |= time_ns - source->heard_ns > flow->silence_ns;
+        if (source->heard_ns + flow->silence_ns + 1 < *until_ns)
+            *until_ns = source->heard_ns + flow->silence_ns + 1;
+    }
+    return any;
 }
 
 static int64_t earlier(int64_t one, int64_t other)
@@ -122,6 +151,8 @@ SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
         }
         bool is_resting = time_ns < flow->rest_until_ns;
         int64_t until_ns = earlier(flow->until_ns, due_ns);
+        if (is_any_silent(flow, time_ns, &until_ns))
+            return NEWS;
         if (is_resting)
             until_ns = earlier(until_ns, flow->rest_until_ns);
         flow->wakes++;

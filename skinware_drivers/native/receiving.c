@@ -146,6 +146,8 @@ int64_t receive(struct path *path, struct source *source)
         if (source->is_counted)
             source->wire_bits += wire_bits(path, source, first, kept);
     }
-    read_memory(path, source);
+    /* frames are lost only where many wait, or the buffer is full after a few */
+    if (batch->stop - begin >= ROWS_AT_ONCE || batch->stop == batch->limit || source->is_small)
+        read_memory(path, source);
     return batch->stop - begin;
 }

@@ -194,7 +194,7 @@ class Source(ctypes.Structure):
 
     _fields_ = [
         *_fields("fd bus headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
-        *_fields("lost_column frames_column is_counted is_watched"),
+        *_fields("lost_column frames_column is_counted is_watched is_small"),
         *_fields("speed_up wire_bits fullest", _REAL),
     ]
 
@@ -203,7 +203,7 @@ class Flow(ctypes.Structure):
     """The loop that takes, publishes and rests."""
 
     _fields_ = [
-        *_fields("loop_fd epoll_fd until_ns latency_ns rest_until_ns n_sources"),
+        *_fields("loop_fd epoll_fd until_ns latency_ns rest_until_ns silence_ns n_sources"),
         *_fields("sources", _POINTER),
         *_fields("takes wakes"),
     ]

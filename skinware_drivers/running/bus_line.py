@@ -52,6 +52,7 @@ class BusLine:
         is_aside: the driver's own code failed on it, and has not succeeded since.
         aside: how long it is left alone then.
         lost: set while it is away.
+        needs_care: set when it was lost, or a patch on it does not deliver.
         suspects: keys of the patches that report errors.
         revived_ns: when one of its patches was last set up anew.
         set_up_ns: when all of it was last set up.
@@ -75,6 +76,7 @@ class BusLine:
         self.is_aside: bool = False
         self.aside: Backoff = Backoff(_FIRST_PAUSE_ASIDE_S, _LONGEST_PAUSE_ASIDE_S)
         self.lost: asyncio.Event = asyncio.Event()
+        self.needs_care: asyncio.Event = asyncio.Event()
         self.busy: asyncio.Lock = asyncio.Lock()
         self.suspects: set[int] = set()
         self.revived_ns = 0
@@ -124,6 +126,7 @@ class BusLine:
                 self._epoll.unregister(self.bus.fileno())
         self.bus.close()
         self.lost.set()
+        self.needs_care.set()
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
@@ -278,6 +281,7 @@ class BusLine:
         """
         self.patches = ()
         self.lost.set()
+        self.needs_care.set()
         if error is not None:
             self._is_away(error)
 

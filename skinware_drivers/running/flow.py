@@ -23,7 +23,7 @@ from skinware_drivers.running.guard import bus_failure
 from skinware_drivers.running.native_path import NativePath
 
 _NEVER_NS = (1 << 63) - 1
-_OTHER_BUS, _NO_MEMORY = 2, 4  # of flow.c
+_OTHER_BUS, _NEWS, _NO_MEMORY = range(2, 5)  # of flow.c
 _LATENCY_WHILE_ASKING_S, _LATENCY_IN_STEP_S = 5e-4, 5e-5
 """The longest rest while devices are asked, and while the answer alone is what comes before the next question."""
 _LOST, _FRAMES = OWN_BUS_COUNTERS.index("lost"), OWN_BUS_COUNTERS.index("frames")
@@ -93,6 +93,7 @@ class Flow:
         flow = self._flow
         flow.loop_fd = loop_fd
         flow.until_ns = _NEVER_NS if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        flow.silence_ns = max(NS_PER_S // 2, self._generation.publisher.silence_ns)
         flow.latency_ns = round(self._rest_s() * NS_PER_S)
         self._hand_over()
         self._generation.prepare_native()
@@ -107,6 +108,8 @@ class Flow:
             self._generation.interrupted()  # C knows of these
         if reason == _NO_MEMORY:
             self._fail(MemoryError("no memory for the updates of a driver"))
+        elif reason == _NEWS:
+            self._generation.update_bus_states()
         elif reason == _OTHER_BUS:
             asyncio.get_running_loop().call_soon(self._take)
 
@@ -130,6 +133,7 @@ class Flow:
             at.lost_before, at.lost, at.frames = source.lost_before, line.bus.counters.lost, 0
             at.lost_column, at.frames_column = _LOST, _FRAMES
             at.is_counted, at.speed_up, at.wire_bits, at.fullest = source.is_counted, source.speed_up, 0.0, 0.0
+            at.is_small = source.is_small
             at.heard_ns, at.is_watched = line.heard_ns, line.state != BusState.LIVE
 
     def _take_back(self) -> None:

@@ -175,7 +175,7 @@ class Generation:
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
     def log_patches(self) -> None:
-        """Tell each change of a patch's state once."""
+        """Tell each change of a patch's state once, and which buses have patches that need care."""
         now, before = self.publisher.patch_state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
@@ -186,3 +186,5 @@ class Generation:
             elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
                 log.warning("%s: %s is live again", line.name, self.name_of(patch))
             before[patch] = now[patch]
+        for bus in set(self.tables.structure.patch_bus[now != PatchState.LIVE].tolist()):
+            self.lines[bus].needs_care.set()

@@ -39,7 +39,7 @@ from skinware_drivers.running.turns import short_turns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-_LOOK_S = 0.25
+_LOOK_S = 0.5
 """While C publishes: how often files, states and counters are looked after."""
 
 PublishMode = Literal["cycle", "rate", "request"]

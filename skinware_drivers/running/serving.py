@@ -21,8 +21,6 @@ from skinware_drivers.running.poller import Poller
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
-_LOOK_S = 0.5
-"""How often silent patches are looked for."""
 _SILENCE_S = 0.5
 """Before there is a structure that says how long a patch may be silent."""
 
@@ -125,15 +123,19 @@ class Serving:
 
     async def _look_after(self, line: BusLine, care: PatchCare) -> None:
         begun_ns = now_ns()
-        while True:
-            if line.lost.is_set():
-                await line.reopen()
-            await care.recover_silent()
-            with contextlib.suppress(TimeoutError):
-                # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
-                async with asyncio.timeout(max(self._silence_s, _LOOK_S)):
-                    await line.lost.wait()
-            line.is_aside = False
+        try:
+            while True:
+                line.needs_care.clear()
+                if line.lost.is_set():
+                    await line.reopen()
+                await care.recover_silent()
+                with contextlib.suppress(TimeoutError):
+                    # not wait_for: that of Python 3.11 forgets a cancellation that comes in the moment of a loss
+                    async with asyncio.timeout(self._silence_s):
+                        await line.lost.wait()
+                line.is_aside = False
+                await line.needs_care.wait()
+        finally:
             if now_ns() - begun_ns > line.aside.longest_s * NS_PER_S:
                 line.aside.begin_again()
 

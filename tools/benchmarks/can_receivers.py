@@ -31,8 +31,8 @@ from skinware_drivers.link import Link
 from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 
-QUIET_S = 1.0
-LOOK_S = 0.25  # seldom: what it costs is measured with the rest
+QUIET_S = 2.5
+LOOK_S = 1.0  # seldom: what it costs is measured with the rest
 NOTED_EVERY = 64
 
 

@@ -92,6 +92,8 @@ class NativeRingReader(RingReader[FrameT]):
         self._turns = _TurnsState(*_ring_words(segment))
         self._turns_at = ctypes.byref(self._turns)
         self._turns.descriptor, self._turns.process = segment.descriptor.fd, os.getpid()
+        self._turns.deadline_ns = _NEVER_NS
+        self._asked: tuple[int | None, bool] = (None, False)
 
     def copy(self, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
@@ -119,8 +121,9 @@ class NativeRingReader(RingReader[FrameT]):
         frame, _, memory = self._pool.free()
         frame.stale = False
         state = self._turns
-        state.in_order = in_order
-        state.deadline_ns = _NEVER_NS if deadline_ns is None else deadline_ns
+        if (deadline_ns, in_order) != self._asked:
+            state.deadline_ns, state.in_order = _NEVER_NS if deadline_ns is None else deadline_ns, in_order
+            self._asked = deadline_ns, in_order
         turn = self._turn_call if self._words[LATEST] == state.last else self._turn_at_once
         return frame if turn(self._turns_at, memory) else None
 

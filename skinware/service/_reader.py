@@ -257,6 +257,7 @@ class ServiceReader(Attachment[FrameT]):
             known = frame.position
 
     def _read_in_order(self, deadline_ns: int | None) -> FrameT:
+        self._require_open()
         if self._lags():
             self._end_turn()
             return self._taken(self._whole(self._next_in_order), self.alive)
@@ -324,7 +325,8 @@ class ServiceReader(Attachment[FrameT]):
 
     def _lags(self) -> bool:
         """Whether the generation that is being read has newer frames, though there may be another one already."""
-        return not self._closed and self._last is not None and self._last < (self._ring.generation, self._ring.latest)
+        last = self._last
+        return last is not None and last < (self._ring.generation, self._ring.latest)
 
     def _next_in_order(self) -> FrameT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None

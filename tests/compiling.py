@@ -19,6 +19,9 @@ _SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"
 LANGUAGES: dict[str, tuple[str, ...]] = {
     "c99": ("gcc", "-std=c99", "-pedantic", "-O2"),
     "c++11": ("g++", "-x", "c++", "-std=c++11", "-O2"),
+    "c11": ("gcc", "-std=c11", "-pedantic", "-O2", "-pthread"),
+    "c11 sanitized": ("gcc", "-std=c11", "-pedantic", "-pthread", *_SANITIZERS),
+    "c11 races": ("gcc", "-std=c11", "-pedantic", "-pthread", "-g", "-O1", "-fsanitize=thread", "-Wno-tsan"),
     "sanitized": ("gcc", "-std=c99", "-pedantic", *_SANITIZERS),
     "sanitized copies": ("gcc", "-std=c99", "-pedantic", "-DCOPY_MAPS", *_SANITIZERS),
 }

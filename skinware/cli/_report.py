@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from skinware import native
 from skinware.cli._health import (
     bus_reason_name,
     bus_state_name,
@@ -63,7 +64,8 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
             continue  # otherwise it was withdrawn this very moment
         entry["readers"] = [record for record in readers if record["service"] == name]
         (drivers if entry["kind"] == KIND else services).append(entry)
-    return {"namespace": namespace.name, "drivers": drivers, "services": services, "problems": problems}
+    own = {"data_path": native.path(), "why_python": native.why_python()}
+    return {"namespace": namespace.name, **own, "drivers": drivers, "services": services, "problems": problems}
 
 
 def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:

@@ -103,6 +103,8 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     """
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
+    if found["why_python"]:
+        lines.append(f"programs of this installation read without compiled code: {found['why_python']}")
     if not drivers and not services:
         lines += ["", "Nothing runs here yet. Start a driver:", "  skin-driver --bus virtual    (needs no hardware)"]
     for driver in drivers:
@@ -356,6 +358,7 @@ def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
 
 
 def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
+    from skinware import native
     from skinware.cli._report import report
     from skinware.errors import ServiceNotFound
 
@@ -363,7 +366,8 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         try:
             found = report(namespace, name)
         except ServiceNotFound as error:  # it may come
-            found = {"namespace": namespace.name, "drivers": [], "services": [], "problems": [str(error)]}
+            found = {"namespace": namespace.name, "data_path": native.path(), "why_python": native.why_python()}
+            found |= {"drivers": [], "services": [], "problems": [str(error)]}
         if as_json:
             print_json(found)
         elif sys.stdout.isatty():

@@ -371,10 +371,18 @@ const char *skinware_reason(void);
 #endif
 
 #include <errno.h>
+#include <fcntl.h>
 #include <string.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
+
+#ifndef O_CLOEXEC
+#error "define SKINWARE_IMPLEMENTATION and include skinware.h before any other header, or define _GNU_SOURCE"
+#endif
+#ifndef F_OFD_GETLK
+#define F_OFD_GETLK 36
+#endif
 
 /* The header of a slot. Every member lies on a multiple of its size: there are no hidden gaps on any processor. */
 typedef struct skinware__slot {
@@ -457,6 +465,15 @@ static inline uint64_t skinware__copy_newest(const skinware__ring *ring, unsigne
     return UINT64_MAX;
 }
 
+/* Whether the writer of a file still holds its lock. */
+static inline int skinware__is_locked(int fd) {
+    struct flock lock;
+    memset(&lock, 0, sizeof lock);
+    lock.l_type = F_RDLCK;
+    lock.l_whence = SEEK_SET;
+    return fcntl(fd, F_OFD_GETLK, &lock) == 0 && lock.l_type == F_WRLCK;
+}
+
 /* Sleep until the word is woken or differs from expected, or the time is up. 0, or the number of an error. */
 static inline int skinware__sleep(const unsigned char *word, uint32_t expected, int64_t timeout_ns) {
 #ifdef SYS_futex
@@ -483,18 +500,11 @@ static inline int skinware__sleep(const unsigned char *word, uint32_t expected, 
 #if defined(SKINWARE_IMPLEMENTATION) && !defined(SKINWARE_IMPLEMENTED)
 #define SKINWARE_IMPLEMENTED
 
-#include <fcntl.h>
 #include <pwd.h>
 #include <stdlib.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 
-#ifndef O_CLOEXEC
-#error "define SKINWARE_IMPLEMENTATION and include skinware.h before any other header, or define _GNU_SOURCE"
-#endif
-#ifndef F_OFD_GETLK
-#define F_OFD_GETLK 36
-#endif
 #ifdef O_PATH
 #define SKINWARE__FOLDER_FLAGS (O_PATH | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC)
 #else
@@ -574,16 +584,6 @@ static __thread const char *skinware__reason = "";
 static skinware_result skinware__fail(skinware_result result, const char *reason) {
     skinware__reason = reason;
     return result;
-}
-
-/* -- shared memory ------------------------------------------------------------------------------------------------ */
-
-static int skinware__is_locked(int fd) {
-    struct flock lock;
-    memset(&lock, 0, sizeof lock);
-    lock.l_type = F_RDLCK;
-    lock.l_whence = SEEK_SET;
-    return fcntl(fd, F_OFD_GETLK, &lock) == 0 && lock.l_type == F_WRLCK;
 }
 
 /* -- checking ----------------------------------------------------------------------------------------------------- */

@@ -1,23 +1,24 @@
 """Both ends of a ring with their data path in C, where it was compiled; they do what those in Python do.
 
 A reader's frame is made before it sleeps. One call then sleeps and copies into it without the interpreter lock, so that
-nothing is left to do when the lock is there again: after a sleep the processor's caches are cold, and whatever Python
-does then costs several times what it costs in a loop.
+next to nothing is left to do when the lock is there again: after a sleep the processor's caches are cold, and whatever
+Python does then costs several times what it costs in a loop.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import time
-from typing import Any
 
 from skinware import native
-from skinware.memory.ring import FrameT, RingReader
+from skinware.memory._frame_pool import FramePool
+from skinware.memory.ring import LATEST, FrameT, RingReader, Turn, Turns
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.segments import Segment
 
+_NEVER_NS = (1 << 63) - 1
 _COPIED, _NOTHING = 1, 0  # what library.c answers
-_WAKE_COUNT, _KNOWN, _WANTED, _TIMEOUT_NS = range(4, 8)  # words of its skinware_native_request, after those of the ring
 
 
 def ring_reader(segment: Segment, frame_class: type[FrameT], context: object = None) -> RingReader[FrameT]:
@@ -34,57 +35,126 @@ def ring_writer(segment: Segment) -> RingWriter:
     return RingWriter(segment) if library is None else NativeRingWriter(segment, library)
 
 
-class NativeRingReader(RingReader[FrameT]):
-    """A reader's end whose waits and copies are calls of C."""
-
-    def __init__(self, segment: Segment, frame_class: type[FrameT], context: object, library: native.Library) -> None:
-        super().__init__(segment, frame_class, context)
-        self._copy_call = library.quick.skinware_native_copy
-        self._wait_call = library.waiting.skinware_native_wait
-        self._request = (ctypes.c_uint64 * 8)(*_ring_words(segment))
-        self._request_at = ctypes.byref(self._request)
-        self._bytes = ctypes.c_char * segment.layout.slot_stride
-        self._spare: tuple[FrameT, ctypes.Array[ctypes.c_char]] | None = None
-
-    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
-        """As in Python."""
-        frame, memory = self._next()
-        request = self._request
-        request[_WAKE_COUNT] = wake_count
-        request[_KNOWN] = latest
-        request[_WANTED] = sequence or 0
-        request[_TIMEOUT_NS] = timeout_ns
-        return self._copied(self._wait_call(self._request_at, memory), frame)
-
-    def copy(self, sequence: int | None = None) -> FrameT | None:
-        """As in Python."""
-        frame, memory = self._next()
-        return self._copied(self._copy_call(self._request_at, ctypes.c_uint64(sequence or 0), memory), frame)
-
-    def _next(self) -> tuple[FrameT, ctypes.Array[ctypes.c_char]]:
-        """The frame to fill next, and its memory."""
-        if self._spare is None:
-            data = bytearray(self.segment.layout.slot_stride)
-            self._spare = self._frame_class(self, data), self._bytes.from_buffer(data)
-        return self._spare
-
-    def _copied(self, result: int, frame: FrameT) -> FrameT | None:
-        if result == _COPIED:
-            self._spare = None
-            return frame
-        if result == _NOTHING:
-            return None
-        raise self._overrun()
-
-
-class _WriterState(ctypes.Structure):
-    """``skinware_ring_writer`` of ring.h."""
+class _Ring(ctypes.Structure):
+    """``skinware__ring`` of skinware.h, with which the others begin."""
 
     _fields_ = [
         ("map", ctypes.c_void_p),
         ("slot_offset", ctypes.c_uint64),
         ("slot_stride", ctypes.c_uint64),
         ("slot_count", ctypes.c_uint64),
+    ]
+
+
+class _Request(_Ring):
+    """``skinware_native_request`` of library.c."""
+
+    _fields_ = [
+        ("wake_count", ctypes.c_uint64),
+        ("known", ctypes.c_uint64),
+        ("wanted", ctypes.c_uint64),
+        ("timeout_ns", ctypes.c_int64),
+    ]
+
+
+class _TurnsState(_Ring):
+    """``skinware_native_turns`` of turns.c."""
+
+    _fields_ = [
+        ("last", ctypes.c_uint64),
+        ("in_order", ctypes.c_uint64),
+        ("until_ns", ctypes.c_int64),
+        ("deadline_ns", ctypes.c_int64),
+        ("descriptor", ctypes.c_int64),
+        ("process", ctypes.c_int64),
+        ("frames", ctypes.c_uint64),
+        ("lost", ctypes.c_uint64),
+        ("acquired_ns", ctypes.c_int64),
+        ("taken_ns", ctypes.c_int64),
+        ("noted", ctypes.c_uint64),
+        ("turns", (ctypes.c_int64 * 4) * 256),
+    ]
+
+
+class NativeRingReader(RingReader[FrameT]):
+    """A reader's end whose waits and copies are calls of C."""
+
+    def __init__(self, segment: Segment, frame_class: type[FrameT], context: object, library: native.Library) -> None:
+        super().__init__(segment, frame_class, context)
+        self._pool = FramePool(lambda data: frame_class(self, data), segment.layout.slot_stride)
+        self._copy_call = library.quick.skinware_native_copy
+        self._copy_call.argtypes = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p
+        self._wait_call = library.waiting.skinware_native_wait
+        self._turn_call = library.waiting.skinware_native_turn
+        self._turn_at_once = library.quick.skinware_native_turn
+        self._request = _Request(*_ring_words(segment))
+        self._request_at = ctypes.byref(self._request)
+        self._turns = _TurnsState(*_ring_words(segment))
+        self._turns_at = ctypes.byref(self._turns)
+        self._turns.descriptor, self._turns.process = segment.descriptor.fd, os.getpid()
+        self._turns.deadline_ns = _NEVER_NS
+        self._asked: tuple[int | None, bool] = (None, False)
+
+    def copy(self, sequence: int | None = None) -> FrameT | None:
+        """As in Python."""
+        frame, _, memory = self._pool.free()
+        return self._copied(self._copy_call(self._request_at, sequence or 0, memory), frame)
+
+    def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
+        """As in Python."""
+        frame, _, memory = self._pool.free()
+        request = self._request
+        request.wake_count, request.known = wake_count, latest
+        request.wanted, request.timeout_ns = sequence or 0, timeout_ns
+        return self._copied(self._wait_call(self._request_at, memory), frame)
+
+    def _copied(self, result: int, frame: FrameT) -> FrameT | None:
+        if result == _COPIED:
+            frame.stale = False
+            return frame
+        if result == _NOTHING:
+            return None
+        raise self._overrun()
+
+    def next_turn(self, deadline_ns: int | None, *, in_order: bool = False) -> FrameT | None:
+        """One call of C, which lets go of the interpreter lock only if it has to sleep: others may keep it for long."""
+        frame, _, memory = self._pool.free()
+        frame.stale = False
+        state = self._turns
+        if (deadline_ns, in_order) != self._asked:
+            state.deadline_ns, state.in_order = _NEVER_NS if deadline_ns is None else deadline_ns, in_order
+            self._asked = deadline_ns, in_order
+        turn = self._turn_call if self._words[LATEST] == state.last else self._turn_at_once
+        return frame if turn(self._turns_at, memory) else None
+
+    def resume_turns(self, last: int, until_ns: int) -> None:
+        """As in Python."""
+        self._turns.last, self._turns.until_ns = last, until_ns
+
+    def settle_turns(self) -> Turns | None:
+        """As in Python."""
+        state = self._turns
+        if not (state.frames or state.noted):
+            return None
+        told = Turns(state.frames, state.lost, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
+        state.frames = state.lost = state.noted = 0
+        return told
+
+    def begin_turn(self, acquired_ns: int, taken_ns: int) -> None:
+        """As in Python."""
+        self._turns.acquired_ns, self._turns.taken_ns = acquired_ns, taken_ns
+
+    def end_turn(self) -> tuple[int, int] | None:
+        """As in Python."""
+        state = self._turns
+        taken_ns, state.taken_ns = state.taken_ns, 0
+        return (state.acquired_ns, taken_ns) if taken_ns else None
+
+
+class _WriterState(_Ring):
+    """``skinware_ring_writer`` of ring.h."""
+
+    _fields_ = [
         ("begun_ns", ctypes.c_int64),
         ("cpu_ns", ctypes.c_int64),
     ]
@@ -118,7 +188,6 @@ class NativeRingWriter(RingWriter):
         return int(self._commit_call(self._state_at, acquired_ns, flags))
 
 
-def _ring_words(segment: Segment) -> tuple[Any, ...]:
-    """``skinware__ring`` of skinware.h."""
+def _ring_words(segment: Segment) -> tuple[int, int, int, int]:
     layout = segment.layout
     return segment.data.ctypes.data, layout.slot_offset, layout.slot_stride, layout.slot_count

@@ -7,7 +7,7 @@ sleeps: load the wake word; fence; look at latest and state. docs/reference/shar
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -120,6 +120,38 @@ else:
     FrameT = TypeVar("FrameT", bound=Frame)
 
 
+class Turn(NamedTuple):
+    """One turn of a loop that takes frames.
+
+    Attributes:
+        acquired_ns: of its frame.
+        taken_ns: when that was handed out.
+        ended_ns: when the loop came back.
+        cpu_ns: CPU time of the thread then; None if it was not asked for.
+    """
+
+    acquired_ns: int
+    taken_ns: int
+    ended_ns: int
+    cpu_ns: int | None
+
+
+class Turns(NamedTuple):
+    """What came of turns in C.
+
+    Attributes:
+        frames: that were taken.
+        lost: frames that were not taken.
+        last: sequence of the last one.
+        over: the turns that are over.
+    """
+
+    frames: int
+    lost: int
+    last: int
+    over: list[Turn]
+
+
 class RingReader(Generic[FrameT]):
     """A reader's end of one generation: reads only, takes no lock, is not known to the writer.
 
@@ -143,6 +175,7 @@ class RingReader(Generic[FrameT]):
         self._count = layout.slot_count
         self._slots = slots_of(segment)
         self._slot_words = slot_headers_of(segment)
+        self._open_turn: tuple[int, int] | None = None
 
     @property
     def latest(self) -> int:
@@ -216,6 +249,34 @@ class RingReader(Generic[FrameT]):
         frame = self._frame_class(self, bytearray(self._slots[slot]))
         fence()
         return frame if words[SEQUENCE] == sequence else None
+
+    # -- turns of a loop -------------------------------------------------------------------------------------------
+    # Where there is C, a loop that takes frames as they come goes round there, as long as nothing happens but frames.
+
+    def next_turn(self, deadline_ns: int | None, *, in_order: bool = False) -> FrameT | None:  # noqa: ARG002, not here
+        """The next frame; None if whatever is to be done now has to be done here, as always without C.
+
+        Args:
+            deadline_ns: when the wait for it is to end, CLOCK_MONOTONIC ns; None: never.
+            in_order: the one after the one before, not the newest.
+        """
+        return None
+
+    def resume_turns(self, last: int, until_ns: int) -> None:
+        """Say which frame was taken last, and when something else is to be done at the latest."""
+
+    def settle_turns(self) -> Turns | None:
+        """What came of turns in C since the last call, None if there were none."""
+        return None
+
+    def begin_turn(self, acquired_ns: int, taken_ns: int) -> None:
+        """A frame was handed out, but not by ``next_turn``, which does this itself."""
+        self._open_turn = acquired_ns, taken_ns
+
+    def end_turn(self) -> tuple[int, int] | None:
+        """``acquired_ns`` of the frame in hand and when it was handed out; None if there is none, or it was told."""
+        turn, self._open_turn = self._open_turn, None
+        return turn
 
     @property
     def missed_periods(self) -> int:

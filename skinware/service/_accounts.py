@@ -8,7 +8,7 @@ import time
 
 from skinware.memory.announcement import Announcement, ReaderRecord
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import Frame
+from skinware.memory.ring import Turn, Turns
 from skinware.realtime import NS_PER_S, now_ns
 
 _ANNOUNCE_EVERY_NS = NS_PER_S // 4
@@ -31,8 +31,7 @@ class Accounts:
         self._announcement: Announcement | None = None
         self._announced_ns = self._announced_frames = 0
         self._in_loop = False
-        self._taken_ns = self._acquired_ns = 0
-        self._turns: list[tuple[int, int, int, int | None]] = []  # acquired, taken, ended; CPU time in a loop
+        self._turns: list[Turn] = []
         self._cpu_ns = 0
 
     @property
@@ -46,20 +45,28 @@ class Accounts:
         self._record.kind = kind
         self._in_loop = True
 
-    def taken(self, frame: Frame, lost: int) -> None:
+    def taken(self, lost: int) -> None:
         """A frame is about to be handed out."""
-        self._taken_ns, self._acquired_ns = now_ns(), frame.acquired_ns
         self._record.frames += 1
         if lost:
             self._record.lost += lost
 
-    def end_turn(self) -> None:
-        """Note what was done since the last call; add up and tell everybody now and then."""
+    @property
+    def due_ns(self) -> int:
+        """When the next announcement is due."""
+        return self._announced_ns + _ANNOUNCE_EVERY_NS
+
+    def settle(self, turns: Turns) -> None:
+        """Count what was taken in C."""
+        self._record.frames += turns.frames
+        self._record.lost += turns.lost
+        self._turns += turns.over
+
+    def end_turn(self, turn: tuple[int, int] | None) -> None:
+        """Note the turn that ends now, if there is one; add up and tell everybody now and then."""
         time_ns = now_ns()
-        if self._taken_ns:
-            cpu_ns = time.thread_time_ns() if self._in_loop else None
-            self._turns.append((self._acquired_ns, self._taken_ns, time_ns, cpu_ns))
-            self._taken_ns = 0
+        if turn is not None:
+            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else None))
         if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
             self._add_up()
             self._announce(time_ns)

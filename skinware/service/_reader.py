@@ -48,7 +48,7 @@ class ServiceReader(Attachment[FrameT]):
         announce: bool = True,
     ) -> None:
         super().__init__(name, namespace, timeout_s)
-        self._last: Position | None = None
+        self._last_taken: Position | None = None
         self._accounts = Accounts(self.namespace, name, announce)
 
     @property
@@ -58,11 +58,13 @@ class ServiceReader(Attachment[FrameT]):
         Those of generations that came and went meanwhile are counted too: each file tells how many were published under
         the name before it. Only where somebody removed the namespace's files in between, that number is unknown.
         """
+        self._settle()
         return self._accounts.record.lost
 
     @property
     def statistics(self) -> ReaderRecord:
         """What this reader has counted so far: frames, losses, times; what ``skin-info`` shows of it."""
+        self._settle()
         return self._accounts.record
 
     @property
@@ -108,19 +110,7 @@ class ServiceReader(Attachment[FrameT]):
             Closed: this reader was closed, or belongs to the process before a fork.
         """
         known = newer_than.position if isinstance(newer_than, Frame) else newer_than
-        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-        if known is None:
-            alive = self._keep_up()
-            if self._ring.latest:
-                frame = self._newest_now(self._ring.copy, alive)
-                if _is_young(frame, max_age_s):
-                    return frame
-                known = frame.position
-        while True:
-            frame = self._next_frame(known, deadline_ns, max_age_s=max_age_s)
-            if _is_young(frame, max_age_s):
-                return frame
-            known = frame.position
+        return self._read(known, max_age_s, _deadline_ns(timeout_s))
 
     @contextlib.contextmanager
     def view(self) -> Iterator[FrameT]:
@@ -144,7 +134,7 @@ class ServiceReader(Attachment[FrameT]):
             valid = frame.valid
             if valid and (self._last is None or frame.position >= self._last):
                 self._count(frame)
-                self._accounts.end_turn()
+                self._end_turn()
         if not valid:
             self._accounts.record.overruns += 1
             raise Overrun(
@@ -170,7 +160,9 @@ class ServiceReader(Attachment[FrameT]):
         if rate_hz is None:
             self._accounts.begin_loop("asap")
             while True:
-                yield self.read(newer_than=self._last, max_age_s=max_age_s, timeout_s=timeout_s)
+                deadline_ns = _deadline_ns(timeout_s)
+                frame = None if self._closed or max_age_s is not None else self._ring.next_turn(deadline_ns)
+                yield self._read(self._last, max_age_s, deadline_ns) if frame is None else frame
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
@@ -194,14 +186,10 @@ class ServiceReader(Attachment[FrameT]):
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         self._accounts.begin_loop("in order")
-        timeout_ns = None if timeout_s is None else round(timeout_s * NS_PER_S)
         while True:
-            deadline_ns = None if timeout_ns is None else now_ns() + timeout_ns
-            if self._lags():
-                self._accounts.end_turn()
-                yield self._taken(self._whole(self._next_in_order), self.alive)
-            else:
-                yield self._next_frame(self._last, deadline_ns, in_order=True)
+            deadline_ns = _deadline_ns(timeout_s)
+            frame = None if self._closed else self._ring.next_turn(deadline_ns, in_order=True)
+            yield self._read_in_order(deadline_ns) if frame is None else frame
 
     def request(self, *, timeout_s: float = 5.0) -> FrameT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
@@ -240,6 +228,7 @@ class ServiceReader(Attachment[FrameT]):
         self._ring.segment.descriptor.close()
 
     def _adopt(self, ring: RingReader[FrameT]) -> None:
+        self._end_turn()
         if self._last is not None and ring.generation != self._ring.generation:
             before = self._ring.segment
             taken = before.published_before + self._last[1]
@@ -251,6 +240,28 @@ class ServiceReader(Attachment[FrameT]):
         super()._adopt(ring)
 
     # -- waiting ------------------------------------------------------------------------------------------------
+
+    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> FrameT:
+        """The newest frame that is newer than ``known`` and young enough, as ``read`` has it."""
+        if known is None:
+            alive = self._keep_up()
+            if self._ring.latest:
+                frame = self._newest_now(self._ring.copy, alive)
+                if _is_young(frame, max_age_s):
+                    return frame
+                known = frame.position
+        while True:
+            frame = self._next_frame(known, deadline_ns, max_age_s=max_age_s)
+            if _is_young(frame, max_age_s):
+                return frame
+            known = frame.position
+
+    def _read_in_order(self, deadline_ns: int | None) -> FrameT:
+        self._require_open()
+        if self._lags():
+            self._end_turn()
+            return self._taken(self._whole(self._next_in_order), self.alive)
+        return self._next_frame(self._last, deadline_ns, in_order=True)
 
     def _next_frame(
         self,
@@ -266,6 +277,7 @@ class ServiceReader(Attachment[FrameT]):
         at the very moment at which a reader is in a hurry.
         """
         look_around = False
+        self._end_turn()
         while True:
             self._require_open()
             ring = self._ring
@@ -277,7 +289,6 @@ class ServiceReader(Attachment[FrameT]):
                 wake_count = ring.wake_count
             latest = ring.latest
             if latest and (known is None or (ring.generation, latest) > known):
-                self._accounts.end_turn()
                 take = self._next_in_order if in_order else self._ring.copy
                 return self._taken(self._whole(take), self.alive)
             if self._moved:
@@ -285,7 +296,7 @@ class ServiceReader(Attachment[FrameT]):
             remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
             if remaining_ns <= 0:
                 raise ServiceTimeout(self._why_nothing_came(max_age_s))
-            self._accounts.end_turn()
+            self._end_turn()
             timeout_ns = min(remaining_ns, WAIT_SLICE_NS)
             try:
                 frame = ring.wait(wake_count, latest, timeout_ns, latest + 1 if in_order else None)
@@ -314,7 +325,8 @@ class ServiceReader(Attachment[FrameT]):
 
     def _lags(self) -> bool:
         """Whether the generation that is being read has newer frames, though there may be another one already."""
-        return not self._closed and self._last is not None and self._last < (self._ring.generation, self._ring.latest)
+        last = self._last
+        return last is not None and last < (self._ring.generation, self._ring.latest)
 
     def _next_in_order(self) -> FrameT | None:
         last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
@@ -337,8 +349,9 @@ class ServiceReader(Attachment[FrameT]):
 
     def _newest_now(self, take: Callable[[], FrameT | None], alive: bool) -> FrameT:
         """The newest frame without a wait, so that this is the moment to count it."""
+        self._settle()
         frame = self._taken(self._whole(take), alive)
-        self._accounts.end_turn()
+        self._end_turn()
         return frame
 
     def _whole(self, take: Callable[[], FrameT | None]) -> FrameT | None:
@@ -359,13 +372,38 @@ class ServiceReader(Attachment[FrameT]):
         frame.stale = not alive
         return frame
 
+    @property
+    def _last(self) -> Position | None:
+        """Position of the frame that was taken last."""
+        self._settle()
+        return self._last_taken
+
+    @_last.setter
+    def _last(self, position: Position | None) -> None:
+        self._last_taken = position
+        if position is not None:
+            self._ring.resume_turns(position[1], self._accounts.due_ns)
+
+    def _settle(self) -> None:
+        """Count the frames that were taken in C since the last time."""
+        turns = self._ring.settle_turns()
+        if turns is not None:
+            self._last_taken = self._ring.generation, turns.last
+            self._accounts.settle(turns)
+
+    def _end_turn(self) -> None:
+        """What was taken last is done with."""
+        self._settle()
+        self._accounts.end_turn(self._ring.end_turn())
+
     def _count(self, frame: FrameT) -> None:
         last = self._last
         lost = 0
         if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
             lost = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
-        self._accounts.taken(frame, lost)
+        self._accounts.taken(lost)
+        self._ring.begin_turn(frame.acquired_ns, now_ns())
 
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------
 
@@ -396,3 +434,7 @@ class ServiceReader(Attachment[FrameT]):
 
 def _is_young(frame: Frame, max_age_s: float | None) -> bool:
     return max_age_s is None or frame.age_ns <= max_age_s * NS_PER_S
+
+
+def _deadline_ns(timeout_s: float | None) -> int | None:
+    return None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)

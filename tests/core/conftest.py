@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from skinware import Namespace
-from tests.compiling import compiled
+from skinware import Namespace, native
+from tests.compiling import compiled, need_compiler
 from tests.core import workers
 from tests.core.c_programs import SOURCE
 from tests.core.users import Users, running_driver
@@ -40,3 +40,17 @@ def any_program(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """c_reader.c, compiled."""
     return compiled(SOURCE, "c99", tmp_path_factory)
+
+
+@pytest.fixture(params=["native", "python"])
+def data_path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Frames go through C, then through Python; also in processes that a test starts."""
+    if request.param == "native":
+        need_compiler("gcc")
+        monkeypatch.delenv("SKINWARE_NATIVE", raising=False)
+    else:
+        monkeypatch.setenv("SKINWARE_NATIVE", "0")
+    native.load.cache_clear()
+    assert native.path() == request.param, native.why_python()
+    yield request.param
+    native.load.cache_clear()

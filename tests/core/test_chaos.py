@@ -33,7 +33,7 @@ STATES = {
 }
 GENERATION, SEQUENCE, MISSED, BEGUN, TORN, STOP, PID, WON = range(8)
 
-pytestmark = pytest.mark.usefixtures("process_server")
+pytestmark = pytest.mark.usefixtures("process_server", "data_path")
 
 
 # -- those who are killed ----------------------------------------------------------------------------------------

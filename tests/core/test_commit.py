@@ -11,6 +11,8 @@ import pytest
 from skinware import Frame, ServiceReader, ServiceWriter
 from skinware.realtime import now_ns
 
+pytestmark = pytest.mark.usefixtures("data_path")
+
 BAD = [
     pytest.param({"acquired_ns": 1 << 63}, ValueError, id="too wide"),
     pytest.param({"acquired_ns": 1.5}, TypeError, id="not whole"),

@@ -34,6 +34,8 @@ from skinware.errors import (
     StructureChanged,
 )
 
+pytestmark = pytest.mark.usefixtures("data_path")
+
 NAMES = ["a", "b"]
 SHAPES = [1, 5]
 SLOTS = 4

@@ -9,6 +9,8 @@ from skinware.errors import Overrun, StructureChanged
 from tests.core.services import publish
 from tests.core.workers import seeded
 
+pytestmark = pytest.mark.usefixtures("data_path")
+
 COLUMNS = {"values": ("<u8", 4)}
 
 

@@ -12,10 +12,12 @@ import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import NamespaceError, StructureChanged
-from skinware.memory import file_layout, ring, segments
+from skinware.memory import file_layout, native_ring, ring, ring_writer, segments
 from skinware.service import _ownership
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
+
+pytestmark = pytest.mark.usefixtures("data_path")
 
 OTHER = {"values": ("<u8", 3)}
 
@@ -93,18 +95,18 @@ def test_pausing_an_old_generation_does_not_hide_that_there_is_a_new_one() -> No
         assert reader._ring.state == file_layout.STATE_SUPERSEDED
 
 
-@pytest.mark.parametrize("where", ["RingWriter", "publish"])
+@pytest.mark.parametrize("where", ["ring_writer", "publish"])
 def test_a_failure_before_it_is_there_leaves_the_old_one(
     where: str, namespace: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
-        raise MemoryError if where == "RingWriter" else NamespaceError("no")
+        raise MemoryError if where == "ring_writer" else NamespaceError("no")
 
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
         publish(writer, 1)
         inode = namespace.ring_path("x").stat().st_ino
         with monkeypatch.context() as patched:
-            patched.setattr(*((_ownership, where) if where == "RingWriter" else (segments, where)), fail)
+            patched.setattr(*((_ownership, where) if where == "ring_writer" else (segments, where)), fail)
             with pytest.raises((MemoryError, NamespaceError)):
                 writer.restructure(OTHER, rate_hz=7)
         publish(writer, 2)
@@ -123,7 +125,8 @@ class Interrupt:
         self.left = lines
 
     def __call__(self, frame: types.FrameType, _event: str, _argument: object) -> Any:
-        of_commit = frame.f_code.co_name == "commit" and frame.f_code.co_filename == ring.__file__
+        files = ring_writer.__file__, native_ring.__file__
+        of_commit = frame.f_code.co_name in ("commit", "_publish") and frame.f_code.co_filename in files
         return self.line if of_commit else None
 
     def line(self, _frame: types.FrameType, event: str, _argument: object) -> Any:
@@ -134,7 +137,7 @@ class Interrupt:
         return self.line
 
 
-def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice() -> None:
+def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice(data_path: str) -> None:
     seen: dict[int, int] = {}
     interrupted = 0
     with ServiceWriter("x", SMALL, slots=2) as writer, ServiceReader[Frame]("x") as reader:
@@ -161,22 +164,26 @@ def test_ctrl_c_in_the_middle_of_a_publication_publishes_no_number_twice() -> No
             writer.commit(1)
             look()
             assert reader.read().position == writer.position
-    assert interrupted > 10
+    assert interrupted > (10 if data_path == "python" else 4)
 
 
-def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_that_reads_is_not_ended_by_a_writer_that_is_too_fast(
+    monkeypatch: pytest.MonkeyPatch, data_path: str
+) -> None:
     from skinware import threads
     from skinware.errors import Overrun
 
-    copy = ring.RingReader.copy
+    ring_class: Any = native_ring.NativeRingReader if data_path == "native" else ring.RingReader
+    copy = ring_class.copy
     overruns = iter([True] * 3)
 
     def sometimes(self: ring.RingReader[Frame], sequence: int | None = None) -> Frame | None:
         if next(overruns, False):
             raise Overrun("too fast")
-        return copy(self, sequence)
+        frame: Frame | None = copy(self, sequence)
+        return frame
 
-    monkeypatch.setattr(ring.RingReader, "copy", sometimes)
+    monkeypatch.setattr(ring_class, "copy", sometimes)
     seen: list[int] = []
     with ServiceWriter("x", SMALL) as writer:
         publish(writer, 1)

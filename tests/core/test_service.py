@@ -20,6 +20,8 @@ from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
 
+pytestmark = pytest.mark.usefixtures("data_path")
+
 # -- coherency ----------------------------------------------------------------------------------------------------
 
 

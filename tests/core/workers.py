@@ -67,7 +67,7 @@ class Crew:
 
     def start(self, work: Callable[..., None], *arguments: Any) -> BaseProcess:
         """Run a function of a module in a process of its own."""
-        process = PROCESSES.Process(target=_work_in, args=(os.environ["SKINWARE_NAMESPACE"], work, *arguments))
+        process = PROCESSES.Process(target=_work_in, args=(_environment(), work, *arguments))
         process.start()
         self._members.append(process)
         return process
@@ -106,8 +106,13 @@ def kill(process: BaseProcess) -> None:
     process.join(PATIENCE_S)
 
 
-def _work_in(namespace: str, work: Callable[..., None], *arguments: Any) -> None:
-    os.environ["SKINWARE_NAMESPACE"] = namespace  # the process server has that of the test that started it
+def _environment() -> dict[str, str]:
+    return {name: value for name, value in os.environ.items() if name.startswith("SKINWARE_")}
+
+
+def _work_in(environment: dict[str, str], work: Callable[..., None], *arguments: Any) -> None:
+    os.environ.pop("SKINWARE_NATIVE", None)  # the process server has the environment of the test that started it
+    os.environ.update(environment)
     work(*arguments)
 
 

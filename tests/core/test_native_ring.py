@@ -1,0 +1,383 @@
+"""What only the ends of a ring in C can get wrong: memory that is used again, the library, races of the protocol."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from skinware import Frame, ServiceReader, ServiceWriter, native
+from skinware.errors import Closed, ServiceTimeout
+from skinware.memory import native_ring
+from skinware.memory.native_ring import NativeRingReader, NativeRingWriter
+from skinware_drivers.testing.waiting import wait_until
+from tests.compiling import compiled
+
+COLUMNS = {"values": ("<u8", 509), "odd": ("u1", 7)}
+STRESS = Path(__file__).with_name("ring_stress.c")
+WAYS = ["asap", "in order", "read"]
+
+
+def publish(writer: ServiceWriter, value: int) -> None:
+    for column in writer.begin().values():
+        column[:] = value
+    writer.commit(value, value)
+
+
+def taking(reader: ServiceReader[Frame], way: str) -> Callable[[], Frame]:
+    """How a loop takes its next frame."""
+    if way == "read":
+        return lambda: reader.read(newer_than=reader._last, timeout_s=20)
+    frames = reader.frames(timeout_s=20) if way == "asap" else reader.in_order(timeout_s=20)
+    return lambda: next(frames)
+
+
+def is_whole(frame: Frame, value: int) -> bool:
+    return bool(
+        (frame.sequence, frame.acquired_ns, frame.flags) == (value, value, value)
+        and (frame.column("values") == value).all()
+        and (frame.column("odd") == value).all()
+    )
+
+
+@pytest.fixture
+def native_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv("SKINWARE_NATIVE", raising=False)
+    native.load.cache_clear()
+    if native.core() is None:
+        pytest.skip(native.why_python())
+    yield
+    native.load.cache_clear()
+
+
+# -- memory that is used again -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("native_path")
+@pytest.mark.parametrize("way", WAYS)
+def test_what_anybody_still_has_is_never_filled_again(way: str) -> None:
+    keep: list[tuple[int, Any]] = []
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        take = taking(reader, way)
+        for value in range(1, 61):
+            publish(writer, value)
+            frame = take()
+            kept: list[Callable[[Frame], Any]] = [
+                lambda frame: frame,
+                lambda frame: frame.column("values"),
+                lambda frame: frame.column("values")[5:9][::2],
+                lambda frame: memoryview(frame.column("odd").data),
+                lambda frame: None,
+                lambda frame: frame.column("values").reshape(1, -1).T.view(np.uint8),
+            ]
+            keep.append((value, kept[value % len(kept)](frame)))
+    del frame
+    gc.collect()
+    for value, thing in keep:
+        if isinstance(thing, Frame):
+            assert is_whole(thing, value)
+        elif thing is not None:
+            array: npt.NDArray[Any] = np.asarray(thing)
+            expected = (
+                np.full(509, value, "<u8").view(np.uint8) if array.dtype == np.uint8 and array.size > 7 else value
+            )
+            assert (np.sort(array.ravel()) == np.sort(np.ravel(expected))).all()
+
+
+@pytest.mark.usefixtures("native_path")
+def test_frames_that_nobody_has_are_filled_again() -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        take = taking(reader, "asap")
+        seen = set()
+        for value in range(1, 41):
+            publish(writer, value)
+            frame = take()
+            assert is_whole(frame, value)
+            seen.add(id(frame))
+        assert len(seen) == 2
+
+
+@pytest.mark.usefixtures("native_path")
+def test_a_frame_of_a_dead_writer_is_stale_and_the_same_memory_afterwards_is_not() -> None:
+    writer = ServiceWriter("x", COLUMNS)
+    with ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        reader.read()
+        reader.read()
+        writer.close()
+        assert reader.read().stale
+        assert reader.read().stale
+        with ServiceWriter("x", COLUMNS) as writer:
+            publish(writer, 1)
+            take = taking(reader, "asap")
+            assert not take().stale
+            publish(writer, 2)
+            assert not take().stale
+
+
+# -- the two ways side by side -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("writers", ["native", "python"])
+def test_both_ways_see_the_same(way: str, writers: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Readers of both kinds of one writer of either kind, through losses and a restart; all that they count agrees."""
+
+    def on(path: str) -> None:
+        monkeypatch.setenv("SKINWARE_NATIVE", "0" if path == "python" else "1")
+        native.load.cache_clear()
+        if native.path() != path:
+            pytest.skip(native.why_python())
+
+    on(writers)
+    writer = ServiceWriter("x", COLUMNS, slots=4)
+    readers = {}
+    for path in ("native", "python"):
+        on(path)
+        readers[path] = ServiceReader[Frame]("x")
+    assert isinstance(readers["native"]._ring, NativeRingReader)
+    assert not isinstance(readers["python"]._ring, NativeRingReader)
+    takes = {path: taking(reader, way) for path, reader in readers.items()}
+    seen: dict[str, list[tuple[int, ...]]] = {path: [] for path in takes}
+    value = 0
+    for burst in (1, 1, 2, 1, 7, 1, 3, -1, 1, 1, 9, 1):
+        if burst < 0:
+            writer.close()
+            on(writers)
+            writer = ServiceWriter("x", COLUMNS, slots=4)
+            value = 0
+            continue
+        for _ in range(burst):
+            value += 1
+            publish(writer, value)
+        for path, take in takes.items():
+            while not seen[path] or seen[path][-1][:2] != writer.position:
+                frame = take()
+                assert is_whole(frame, frame.sequence)
+                times = frame.acquired_ns, frame.published_ns, frame.flags
+                seen[path].append((frame.generation, frame.sequence, *times, frame.stale))
+    assert seen["native"] == seen["python"]
+    told = {path: reader.statistics for path, reader in readers.items()}
+    counts = {path: (one.frames, one.lost, one.overruns, one.age.total, one.wall.count) for path, one in told.items()}
+    assert counts["native"] == counts["python"]
+    for reader in readers.values():
+        reader.close()
+    writer.close()
+    native.load.cache_clear()
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+def test_a_writer_tells_the_same_of_itself(data_path: str) -> None:
+    with ServiceWriter("x", COLUMNS, slots=3) as writer, ServiceReader[Frame]("x") as reader:
+        assert isinstance(writer._ring, NativeRingWriter) == (data_path == "native")
+        now_ns = time.monotonic_ns()
+        for acquired_ns in (-1, -(1 << 63), 0, now_ns, now_ns + (1 << 40), now_ns - 3_000_000):
+            writer.begin()
+            writer.commit(acquired_ns, (1 << 64) - 1)
+        told = reader.writer_statistics
+        assert (told.published, told.before_boot) == (6, 2)
+        assert told.wall.count == told.cpu.count == told.age.total == 6
+        assert told.age.counts[0] >= 1  # what is newer than its publication
+        assert told.age.counts[22] + told.age.counts[23] >= 1  # 3 ms, if the machine did not stand still
+        assert 0 < told.wall.best_ns <= told.wall.mean_ns <= told.wall.worst_ns
+        assert 0 <= told.cpu.best_ns <= told.cpu.worst_ns <= told.cpu.total_ns
+        words = reader._ring._slot_words[6 % 3]
+        assert words[3] == (1 << 64) - 1
+
+
+# -- whoever ends a wait -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_signal_ends_a_wait(way: str, data_path: str) -> None:
+    class Rang(Exception):
+        pass
+
+    def ring(*_: object) -> None:
+        raise Rang
+
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+            take = taking(reader, way)
+            publish(writer, 1)
+            take()
+            signal.setitimer(signal.ITIMER_REAL, 0.02)
+            with pytest.raises(Rang):
+                take()
+            publish(writer, 2)
+            frame = taking(reader, way)()  # a generator that raised is over
+            assert is_whole(frame, 2)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+@pytest.mark.parametrize("way", WAYS)
+def test_another_thread_stops_a_wait(way: str, data_path: str) -> None:
+    with ServiceWriter("x", COLUMNS) as writer:
+        reader = ServiceReader[Frame]("x")
+        take = taking(reader, way)
+        publish(writer, 1)
+        take()
+        stopper = threading.Timer(0.02, reader.stop)
+        stopper.start()
+        with pytest.raises(Closed):
+            take()
+        stopper.join()
+        reader.close()
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+@pytest.mark.parametrize("way", ["asap", "in order"])
+def test_the_child_of_a_fork_has_no_reader(way: str, data_path: str) -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+        take = taking(reader, way)
+        for value in (1, 2):
+            publish(writer, value)
+            take()
+        publish(writer, 3)
+        child = os.fork()
+        if child == 0:
+            try:
+                take()
+            except Closed:
+                os._exit(7)
+            finally:
+                os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        assert is_whole(take(), 3)
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+@pytest.mark.parametrize("way", ["asap", "in order"])
+def test_a_deadline_holds_and_the_loop_goes_on_in_a_new_one(way: str, data_path: str) -> None:
+    with ServiceWriter("x", COLUMNS) as writer, ServiceReader[Frame]("x") as reader:
+
+        def frames() -> Iterator[Frame]:
+            return reader.frames(timeout_s=0.01) if way == "asap" else reader.in_order(timeout_s=0.01)
+
+        publish(writer, 1)
+        loop = frames()
+        next(loop)
+        begun_ns = time.monotonic_ns()
+        with pytest.raises(ServiceTimeout, match="is silent"):
+            next(loop)
+        assert time.monotonic_ns() - begun_ns >= 10_000_000
+        publish(writer, 2)
+        assert is_whole(next(frames()), 2)
+        assert reader.statistics.frames == 2
+        assert reader.lost == 0
+
+
+@pytest.mark.parametrize("data_path", ["native", "python"], indirect=True)
+def test_a_killed_writer_is_noticed_by_a_loop(data_path: str) -> None:
+    writer = ServiceWriter("x", COLUMNS)
+    with ServiceReader[Frame]("x") as reader:
+        take = taking(reader, "asap")
+        publish(writer, 1)
+        take()
+        publish(writer, 2)
+        writer._ring.segment.descriptor.close()  # as if it were killed
+        frame = take()
+        assert is_whole(frame, 2)
+        assert frame.stale
+        writer._name_lock.close()
+        with ServiceWriter("x", COLUMNS) as second:
+            publish(second, 1)
+            frame = take()
+            assert (frame.generation, frame.sequence, frame.stale) == (second.generation, 1, False)
+
+
+# -- the library ---------------------------------------------------------------------------------------------------
+
+
+def test_a_library_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    if native.core() is None:
+        pytest.skip(native.why_python())
+    refused = native.load(native._CORE, native.ABI + 1)
+    assert refused.library is None
+    assert refused.why_python.startswith(f"libskinware.so is of another version ({native.ABI}, not {native.ABI + 1})")
+
+
+def test_what_is_no_library_or_not_there_leaves_python(tmp_path: Path) -> None:
+    broken = tmp_path / "libskinware.so"
+    broken.write_bytes(b"no library")
+    assert "cannot be loaded" in native.load(broken, native.ABI).why_python
+    assert "was not compiled" in native.load(tmp_path / "libnothing.so", native.ABI).why_python
+
+
+@pytest.mark.parametrize(("given", "path"), [("0", "python"), (None, "native")])
+def test_a_program_chooses_by_its_environment(given: str | None, path: str) -> None:
+    if path == "native" and native.core() is None:
+        pytest.skip(native.why_python())
+    environment = {name: value for name, value in os.environ.items() if name != "SKINWARE_NATIVE"}
+    if given is not None:
+        environment["SKINWARE_NATIVE"] = given
+    code = "from skinware import native; print(native.path(), native.why_python())"
+    told = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert told.stdout.split() == [path, *(["SKINWARE_NATIVE=0"] if given else [])]
+
+
+# -- the protocol under the checkers -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("slots", [2, 3, 8])
+@pytest.mark.parametrize("checked", ["c11", "c11 sanitized", "c11 races"])
+def test_no_frame_is_torn_whatever_is_checked(
+    checked: str, slots: int, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    program = compiled(STRESS, checked, tmp_path_factory)
+    result = subprocess.run(
+        [program, tmp_path / "ring", str(slots), "10000"], capture_output=True, text=True, timeout=110
+    )
+    assert result.returncode == 0, result.stderr
+    assert not result.stderr
+    told = json.loads(result.stdout)
+    assert told["torn"] == 0
+    assert told["timed"] == told["ages"] == 10000
+    assert all(told[way] > 0 for way in ("turns", "in_order", "copies", "waits")), told
+    structures = native_ring._Request, native_ring._TurnsState, native_ring._WriterState
+    assert told["sizes"] == [ctypes.sizeof(one) for one in structures]
+
+
+@pytest.mark.usefixtures("native_path")
+def test_a_reader_beside_a_thread_that_computes_gets_every_frame() -> None:
+    """It lets go of the interpreter lock only to sleep, so that it catches up once it has it."""
+    over = threading.Event()
+
+    def compute() -> None:
+        while not over.is_set():
+            sum(range(1000))
+
+    thread = threading.Thread(target=compute)
+    with ServiceWriter("x", COLUMNS, slots=64) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        take = taking(reader, "in order")
+        take()
+        thread.start()
+        try:
+            for value in range(2, 50):
+                publish(writer, value)
+            for value in range(2, 50):
+                assert take().sequence == value
+        finally:
+            over.set()
+            thread.join()
+        assert reader.lost == 0
+        wait_until(lambda: not thread.is_alive())

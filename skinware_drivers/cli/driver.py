@@ -345,6 +345,8 @@ async def _report(runner: Runner) -> None:
 
 
 def _tell_ready(runner: Runner, as_json: bool) -> None:
+    from skinware_drivers.running.figures import path_figures
+
     if runner.generation is None:
         return
     structure = runner.generation.tables.structure
@@ -353,11 +355,13 @@ def _tell_ready(runner: Runner, as_json: bool) -> None:
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
-        print_json({**ready, "types": types, "buses": buses})
+        print_json({**ready, "types": types, "buses": buses, **path_figures(runner.generation)})
     else:
         patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
         what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
         click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
+        if runner.generation.why_python:
+            click.echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
 
 
 def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:

@@ -46,10 +46,17 @@ def figures(
                 **counters,
             }
         )
-    way = {"data_path": "python" if generation.native is None else "native", "why_python": generation.why_python}
-    latency = {"latency_ms": int(publisher.latency_ns[0]) / 1e6}
-    figures = {"sequence": writer.sequence, **way, **latency, "buses": buses, "patches": patches}
+    figures = {"sequence": writer.sequence, **path_figures(generation), "buses": buses, "patches": patches}
     return {**figures, "machine": _machine(machine)}
+
+
+def path_figures(generation: Generation) -> dict[str, Any]:
+    """Which way frames take, why not the native one, and how long they may wait."""
+    return {
+        "data_path": "python" if generation.native is None else "native",
+        "why_python": generation.why_python,
+        "latency_ms": int(generation.publisher.latency_ns[0]) / 1e6,
+    }
 
 
 def _machine(machine: MachineLimits) -> dict[str, int]:

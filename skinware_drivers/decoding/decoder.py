@@ -94,8 +94,9 @@ class Decoder:
         by_payload = np.array([kind.module_by_byte is not None for kind in self.kinds], bool)
         self.payload_names: Flags = self.addresses.sets @ by_payload
         self._compile_assemblies(first_of)
-        lengths = 1 + max((layout.payload_size for layout in self.layouts if layout is not None), default=0)
-        self.length_ok = np.zeros((256, max(256, lengths)), bool)  # by kind; the last row: right for any frame
+        longest = max((max(frame.length) for frame in self.frames), default=0)
+        # by kind (the last row: right for any frame) and length (the last column: all that are longer than any)
+        self.length_ok = np.zeros((256, max(256, longest + 2)), bool)
         for kind, frame in enumerate(self.frames):
             self.length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self.header = self._compile_header()
@@ -267,7 +268,8 @@ class Decoder:
 
         Those are counted here.
         """
-        n_buses, length, payload = len(self.state.bus_counters), wire["length"], wire["payload"]
+        n_buses, payload = len(self.state.bus_counters), wire["payload"]
+        length = np.minimum(wire["length"], self.length_ok.shape[1] - 1)
         ours = entry < self._n_modules + self._n_patches
         if self.header is not None:
             at, table = self.header

@@ -25,13 +25,16 @@ import pytest
 
 from skinware_drivers.testing.fault_tests import FaultTests
 from skinware_drivers.testing.life_tests import LifeTests
+from skinware_drivers.testing.path_tests import PathTests
 from skinware_drivers.testing.silence_tests import SilenceTests
 from skinware_drivers.testing.torn_tests import TornTests
 from skinware_drivers.testing.value_tests import ValueTests
 
 
 @pytest.mark.usefixtures("namespace")
-class DriverConformance(SilenceTests, TornTests, FaultTests, LifeTests, ValueTests):  # pytest begins with the last
+class DriverConformance(
+    PathTests, SilenceTests, TornTests, FaultTests, LifeTests, ValueTests
+):  # pytest begins with the last
     """Tests for a driver. Subclass it, say which driver and which emulator, and nothing else.
 
     Attributes:

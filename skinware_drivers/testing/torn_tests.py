@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.description import SkinTables
 from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import defect, require
@@ -84,35 +87,56 @@ def _bursts(rig: Running) -> int:
     return max(len(bursts) for bursts in rig.truth.bursts.values())
 
 
+class Take(NamedTuple):
+    """Frames that a bus delivered at once.
+
+    Attributes:
+        now_ns: when it did.
+        wire: (n,) as in a batch.
+        time_ns: (n,) int64, stamps.
+    """
+
+    now_ns: int
+    wire: npt.NDArray[np.void]
+    time_ns: npt.NDArray[np.int64]
+
+
 class Heard:
     """What a driver's bus delivers from now on.
 
     Args:
-        rig: the driver.
+        rig: the driver; it runs.
+
+    Attributes:
+        takes: in order, those without frames left out.
+        tables: the skin.
     """
 
     def __init__(self, rig: Running) -> None:
+        if rig.runner is None or rig.runner.generation is None:
+            defect("the driver publishes nothing yet")
         self._rig = rig
-        self._wire: list[npt.NDArray[np.void]] = []
-        self._time_ns: list[npt.NDArray[np.int64]] = []
+        self.takes: list[Take] = []
+        self.tables: SkinTables = rig.runner.generation.tables
         receive = rig.bus.receive
 
         def listen(batch: FrameBatch, ordinal: int) -> int:
             first = batch.stop
             count = receive(batch, ordinal)
-            self._wire.append(batch.wire[first : batch.stop].copy())
-            self._time_ns.append(batch.time_ns[first : batch.stop].copy())
+            if batch.stop > first:
+                rows = slice(first, batch.stop)
+                self.takes.append(Take(rig.clock.now_ns, batch.wire[rows].copy(), batch.time_ns[rows].copy()))
             return count
 
         rig.bus.receive = listen  # type: ignore[method-assign]
 
     def recording(self, bursts: int = BURSTS) -> Recording | None:
         """So many bursts of the first patch; None if there are not so many."""
-        runner, adapter = self._rig.runner, self._rig.adapter
-        if runner is None or runner.generation is None or not self._wire:
+        if not self.takes:
             return None
-        wire, time_ns = np.concatenate(self._wire), np.concatenate(self._time_ns)
-        return record(adapter.layout, runner.generation.tables, adapter.period_s, wire, time_ns, bursts)
+        wire, time_ns = np.concatenate([t.wire for t in self.takes]), np.concatenate([t.time_ns for t in self.takes])
+        adapter = self._rig.adapter
+        return record(adapter.layout, self.tables, adapter.period_s, wire, time_ns, bursts)
 
 
-__all__ = ["Heard", "TornTests"]
+__all__ = ["Heard", "Take", "TornTests"]

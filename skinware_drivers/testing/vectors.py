@@ -8,6 +8,8 @@
 
 An identifier of 29 bits is written as everywhere: ``EXTENDED_FLAG | 0x18DA00F1``.
 
+The data path in C is given the same, and has to do the same as that of numpy.
+
 A test fails if something of what it decodes is not shown, and says what and why. Where that is what is tested, say
 ``strict=False`` and look at ``problems``. Bytes that a program computed, say the driver's emulator, prove only that two
 programs agree.
@@ -32,6 +34,7 @@ from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
 from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.testing.both_paths import require_same
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import make_bus
@@ -130,7 +133,7 @@ def _decode(
 ) -> Shown:
     patches = _patches(adapter, devices)
     decoder = Decoder([adapter.layout], assemble([("bus", patches)], adapter.types, adapter.dtype))
-    state, unknown = decoder.state, 0
+    state, unknown, taken = decoder.state, 0, list[tuple[int, int, bytes]]()
     batch = FrameBatch(1, adapter.payload_size, decoder.headroom)
     for number, (identifier, digits) in enumerate(frames):
         payload = _bytes(digits)
@@ -141,13 +144,15 @@ def _decode(
             problems.append(f"{name}: too long, the longest of the layout has {adapter.payload_size} bytes")
             continue
         decoder.put_back(batch)
-        batch.append(0, (number + 1) * _MS, identifier, payload)
+        taken.append(((number + 1) * _MS, identifier, payload))
+        batch.append(0, *taken[-1])
         before = state.bus_counters[0].copy()
         updates, foreign = decoder.decode(batch)
         decoder.count_unknown(batch, foreign)
         unknown += len(foreign)
         state.show(updates)
         problems += [f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(state.bus_counters[0] - before)]
+    require_same(adapter.layout, decoder.tables, adapter.period_s, adapter.payload_size, taken)
     decoder.put_back(batch)
     orphans = int(state.patch_counters[:, 1].sum())
     if orphans:

@@ -36,8 +36,8 @@ from skinware_drivers.layout import (
     Values,
 )
 from skinware_drivers.registry import DRIVERS, load_driver
+from skinware_drivers.testing.both_paths import Pair, Publishing, Way
 from skinware_drivers.testing.clock import HandClock
-from tests.native.pair import Pair, Publishing, Way
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths
 from tests.native.traffic import identifier_of
 from tests.serial.fuzzing import Script
@@ -168,7 +168,10 @@ def run(clock: HandClock, data: bytes) -> int:
     design = known[sorted(known)[script.number(len(known))]]
     is_alone = script.number(4) == 0
     publishing = Publishing(_PERIOD_S, script.number(4) > 0, script.number(4) == 0, 2 + script.number(8))
-    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing, rows=_MOST_ROWS) as pair:
+    longest = max(layout.payload_size for layout in design.layouts if layout is not None)
+    size = longest + (0, 64, 512)[script.number(3)]
+    skin = design.layouts, design.tables(), design.periods_s
+    with Pair(clock, *skin, publishing, rows=_MOST_ROWS, payload_size=size) as pair:
         if pair.why_not:
             return 0
         _Fuzz(design, pair, script, is_alone).run()

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 from skinware_drivers.testing.clock import HandClock
-from tests.native.pair import Pair, Publishing, hand_clock, needs_native
+from tests.native import needs_native
 from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
 from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout, SequenceNumber
-from tests.native.pair import Pair, Way
+from skinware_drivers.testing.both_paths import Pair, Way
 from tests.native.skins import SkinDesign
 
 Wire = tuple[int, int, int, bytes]
@@ -224,9 +224,8 @@ class Player:
         while stream:
             size = next(sizes)
             self._waiting, stream = stream[:size], stream[size:]
-            while is_watched and self.pair.deadline_ns < self._waiting[0][1]:
-                self.pair.clock.now_ns = max(self.pair.clock.now_ns, self.pair.deadline_ns)
-                self.pair.publish_if_due()
+            if is_watched:
+                self.pair.pass_to(self._waiting[0][1])
             self._digest()
         self._pass(Pass(400))
 
@@ -258,9 +257,8 @@ class Player:
             self._digest()
         clock, pair = self.pair.clock, self.pair
         end_ns = clock.now_ns + event.centiperiods * self._period_ns // 100
-        while event.is_watched and pair.deadline_ns <= end_ns:
-            clock.now_ns = max(clock.now_ns, pair.deadline_ns)
-            pair.publish_if_due()
+        if event.is_watched:
+            pair.pass_to(end_ns)
         self._stamp_ns = clock.now_ns = max(clock.now_ns, end_ns)
         pair.publish_if_due()
 

@@ -197,11 +197,19 @@ def test_a_frame_of_a_wrong_length_or_an_unknown_module_is_counted_once(
     assert tuple(decoder.state.bus_counters[0, :3].tolist()) == counted
 
 
-def test_a_frame_longer_than_all_that_are_right_fits_into_its_row() -> None:
-    """Rows have multiples of 8 bytes."""
-    layout = one(Values(0, "u1", 1), length=257)
-    decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, bytes(n)) for n in (257, 258, layout.payload_size)])
-    assert decoder.state.bus_counters[0, 1] == 2
+@pytest.mark.parametrize("when", [[Identifier(0x100)], [Identifier(0x100), Byte(0, 0)]])
+def test_frames_that_are_longer_than_all_of_the_layout(when: Sequence[Identifier | Byte]) -> None:
+    """Rows can be longer than the layout's frames: a device answers questions over the same line."""
+    layout = Layout([Frame("data", when, (20,), Values(0, "u1", 1))])
+    decoder = Decoder([layout], assemble([("bus", [Patch("patch", [Module(taxels(1))])])], TYPES, "u1"))
+    batch = FrameBatch(10, 1000)
+    for identifier in (0x100, 0x101):
+        for length in (20, 21, 255, 256, 1000):
+            batch.append(0, 1, identifier, bytes(length))
+    updates, foreign = decoder.decode(batch)
+    assert len(updates) == 1
+    assert decoder.state.bus_counters[0].tolist() == [0, 4, 0, 0]
+    assert batch.wire["identifier"][foreign].tolist() == [0x101] * 5
 
 
 def test_sentinels_and_flags() -> None:

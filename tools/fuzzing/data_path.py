@@ -36,8 +36,8 @@ from tests.native import sanitizing  # noqa: E402
 def fuzz(seconds: float, rng: random.Random) -> None:
     """Fuzz in this process, which the sanitizers end if C does what it must not."""
     from skinware_drivers import native
+    from skinware_drivers.testing.both_paths import hand_clock
     from tests.native.fuzzing import run
-    from tests.native.pair import hand_clock
     from tests.serial.fuzzing import changed
 
     sanitizing.use_library()
@@ -63,8 +63,8 @@ def fuzz(seconds: float, rng: random.Random) -> None:
 
 def run_once(data: bytes) -> None:
     """Run one input in this process."""
+    from skinware_drivers.testing.both_paths import hand_clock
     from tests.native.fuzzing import run
-    from tests.native.pair import hand_clock
 
     sanitizing.use_library()
     with hand_clock() as clock:

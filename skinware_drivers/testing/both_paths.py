@@ -1,11 +1,15 @@
 """The two data paths side by side, numpy and C: both get the same, and everything that they have is compared.
 
-What differs by nature is left out: when the ring says that a frame was published, and the ring's own statistics.
+What differs by nature is left out: when the ring says that a frame was published, and the ring's own statistics. What
+they differ in otherwise is a fault of Skinware's, and not of the driver whose frames show it.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import secrets
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,10 +17,10 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 
 import skinware.native
 from skinware.driver_service import DriverReader, DriverWriter
+from skinware.memory.namespace import Namespace
 from skinware.status import Status
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
@@ -28,10 +32,9 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.testing.clock import HandClock, package_on
+from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.watch import Watch
 
-_WHY_PYTHON = native.why_python() or skinware.native.why_python()
-needs_native = pytest.mark.skipif(bool(_WHY_PYTHON), reason=f"no data path in C: {_WHY_PYTHON}")
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
 _NOBODY = (1 << 63) - 1
 _OF_STATE = (
@@ -80,9 +83,11 @@ class Asking:
 
     @property
     def wanted_ns(self) -> int:
+        """Since when the first of them waits; far ahead if nobody does."""
         return min(self.waiting, default=_NOBODY)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
+        """A frame was published."""
         self.answered.append((oldest_ns, position[1]))
         self.waiting = [time_ns for time_ns in self.waiting if time_ns > oldest_ns]
 
@@ -95,6 +100,7 @@ class Marking(Watch):
         self.seen: list[bytes] = []
 
     def look(self, updates: Updates) -> None:
+        """Mark the modules of flagged values."""
         self.module_status[updates.module[updates.status.any(axis=1)]] |= np.uint8(Status.SUSPECT)
         parts = updates.module, updates.whole, updates.status, updates.oldest_ns, updates.newest_ns, updates.sensors
         self.seen.append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
@@ -126,6 +132,8 @@ class Way:
         publishing: Publishing,
         rows: int,
         watch: Callable[[SkinTables], Watch],
+        namespace: Namespace | str | None,
+        payload_size: int,
     ) -> None:
         self.decoder = Decoder(layouts, tables, periods_s)
         self.writer = DriverWriter(
@@ -134,8 +142,9 @@ class Way:
             bus_counters=ALL_BUS_COUNTERS,
             patch_counters=ALL_PATCH_COUNTERS,
             slots=publishing.slots,
+            namespace=namespace,
         )
-        self.reader = DriverReader(name)
+        self.reader = DriverReader(name, namespace=namespace)
         self.watch = watch(tables)
         self.desk = Asking() if publishing.has_desk else None
         self.publisher = Publisher(
@@ -150,15 +159,18 @@ class Way:
         )
         self.publisher.bus_counters = [BusCounters() for _ in layouts]
         longest = max((layout.payload_size for layout in layouts if layout is not None), default=8)
-        self.batch = FrameBatch(rows, longest, self.decoder.headroom)
+        self.batch = FrameBatch(rows, payload_size or longest, self.decoder.headroom)
 
     def empty(self) -> None:
+        """Empty the batch, but for what waits for partners."""
         raise NotImplementedError
 
     def digest(self, interrupted: Sequence[int]) -> None:
+        """Decode the batch and publish what is due; some buses have lost frames before it."""
         raise NotImplementedError
 
     def publish_if_due(self) -> None:
+        """Publish if the time has come."""
         raise NotImplementedError
 
     def inside(self) -> Arrays:
@@ -198,11 +210,13 @@ class Way:
     def frame(self, sequence: int) -> Arrays:
         """One of the newest frames."""
         frame = self.reader._ring.copy(sequence)
-        assert frame is not None, f"frame {sequence} is not in the ring"
+        if frame is None:
+            defect(f"frame {sequence} is not in the ring")
         found: Arrays = {name: frame.column(name) for name in self.writer.column_offsets()}
         return found | {"acquired_ns": frame.acquired_ns}
 
     def close(self) -> None:
+        """Let go of the ring."""
         self.reader.close()
         self.writer.close()
 
@@ -245,7 +259,8 @@ class NativeWay(Way):
 
     @property
     def _path(self) -> NativePath:
-        assert self.path is not None, self.why_not
+        if self.path is None:
+            defect(f"there is no data path in C: {self.why_not}")
         return self.path
 
     def empty(self) -> None:
@@ -282,6 +297,8 @@ class Pair:
         publishing: how.
         rows: frames of a batch, at the most.
         watch: makes what looks at updates.
+        namespace: where both publish.
+        payload_size: of the batch's rows; 0: what the layouts need.
 
     Attributes:
         why_not: why there is nothing to compare with; empty if there is.
@@ -298,8 +315,10 @@ class Pair:
         *,
         rows: int = 1024,
         watch: Callable[[SkinTables], Watch] = Marking,
+        namespace: Namespace | str | None = None,
+        payload_size: int = 0,
     ) -> None:
-        more = layouts, tables, periods_s, publishing or Publishing(), rows, watch
+        more = layouts, tables, periods_s, publishing or Publishing(), rows, watch, namespace, payload_size
         self.clock = clock
         self.numpy = NumpyWay("numpy", *more)
         self.native = NativeWay("native", *more)
@@ -328,11 +347,32 @@ class Pair:
 
         self.do(take)
 
+    def feed_rows(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
+        """A batch of rows as the only bus wrote them."""
+
+        def take(way: Way) -> None:
+            way.empty()
+            rows = slice(way.batch.stop, way.batch.stop + len(wire))
+            way.batch.wire[rows], way.batch.time_ns[rows], way.batch.bus[rows] = wire, time_ns, 0
+            way.batch.stop = rows.stop
+            way.digest(())
+
+        self.do(take)
+
+    def pass_to(self, time_ns: int) -> None:
+        """Let time pass; what is due before then is published when it is."""
+        while self.deadline_ns < time_ns:
+            self.clock.now_ns = max(self.clock.now_ns, self.deadline_ns)
+            self.publish_if_due()
+        self.clock.now_ns = max(self.clock.now_ns, time_ns)
+
     def publish_if_due(self) -> None:
+        """Publish if the time has come."""
         self.do(lambda way: way.publish_if_due())
 
     @property
     def deadline_ns(self) -> int:
+        """When something has to be published at the latest, CLOCK_MONOTONIC ns."""
         return self.numpy.publisher.deadline_ns
 
     def do(self, action: Callable[[Way], object]) -> None:
@@ -343,9 +383,10 @@ class Pair:
             with _listening() as lines:
                 action(way)
             told.append(sorted(lines))
-        assert told[0] == told[1], f"numpy logs {told[0]}, C {told[1]}"
+        require(told[0] == told[1], f"numpy logs {told[0]}, C {told[1]}")
         newest = self.numpy.publisher.sequence
-        assert self.native.publisher.sequence == newest
+        sequence = self.native.publisher.sequence
+        require(sequence == newest, f"numpy has published {newest} frames, C {sequence}")
         for sequence in range(before + 1, newest + 1):
             _compare(self.numpy.frame(sequence), self.native.frame(sequence), f"frame {sequence}, ")
         _compare(self.numpy.arrays(), self.native.arrays())
@@ -362,7 +403,7 @@ def _compare(expected: Mapping[str, object], found: Mapping[str, object], where:
             is_same = value == other
         if not is_same:
             wrong.append(f"{where}{name}: numpy has\n{value!r}\nC has\n{other!r}")
-    assert not wrong, "\n".join(wrong)
+    require(not wrong, "\n".join(wrong))
 
 
 @contextmanager
@@ -376,8 +417,43 @@ def _listening() -> Iterator[list[str]]:
 
 
 @contextmanager
-def hand_clock() -> Iterator[HandClock]:
-    """A clock that the whole package is on."""
+def hand_clock(begin_ns: int = 0) -> Iterator[HandClock]:
+    """A clock that the whole package is on, and that begins there at the earliest."""
     clock = HandClock()
+    clock.now_ns = max(clock.now_ns, begin_ns)
     with package_on(clock):
         yield clock
+
+
+def require_same(
+    layout: Layout, tables: SkinTables, period_s: float, payload_size: int, frames: Sequence[tuple[int, int, bytes]]
+) -> None:
+    """Fail the test unless both paths make the same of frames that come one by one; nothing where there is only one.
+
+    Args:
+        layout: of the only bus.
+        tables: the skin.
+        period_s: nominal time between two updates of a module.
+        payload_size: of the batch's rows.
+        frames: (time_ns, identifier, payload) of each.
+    """
+    if why_python():
+        return
+    namespace = Namespace(f"both-paths-{os.getpid()}-{secrets.token_hex(4)}")
+    publishing = Publishing(period_s)
+    more: dict[str, Any] = {"rows": 1, "namespace": namespace, "payload_size": payload_size}
+    try:
+        with hand_clock() as clock, Pair(clock, [layout], tables, [period_s], publishing, **more) as pair:
+            require(not pair.why_not, f"C cannot do what this layout says: {pair.why_not}")
+            for time_ns, identifier, payload in frames:
+                pair.feed([(0, time_ns, identifier, payload)])
+    finally:
+        shutil.rmtree(namespace.path, ignore_errors=True)
+
+
+def why_python() -> str:
+    """Why there is nothing to compare with on this machine; empty if there is."""
+    return native.why_python() or skinware.native.why_python()
+
+
+__all__ = ["Marking", "Pair", "Publishing", "Way", "hand_clock", "require_same", "why_python"]

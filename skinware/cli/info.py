@@ -103,8 +103,6 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     """
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
-    if found["why_python"]:
-        lines.append(f"programs of this installation read without compiled code: {found['why_python']}")
     if not drivers and not services:
         lines += ["", "Nothing runs here yet. Start a driver:", "  skin-driver --bus virtual    (needs no hardware)"]
     for driver in drivers:
@@ -112,6 +110,8 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     for service in services:
         own = [*_column_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
         lines += ["", _life_line("service", service), *_indented(own)]
+    if found["why_python"]:
+        lines += ["", f"programs of this installation read without compiled code: {found['why_python']}"]
     if found["problems"]:
         lines += ["", *(click.style("problem: ", fg="red") + text for text in found["problems"])]
     return [part for line in lines for part in wrapped(line, terminal_width())]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter
+from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter, native
 from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
@@ -156,7 +156,8 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
 
 
 def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
-    empty = {"namespace": namespace.name, "drivers": [], "services": [], "problems": []}
+    own = {"data_path": native.path(), "why_python": native.why_python()}
+    empty = {"namespace": namespace.name, **own, "drivers": [], "services": [], "problems": []}
     assert told(capsys) == empty
     out = text(capsys)
     assert "0 drivers, 0 services" in out
@@ -325,6 +326,8 @@ def test_the_namespace_option(capsys: pytest.CaptureFixture[str], namespace: Nam
         assert told(capsys, "--namespace", namespace.name)["drivers"]
         assert told(capsys, "--namespace", f"{namespace.name}x") == {
             "namespace": f"{namespace.name}x",
+            "data_path": native.path(),
+            "why_python": native.why_python(),
             "drivers": [],
             "services": [],
             "problems": [],
@@ -363,7 +366,7 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
 
 
 def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
-    report = {"namespace": "x", "drivers": [], "services": [], "problems": ["refused"]}
+    report = {"namespace": "x", "why_python": "no compiler", "drivers": [], "services": [], "problems": ["refused"]}
     assert "\x1b[31mproblem: \x1b[0mrefused" in as_text(report)
 
 

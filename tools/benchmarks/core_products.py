@@ -9,13 +9,18 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
+import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware import Frame, Namespace, ServiceReader, ServiceWriter
+import skinware
+from skinware import Frame, Namespace, ServiceReader, ServiceWriter, native
 from skinware.errors import ServiceTimeout
 from skinware.realtime import now_ns
 
@@ -75,6 +80,35 @@ class Skinware:
 
     def subscriber(self, topic: str, _n_sensors: int) -> Subscriber:
         return _SkinwareSubscriber(topic, self._namespace)
+
+
+class SkinwareInPython(Skinware):
+    """Ours where nothing is compiled."""
+
+    name = "python"
+
+    def subscriber(self, topic: str, n_sensors: int) -> Subscriber:
+        os.environ["SKINWARE_NATIVE"] = "0"  # of the reader's process alone
+        native.load.cache_clear()
+        return super().subscriber(topic, n_sensors)
+
+
+class SkinwareInC(Skinware):
+    """Ours, read by a program of ``skinware.h``."""
+
+    name = "c"
+
+    def __init__(self, namespace: Namespace) -> None:
+        super().__init__(namespace)
+        self._folder = tempfile.TemporaryDirectory()
+        program = Path(self._folder.name) / "core_reader"
+        source = Path(__file__).with_name("core_reader.c")
+        subprocess.run(["cc", "-O2", f"-I{skinware.get_include()}", "-o", program, source], check=True)
+        self._command = [str(program), namespace.name]
+
+    def reader_command(self, topic: str) -> list[str]:
+        """The program, and what to tell it."""
+        return [*self._command, topic]
 
 
 class _SkinwarePublisher:
@@ -274,6 +308,8 @@ def products(names: list[str], namespace: Namespace, port: int) -> list[Product]
     """
     makers: dict[str, Callable[[], Product]] = {
         "skinware": lambda: Skinware(namespace),
+        "c": lambda: SkinwareInC(namespace),
+        "python": lambda: SkinwareInPython(namespace),
         "iceoryx2": Iceoryx2,
         "zenoh": lambda: Zenoh(port, shared_memory=True),
         "zenoh-tcp": lambda: Zenoh(port, shared_memory=False),
@@ -281,4 +317,4 @@ def products(names: list[str], namespace: Namespace, port: int) -> list[Product]
     return [makers[name]() for name in names]
 
 
-NAMES = ("skinware", "iceoryx2", "zenoh", "zenoh-tcp")
+NAMES = ("skinware", "c", "iceoryx2", "zenoh", "python", "zenoh-tcp")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import secrets
+import subprocess
 import time
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 
 import numpy as np
 import numpy.typing as npt
-from core_products import Product
+from core_products import Product, SkinwareInC
 from processes import READY, CpuShare, Processes, RunFailed, answer, use_fifo
 
 from skinware.realtime import Periodic, now_ns
@@ -124,6 +125,9 @@ def _write(pipe: Connection, product: Product, topic: str, cell: Cell, count: in
 
 def _read(pipe: Connection, product: Product, topic: str, cell: Cell) -> None:
     use_fifo(_READER_PRIORITY if cell.profile == "fifo" else None)
+    if isinstance(product, SkinwareInC):
+        _read_in_c(pipe, product.reader_command(topic))
+        return
     subscriber = product.subscriber(topic, cell.sensors)
     pipe.send(READY)
     ages: list[int] = []
@@ -142,3 +146,12 @@ def _read(pipe: Connection, product: Product, topic: str, cell: Cell) -> None:
     received: npt.NDArray[np.int64] = np.array(ages, np.int64)
     pipe.send((received, torn, cpu))
     subscriber.close()
+
+
+def _read_in_c(pipe: Connection, command: list[str]) -> None:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        assert program.stdout.readline() == "ready\n"
+        pipe.send(READY)
+        cpu, torn, *ages = program.stdout.read().split()
+    pipe.send((np.array(ages, np.int64), int(torn), float(cpu)))

@@ -27,7 +27,7 @@ def built_wheel(factory: pytest.TempPathFactory) -> Path:
 def _build_into(folder: Path) -> None:
     source = folder / "source"
     copy_sources(source)
-    pip_in(source, "wheel", "--no-deps", "--wheel-dir", str(folder))
+    make_wheel(source, folder)
 
 
 def copy_sources(folder: Path) -> None:
@@ -39,18 +39,32 @@ def copy_sources(folder: Path) -> None:
         shutil.copy(ROOT / part, folder)
 
 
-def pip_in(source: Path, command: str, *options: str, environ: Mapping[str, str] | None = None) -> str:
-    """Run pip with the package of a folder, and no network; what it said. It must succeed.
+def make_wheel(source: Path, folder: Path, environ: Mapping[str, str] | None = None) -> Path:
+    """The wheel of copied sources.
 
     Args:
-        source: the folder.
-        command: of pip, such as ``wheel``.
-        options: more of them.
+        source: the copy.
+        folder: for the wheel.
+        environ: environment beside what is there.
+    """
+    options = ["--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
+    run_in(source, "-m", "pip", "wheel", *options, ".", environ=environ)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+def run_in(source: Path, *arguments: str, environ: Mapping[str, str] | None = None) -> str:
+    """Run Python with copied sources, and a compiler that does not optimize; what it said. It must succeed.
+
+    Args:
+        source: the copy.
+        arguments: of Python.
         environ: environment beside what is there.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "pip", "-v", command, "--no-index", "--no-build-isolation", *options, str(source)],
-        env={**os.environ, **(environ or {})},
+        [sys.executable, *arguments],
+        cwd=source,
+        env={**os.environ, "CFLAGS": "-O0", **(environ or {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

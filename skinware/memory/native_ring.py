@@ -19,6 +19,7 @@ from skinware.memory.segments import Segment
 
 _NEVER_NS = (1 << 63) - 1
 _COPIED, _NOTHING = 1, 0  # what library.c answers
+_NEWEST = ctypes.c_uint64(0)
 
 
 def ring_reader(segment: Segment, frame_class: type[FrameT], context: object = None) -> RingReader[FrameT]:
@@ -83,7 +84,6 @@ class NativeRingReader(RingReader[FrameT]):
         super().__init__(segment, frame_class, context)
         self._pool = FramePool(lambda data: frame_class(self, data), segment.layout.slot_stride)
         self._copy_call = library.quick.skinware_native_copy
-        self._copy_call.argtypes = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p
         self._wait_call = library.waiting.skinware_native_wait
         self._turn_call = library.waiting.skinware_native_turn
         self._turn_at_once = library.quick.skinware_native_turn
@@ -98,7 +98,8 @@ class NativeRingReader(RingReader[FrameT]):
     def copy(self, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
         frame, _, memory = self._pool.free()
-        return self._copied(self._copy_call(self._request_at, sequence or 0, memory), frame)
+        wanted = _NEWEST if sequence is None else ctypes.c_uint64(sequence)
+        return self._copied(self._copy_call(self._request_at, wanted, memory), frame)
 
     def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
@@ -127,9 +128,12 @@ class NativeRingReader(RingReader[FrameT]):
         turn = self._turn_call if self._words[LATEST] == state.last else self._turn_at_once
         return frame if turn(self._turns_at, memory) else None
 
-    def resume_turns(self, last: int, until_ns: int) -> None:
+    def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> bool:
         """As in Python."""
-        self._turns.last, self._turns.until_ns = last, until_ns
+        state = self._turns
+        state.last, state.until_ns = last, until_ns
+        state.acquired_ns, state.taken_ns = turn or (0, 0)
+        return True
 
     def settle_turns(self) -> Turns | None:
         """As in Python."""
@@ -139,10 +143,6 @@ class NativeRingReader(RingReader[FrameT]):
         told = Turns(state.frames, state.lost, state.last, [Turn(*turn) for turn in state.turns[: state.noted]])
         state.frames = state.lost = state.noted = 0
         return told
-
-    def begin_turn(self, acquired_ns: int, taken_ns: int) -> None:
-        """As in Python."""
-        self._turns.acquired_ns, self._turns.taken_ns = acquired_ns, taken_ns
 
     def end_turn(self) -> tuple[int, int] | None:
         """As in Python."""

@@ -175,7 +175,6 @@ class RingReader(Generic[FrameT]):
         self._count = layout.slot_count
         self._slots = slots_of(segment)
         self._slot_words = slot_headers_of(segment)
-        self._open_turn: tuple[int, int] | None = None
 
     @property
     def latest(self) -> int:
@@ -262,21 +261,26 @@ class RingReader(Generic[FrameT]):
         """
         return None
 
-    def resume_turns(self, last: int, until_ns: int) -> None:
-        """Say which frame was taken last, and when something else is to be done at the latest."""
+    def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> bool:  # noqa: ARG002, not here
+        """Begin to take turns in C, where there is C.
+
+        Args:
+            last: sequence of the frame that was taken last.
+            until_ns: when something else is to be done at the latest.
+            turn: ``acquired_ns`` of that frame and when it was handed out; None if its turn is over.
+
+        Returns:
+            Whether there is C.
+        """
+        return False
 
     def settle_turns(self) -> Turns | None:
         """What came of turns in C since the last call, None if there were none."""
         return None
 
-    def begin_turn(self, acquired_ns: int, taken_ns: int) -> None:
-        """A frame was handed out, but not by ``next_turn``, which does this itself."""
-        self._open_turn = acquired_ns, taken_ns
-
     def end_turn(self) -> tuple[int, int] | None:
-        """``acquired_ns`` of the frame in hand and when it was handed out; None if there is none, or it was told."""
-        turn, self._open_turn = self._open_turn, None
-        return turn
+        """``acquired_ns`` of the frame that C handed out last and when that was; None if its turn is over."""
+        return None
 
     @property
     def missed_periods(self) -> int:

@@ -49,6 +49,8 @@ class ServiceReader(Attachment[FrameT]):
     ) -> None:
         super().__init__(name, namespace, timeout_s)
         self._last_taken: Position | None = None
+        self._open_turn: tuple[int, int] | None = None
+        self._turns_in_c = False  # whether the ring counts at the moment, for a loop
         self._accounts = Accounts(self.namespace, name, announce)
 
     @property
@@ -161,8 +163,12 @@ class ServiceReader(Attachment[FrameT]):
             self._accounts.begin_loop("asap")
             while True:
                 deadline_ns = _deadline_ns(timeout_s)
-                frame = None if self._closed or max_age_s is not None else self._ring.next_turn(deadline_ns)
-                yield self._read(self._last, max_age_s, deadline_ns) if frame is None else frame
+                in_c = self._turns_in_c and not self._closed and max_age_s is None
+                frame = self._ring.next_turn(deadline_ns) if in_c else None
+                if frame is None:
+                    frame = self._read(self._last, max_age_s, deadline_ns)
+                    self._go_round_in_c()
+                yield frame
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
@@ -188,8 +194,12 @@ class ServiceReader(Attachment[FrameT]):
         self._accounts.begin_loop("in order")
         while True:
             deadline_ns = _deadline_ns(timeout_s)
-            frame = None if self._closed else self._ring.next_turn(deadline_ns, in_order=True)
-            yield self._read_in_order(deadline_ns) if frame is None else frame
+            in_c = self._turns_in_c and not self._closed
+            frame = self._ring.next_turn(deadline_ns, in_order=True) if in_c else None
+            if frame is None:
+                frame = self._read_in_order(deadline_ns)
+                self._go_round_in_c()
+            yield frame
 
     def request(self, *, timeout_s: float = 5.0) -> FrameT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.
@@ -349,7 +359,6 @@ class ServiceReader(Attachment[FrameT]):
 
     def _newest_now(self, take: Callable[[], FrameT | None], alive: bool) -> FrameT:
         """The newest frame without a wait, so that this is the moment to count it."""
-        self._settle()
         frame = self._taken(self._whole(take), alive)
         self._end_turn()
         return frame
@@ -380,21 +389,35 @@ class ServiceReader(Attachment[FrameT]):
 
     @_last.setter
     def _last(self, position: Position | None) -> None:
+        self._come_back()
         self._last_taken = position
-        if position is not None:
-            self._ring.resume_turns(position[1], self._accounts.due_ns)
+
+    def _go_round_in_c(self) -> None:
+        """Leave a loop's next turns to C, where there is C, until they have to be done here."""
+        if self._last_taken is not None:
+            self._turns_in_c = self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
+        if self._turns_in_c:
+            self._open_turn = None
+
+    def _come_back(self) -> None:
+        """The next turn is done here."""
+        if self._turns_in_c:
+            self._settle()
+            self._open_turn = self._ring.end_turn()
+            self._turns_in_c = False
 
     def _settle(self) -> None:
         """Count the frames that were taken in C since the last time."""
-        turns = self._ring.settle_turns()
+        turns = self._ring.settle_turns() if self._turns_in_c else None
         if turns is not None:
             self._last_taken = self._ring.generation, turns.last
             self._accounts.settle(turns)
 
     def _end_turn(self) -> None:
         """What was taken last is done with."""
-        self._settle()
-        self._accounts.end_turn(self._ring.end_turn())
+        self._come_back()
+        turn, self._open_turn = self._open_turn, None
+        self._accounts.end_turn(turn)
 
     def _count(self, frame: FrameT) -> None:
         last = self._last
@@ -403,7 +426,7 @@ class ServiceReader(Attachment[FrameT]):
             lost = frame.sequence - last[1] - 1
         self._last = frame.generation, frame.sequence
         self._accounts.taken(lost)
-        self._ring.begin_turn(frame.acquired_ns, now_ns())
+        self._open_turn = frame.acquired_ns, now_ns()
 
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ HEAD = 3
 DEPTH = 8
 _HEAD_BYTES = 8 * HEAD
 _MAX_READERS = 16
-_WAIT_MS = 500
+_WAIT_MS = 5000  # longer than it takes to start all readers
 
 Values = npt.NDArray[np.uint16]
 Message = tuple[int, int, int, Values]

@@ -32,10 +32,10 @@ from skinware_drivers.testing.value_tests import ValueTests
 
 
 @pytest.mark.usefixtures("namespace")
-class DriverConformance(
-    PathTests, SilenceTests, TornTests, FaultTests, LifeTests, ValueTests
-):  # pytest begins with the last
+class DriverConformance(SilenceTests, PathTests, TornTests, FaultTests, LifeTests, ValueTests):
     """Tests for a driver. Subclass it, say which driver and which emulator, and nothing else.
+
+    pytest begins with those of the last base class.
 
     Attributes:
         driver: the adapter class.

@@ -164,7 +164,7 @@ def _number(draw: st.DrawFn, shortest: int, fewest: int) -> SequenceNumber | Non
 @st.composite
 def _flags(draw: st.DrawFn, longest: int, n_channels: int) -> Sequence[Flag | Sentinel | StatusBytes]:
     found: list[Flag | Sentinel | StatusBytes] = []
-    for _ in range(draw(st.sampled_from([0, 0, 1, 2, 3]))):
+    for _ in range(draw(st.sampled_from([0, 1, 2, 3]))):
         status = draw(st.sampled_from(_STATUS))
         what = draw(st.sampled_from(["word", "sentinel", "bytes"]))
         if what == "word":
@@ -198,6 +198,8 @@ class _Naming:
 
     def conditions(self, number: int) -> list[Condition]:
         slot, byte = number, None
+        if self.kinds_by == "byte alone":
+            return [Byte(self.kind_byte, 0x10 + number)]
         if self.kinds_by == "byte":
             slot, byte = 0, Byte(self.kind_byte, 0x10 + number)
         elif self.kinds_by == "both":
@@ -228,7 +230,7 @@ def _naming(draw: st.DrawFn, shortest: int) -> _Naming:
     shift = draw(st.integers(0, 5))
     return _Naming(
         draw(st.booleans()),
-        draw(st.sampled_from(["identifier", "byte", "both"])),
+        draw(st.sampled_from(["identifier", "byte", "both", "byte alone"])),
         draw(st.sampled_from(["bits", "key", "none"])),
         draw(st.sampled_from(["bits", "byte", "key", "none"])),
         draw(st.integers(0, shortest - 1)),

@@ -16,6 +16,7 @@ from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 from skinware_drivers.testing.clock import HandClock
 from tests.native import needs_native
+from tests.native.fuzzing import designs
 from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames
 from tests.native.traffic import Burst, Digest, Event, Pass, Player, Sender, scripts, senders
 
@@ -116,3 +117,16 @@ def test_signaling_nans_stay_what_they_are(clock: HandClock) -> None:
     with Pair(clock, design.layouts, design.tables(), design.periods_s) as pair:
         pair.feed([(0, clock.now_ns, 0x100, raw + raw[::-1])])
         assert pair.native.decoder.state.values.tobytes() == 2 * raw[::-1]
+
+
+def test_a_patch_in_a_hurry_is_told_of_by_both(clock: HandClock) -> None:
+    design = designs()["timed cycle"]
+    identifiers = [0x100, 0x200, 0x300]
+    with Pair(clock, design.layouts, design.tables(), design.periods_s) as pair:
+        for _ in range(20):
+            frames = []
+            for _ in range(6):
+                clock.now_ns += 1_000_000
+                frames += [(0, clock.now_ns, identifier, bytes(8)) for identifier in identifiers]
+            pair.feed(frames)
+        assert (pair.native.decoder.haste < -1000).any()

@@ -108,6 +108,7 @@ FAULTS = (
     "garbage",
     "other header",
     "other module",
+    "stranger's length",
     "twice",
     "swapped",
     "late",
@@ -332,7 +333,7 @@ class Player:
             self._counts[who] = self._counts.get(who, 0) + burst.counts
             put_number(payload, number, self._counts[who] % number.turn)
         if frame.module_byte is not None:
-            put_bits(payload, frame.module_byte, key ^ ("other module" in wrong))
+            put_bits(payload, frame.module_byte, key ^ ("other module" in wrong) ^ 5 * ("stranger's length" in wrong))
         for condition in frame.when:
             if isinstance(condition, Byte):
                 value = condition.value ^ (0x07 if "other header" in wrong else 0)
@@ -344,7 +345,7 @@ class Player:
             payload = bytearray(_bytes(burst.value + place, length))
         if "short" in wrong:
             del payload[burst.value % length :]
-        if "long" in wrong:
+        if "long" in wrong or "stranger's length" in wrong:
             payload += bytes(1 + burst.value % 3)
         return bytes(payload[:longest])
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState
-from skinware_drivers.bus import KernelSource, Received
+from skinware_drivers.bus import Received
 from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.native import structs
 from skinware_drivers.running.bus_line import BusLine
@@ -83,13 +83,25 @@ class Flow:
         self._latency_s = latency_s
         self._take, self._fail = take, fail
         self._flow = structs.Flow(epoll_fd=epoll_fd)
-        self._handed: list[KernelSource | None] = []
         self._sources = (structs.Source * 0)()
         self._line_of: list[BusLine] = []
         path.sort_out, path.lose, path.heard = self._sort_out, self._lose, self._heard
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, for so long at the most."""
+        try:
+            reason = self._run(loop_fd, timeout_s)
+        except BaseException as error:  # noqa: BLE001
+            self._fail(error)
+            return
+        if reason == _NO_MEMORY:
+            self._fail(MemoryError("no memory for the updates of a driver"))
+        elif reason == _NEWS:
+            self._generation.update_bus_states()
+        elif reason == _OTHER_BUS:
+            asyncio.get_running_loop().call_soon(self._take)
+
+    def _run(self, loop_fd: int, timeout_s: float | None) -> int:
         flow = self._flow
         flow.loop_fd = loop_fd
         flow.until_ns = _NEVER_NS if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
@@ -99,19 +111,10 @@ class Flow:
         self._generation.prepare_native()
         self._path.interrupt(self._generation.interrupted())
         try:
-            reason = self._path.run(flow)
-        except BaseException as error:  # noqa: BLE001
-            self._fail(error)
-            return
+            return self._path.run(flow)
         finally:
             self._take_back()
             self._generation.interrupted()  # C knows of these
-        if reason == _NO_MEMORY:
-            self._fail(MemoryError("no memory for the updates of a driver"))
-        elif reason == _NEWS:
-            self._generation.update_bus_states()
-        elif reason == _OTHER_BUS:
-            asyncio.get_running_loop().call_soon(self._take)
 
     def _rest_s(self) -> float:
         links = [line.link for line in self._lines]

@@ -284,6 +284,14 @@ class Link:
         return bool(self._waiters or self._late or self._heard is not None)
 
     @property
+    def awaited(self) -> Sequence[Filter]:
+        """What lets those frames through that matter to anybody."""
+        if self._heard is not None:
+            return (Filter(0, 0),)
+        waiting = [matches for matches, _ in self._waiters] + [matches for _, matches in self._late]
+        return [match.filter for matches in waiting for match in matches]
+
+    @property
     def expects_data(self) -> bool:
         """Whether a question is open whose answer may be data: ``hear`` wants to be called."""
         return self._expected is not None

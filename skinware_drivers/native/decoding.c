@@ -123,6 +123,31 @@ static void sever(struct path *path)
     memset(path->plan->interrupted, 0, (size_t)path->plan->n_buses);
 }
 
+static bool is_awaited(const struct plan *plan, uint32_t identifier)
+{
+    bool found = plan->n_awaited < 0;
+    for (int64_t i = 0; i < plan->n_awaited && !found; i++)
+        found = (identifier & plan->awaited[i].mask) == plan->awaited[i].value;
+    return found;
+}
+
+/* Offer rows that are of no module of ours to those who wait for such; the others are strangers. */
+static void part_with(struct path *path, int64_t time_ns)
+{
+    int64_t n_awaited = 0, n_strangers = 0, *awaited = path->rows, *strangers = path->foreign;
+    for (int64_t i = 0; i < path->n_foreign; i++) {
+        int64_t row = path->foreign[i];
+        if (path->plan->hooks.offer && is_awaited(path->plan, identifier_of(path->batch, row)))
+            awaited[n_awaited++] = row;
+        else
+            strangers[n_strangers++] = row;
+    }
+    if (n_strangers)
+        count_strangers(path, strangers, n_strangers, time_ns);
+    if (n_awaited)
+        path->plan->hooks.offer(awaited, n_awaited);
+}
+
 /* The batch becomes updates: those held back come first, then the new ones in order of time, all in `list`. */
 void decode_batch(struct path *path)
 {
@@ -141,9 +166,7 @@ void decode_batch(struct path *path)
         find_cycles(path, &plan->cycles[number], number);
     finish_updates(path, first);
     put_in_order(path, first);
-    if (path->n_foreign && plan->hooks.offer)
-        plan->hooks.offer(path->foreign, path->n_foreign);
-    else if (path->n_foreign)
-        count_strangers(path, path->foreign, path->n_foreign, time_ns);
+    if (path->n_foreign)
+        part_with(path, time_ns);
     put_back(path);
 }

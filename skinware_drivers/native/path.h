@@ -192,6 +192,8 @@ struct plan {
     struct columns columns;
 
     struct hooks hooks;
+    int64_t n_awaited; /* frames of no module that somebody waits for; -1: any */
+    const struct identifier_condition *awaited;
 };
 
 #endif

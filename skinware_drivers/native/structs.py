@@ -177,6 +177,8 @@ class Plan(ctypes.Structure):
         *_fields("timing timing_before_ns", _POINTER),
         ("columns", Columns),
         ("hooks", Hooks),
+        *_fields("n_awaited"),
+        *_fields("awaited", _POINTER),
     ]
 
 

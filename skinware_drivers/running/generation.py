@@ -125,6 +125,7 @@ class Generation:
         if self.native is not None:
             self.native.hear = self._hear if any(line.link.expects_data for line in self.lines) else None
             self.native.offer = self._offer if any(line.link.is_listening for line in self.lines) else None
+            self.native.awaited = [wanted for line in self.lines for wanted in line.link.awaited]
 
     def _hear(self, rows: Rows) -> None:
         for line, own in zip(self.lines, split_by_bus(self.batch, rows, len(self.lines)), strict=True):

@@ -16,7 +16,7 @@ from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import PatchState, Status
 from skinware_drivers import native
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import Filter, FrameBatch
 from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import Updates
@@ -56,6 +56,7 @@ class NativePath:
     Attributes:
         hear: shown the new rows of each batch, before anything else, while somebody waits for a frame that is data.
         offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
+        awaited: what lets the rows through that are to be offered; None: all are.
         sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
         lose: told which bus went away, and the system's error number.
         heard: told that frames came on a bus that is watched.
@@ -65,6 +66,7 @@ class NativePath:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
         self.hear: Callable[[Rows], None] | None = None
         self.offer: Callable[[Rows], Rows] | None = None
+        self.awaited: Sequence[Filter] | None = None
         self.sort_out: Callable[[int, int, int], int] | None = None
         self.lose: Callable[[int, int], None] | None = None
         self.heard: Callable[[], None] | None = None
@@ -154,6 +156,10 @@ class NativePath:
         self._words.wanted_ns = self._publisher.wanted_ns
         self._words.ring, self._words.sequence = self._publisher.ring_address or 0, self._publisher.sequence
         self._set_hooks()
+        conditions = [structs.IdentifierCondition(mask, value) for value, mask in self.awaited or ()]
+        self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
+        self._plan.n_awaited = -1 if self.awaited is None else len(conditions)
+        self._plan.awaited = ctypes.addressof(self._awaited)
 
     def _leave(self) -> None:
         self._batch.start, self._batch.stop = self._rows.start, self._rows.stop

@@ -4,7 +4,7 @@
  * arrays, which Python owns; `struct plan` says where they are. What only Python can do (a driver's own functions,
  * whoever waits for a frame) is called from inside, through `struct hooks`.
  *
- * All fields are 8 bytes wide, so that Python can describe them without padding (tables.py has the same fields in the
+ * All fields are 8 bytes wide, so that Python can describe them without padding (structs.py has the same fields in the
  * same order). Modules, patches, buses, sensors and kinds of frame are numbers; times are CLOCK_MONOTONIC ns.
  */
 #ifndef SKINWARE_DRIVERS_PATH_H

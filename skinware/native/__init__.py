@@ -56,11 +56,12 @@ def load(file: Path, abi: int) -> Loaded:
     """
     if os.environ.get("SKINWARE_NATIVE") == "0":
         return Loaded(None, "SKINWARE_NATIVE=0")
-    if not file.exists():
-        return Loaded(None, f"no {file.name}: it was not compiled when this package was installed")
     try:
+        file.stat()
         library = Library(ctypes.CDLL(str(file)), ctypes.PyDLL(str(file)))
         found = library.quick.skinware_native_abi()
+    except FileNotFoundError:
+        return Loaded(None, f"no {file.name}: it was not compiled when this package was installed")
     except (OSError, AttributeError) as error:
         return Loaded(None, f"{file.name} cannot be loaded: {error}")
     if found != abi:

@@ -93,7 +93,7 @@ class SilenceTests(Suite):
         """Everything is fresh again, and right."""
         end_ns = rig.clock.now_ns
         await rig.until(
-            lambda frame: frame.published_ns > end_ns and is_fresh(frame) and is_live(frame),
+            lambda frame: frame.acquired_ns > end_ns and is_fresh(frame) and is_live(frame),
             f"{after}, and {within_s:g} s later not every sensor is fresh again: look at `probe` and `revive`; what the"
             f" driver sent: {rig.sent_in_words()}",
             within_s=within_s,

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.cli.import_ import command
 from skinware_drivers.options import describe_options
+from skinware_drivers.testing.waiting import read_until
 from tests.commands import running
 from tests.icub.conftest import WRAPPER, Made, configuration, device
 from tests.icub.test_positions import TRIANGLE, positions
@@ -49,5 +51,7 @@ def test_the_snippet_of_the_how_to_finds_the_load(
     monkeypatch.chdir(made.folder)
     with running("skin-driver", "--config", "skin/torso_skin.toml") as driver:
         driver.wait_for("ready")
+        with DriverReader("torso_skin") as reader:
+            read_until(reader, lambda frame: not frame.status.any())
         exec(compile(snippet, page, "exec"), {"__name__": "how-to"})
     assert re.fullmatch(r"centre of load \[.*\] m in the frame chest\n", capsys.readouterr().out)

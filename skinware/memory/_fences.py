@@ -1,7 +1,7 @@
 """Memory order between processes: what makes a plain store of the sequence enough, or not.
 
 x86-64 keeps the order of loads and of stores (Intel SDM vol. 3, 9.2.3), so aligned 8-byte accesses suffice. On
-other processors the two fences of the slot protocol come from libatomic.
+other processors the two fences of the slot protocol come from our own compiled code, or from libatomic.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import ctypes
 import platform
 from collections.abc import Callable
 
+from skinware import native
 from skinware.errors import PlatformError
 
 _SEQUENTIALLY_CONSISTENT = 5  # memory_order_seq_cst of <stdatomic.h>
@@ -20,14 +21,24 @@ def _nothing() -> None:
     pass
 
 
-def fence_for(machine: str, library: str = "libatomic.so.1") -> Callable[[], None]:
+def fence_for(
+    machine: str, compiled: native.Library | None = None, library: str = "libatomic.so.1"
+) -> Callable[[], None]:
     """The fence that a processor needs between a slot's sequence and its data.
 
+    Args:
+        machine: what ``platform.machine`` calls the processor.
+        compiled: our own code, None where Python does its work.
+        library: where else there is a fence.
+
     Raises:
-        PlatformError: the processor needs fences and there is no libatomic.
+        PlatformError: the processor needs fences, nothing is compiled, and there is no libatomic.
     """
     if machine in _TOTAL_STORE_ORDER:
         return _nothing
+    if compiled is not None:
+        own: Callable[[], None] = compiled.quick.skinware_native_fence
+        return own
     try:
         thread_fence = ctypes.CDLL(library).atomic_thread_fence
     except (OSError, AttributeError):
@@ -40,5 +51,5 @@ def fence_for(machine: str, library: str = "libatomic.so.1") -> Callable[[], Non
     return lambda: thread_fence(_SEQUENTIALLY_CONSISTENT)
 
 
-fence = fence_for(platform.machine())
+fence = fence_for(platform.machine(), native.core())
 """Orders everything before it against everything after it, for all processes that map the memory."""

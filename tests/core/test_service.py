@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import Column, Frame, Namespace, ServiceReader, ServiceWriter, native
 from skinware.errors import Overrun, Paused, PlatformError, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory import _fences, file_layout, segments
 from skinware.memory import ring as ring_module
@@ -72,14 +72,15 @@ def test_what_goes_wrong_during_a_view_is_told_as_it_is() -> None:
             look(reader, writer)
 
 
-def test_other_processors_get_fences_from_libatomic(monkeypatch: pytest.MonkeyPatch) -> None:
-    fence = _fences.fence_for("aarch64")
+@pytest.mark.parametrize("compiled", [None, native.core()], ids=["libatomic", "compiled"])
+def test_other_processors_get_fences(monkeypatch: pytest.MonkeyPatch, compiled: native.Library | None) -> None:
+    fence = _fences.fence_for("aarch64", compiled)
     monkeypatch.setattr(ring_module, "fence", fence)
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
         publish(writer, 7)
         assert reader.read().column("values")[0] == 7
     with pytest.raises(PlatformError, match="libatomic1"):
-        _fences.fence_for("aarch64", "libmissing.so.9")
+        _fences.fence_for("aarch64", library="libmissing.so.9")
 
 
 # -- losses -------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ A bus knows nothing of skins. It moves frames between a wire and a :class:`Frame
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple, Self, TypeVar
@@ -15,7 +14,7 @@ from typing import ClassVar, NamedTuple, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.errors import BusSendError, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.samples import Samples
@@ -169,51 +168,6 @@ class FrameBatch:
         self.stop += 1
 
 
-class KernelSource(NamedTuple):
-    """A socket from which C code receives in place of its bus.
-
-    Attributes:
-        fd: the socket; its datagrams are ``struct can_frame`` or ``struct canfd_frame``.
-        headers: address of a ``struct mmsghdr`` for every row of the batch.
-        control: address of 64 bytes for the ancillary data of every row.
-        offset_ns: CLOCK_MONOTONIC - CLOCK_REALTIME.
-        last_poll_ns: when frames were stamped last, CLOCK_MONOTONIC ns.
-        lost_before: frames that were lost before the socket was opened.
-        is_counted: count bits on the wire.
-        speed_up: by how much the payload of CAN FD frames that switch is faster.
-        is_small: the receive buffer is full after a few frames.
-    """
-
-    fd: int
-    headers: int
-    control: int
-    offset_ns: int
-    last_poll_ns: int
-    lost_before: int
-    is_counted: bool
-    speed_up: float
-    is_small: bool
-
-
-class Received(NamedTuple):
-    """What C code has received in place of a bus.
-
-    Attributes:
-        offset_ns, last_poll_ns: as of :class:`KernelSource`, now.
-        frames: so many.
-        lost: frames that were lost ever.
-        wire_bits: what the frames took.
-        fullest: largest share of the receive buffer in use.
-    """
-
-    offset_ns: int
-    last_poll_ns: int
-    frames: int
-    lost: int
-    wire_bits: float
-    fullest: float
-
-
 class Bus(ABC):
     """One link to hardware.
 
@@ -320,30 +274,6 @@ class Bus(ABC):
     @abstractmethod
     def close(self) -> None:
         """Let go of the wire. Idempotent."""
-
-    @property
-    def reads_natively(self) -> bool:
-        """Whether C code can receive in place of ``receive`` while it is open."""
-        return False
-
-    def hand_over(self, batch: FrameBatch) -> KernelSource | None:  # noqa: ARG002
-        """What C code needs to receive in place of ``receive``; None: it cannot, now or ever."""
-        return None
-
-    def take_back(self, received: Received) -> None:  # noqa: B027
-        """What C code did since ``hand_over``; called before anything else of this bus is."""
-
-    def sort_out(self, batch: FrameBatch, new: slice) -> int:  # noqa: ARG002
-        """Take what is no data frame out of rows that C code received; returns how many are left."""
-        return new.stop - new.start  # type: ignore[no-any-return]
-
-    def nothing_received(self, number: int) -> int:
-        """What an error of the kernel means, in the place of frames that C code wanted.
-
-        Raises:
-            skinware.errors.BusNotAvailable: the interface went down or away.
-        """
-        raise BusNotAvailable(f"{self.name}: {os.strerror(number)}")
 
     def narrow(self, filters: Sequence[Filter]) -> None:  # noqa: B027  (a bus need not be able to)
         """From now on leave out what none of these lets through; without any, nothing is left out.

@@ -285,7 +285,8 @@ class Link:
 
     @property
     def awaited(self) -> Sequence[Filter]:
-        """What lets those frames through that matter to anybody."""
+        """What lets those frames through that matter to anybody; nothing if ``is_listening`` is false."""
+        self._forget_late()
         if self._heard is not None:
             return (Filter(0, 0),)
         waiting = [matches for matches, _ in self._waiters] + [matches for _, matches in self._late]

@@ -34,12 +34,6 @@ typedef struct skinware_native_turns {
     turn turns[TURNS];
 } skinware_native_turns;
 
-static int64_t clock_ns(clockid_t clock) {
-    struct timespec now;
-    clock_gettime(clock, &now);
-    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
-}
-
 static void end_turn(skinware_native_turns *turns, int64_t now_ns) {
     turn *over = &turns->turns[turns->noted];
     if (turns->taken_ns == 0)
@@ -47,7 +41,7 @@ static void end_turn(skinware_native_turns *turns, int64_t now_ns) {
     over->acquired_ns = turns->acquired_ns;
     over->taken_ns = turns->taken_ns;
     over->ended_ns = now_ns;
-    over->cpu_ns = clock_ns(CLOCK_THREAD_CPUTIME_ID);
+    over->cpu_ns = skinware__clock_ns(CLOCK_THREAD_CPUTIME_ID);
     turns->noted++;
     turns->taken_ns = 0;
 }
@@ -66,7 +60,7 @@ static int take(skinware_native_turns *turns, uint64_t latest, unsigned char *to
     turns->frames++;
     turns->last = wanted;
     turns->acquired_ns = slot->acquired_ns;
-    turns->taken_ns = clock_ns(CLOCK_MONOTONIC);
+    turns->taken_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     return 1;
 }
 
@@ -77,7 +71,7 @@ int skinware_native_turn(skinware_native_turns *turns, unsigned char *to) {
     const unsigned char *map = turns->ring.map;
     const uint32_t wake_word = skinware__load_32(map + SKINWARE__WAKE_WORD_OFFSET);
     uint64_t latest = skinware__latest(&turns->ring);
-    const int64_t now_ns = clock_ns(CLOCK_MONOTONIC);
+    const int64_t now_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     int64_t until_ns;
     end_turn(turns, now_ns);
     if (turns->last == 0 || turns->noted == TURNS || (skinware__load_32(map + SKINWARE__STATE_OFFSET) & 6u) ||

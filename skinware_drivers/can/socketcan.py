@@ -27,11 +27,8 @@ from skinware.status import BusReason
 from skinware_drivers.bus import (
     ERROR_FLAG,
     REMOTE_FLAG,
-    Bus,
     Filter,
     FrameBatch,
-    KernelSource,
-    Received,
     identifier_text,
 )
 from skinware_drivers.can.error_frames import CONTROLLER_STATES, ControllerHealth
@@ -39,6 +36,8 @@ from skinware_drivers.can.interface import NO_CAN, read_controller
 from skinware_drivers.can.recvmmsg import rows_of
 from skinware_drivers.can.stamps import Stamper, Stamping, has_hardware_stamps
 from skinware_drivers.can.wire_time import wire_bits
+from skinware_drivers.native.kernel_bus import KernelBus
+from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
@@ -80,7 +79,7 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "off"
 
 
-class SocketCanBus(Bus):
+class SocketCanBus(KernelBus):
     """A CAN interface of the kernel (``can0``, ``vcan0``, ``slcan0``).
 
     Options: :class:`SocketCanOptions`. The bit rate is set where the interface is set up (``ip link set can0 type can
@@ -238,34 +237,30 @@ class SocketCanBus(Bus):
         """Whether frames have the kernel's stamps; a controller's clock is followed in Python."""
         return not self._stamper.hardware
 
-    def hand_over(self, batch: FrameBatch) -> KernelSource | None:
-        """What C code needs to receive in place of this; None while it cannot.
-
-        Args:
-            batch: into whose rows.
-        """
+    def hand_over(self, batch: FrameBatch, source: Source) -> bool:
+        """Tell C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
         if self._socket is None or not self.reads_natively:
-            return None
+            return False
         rows = rows_of(batch)
-        return KernelSource(
+        source.fd, source.headers, source.control = (
             self._socket.fileno(),
             rows.headers_address,
             rows.control.ctypes.data,
-            *self._stamper.state,
-            self._lost_before,
-            self.bit_rate > 0,
-            self._speed_up,
-            self.granted_buffer < _SMALL_BUFFER,
         )
+        source.offset_ns, source.last_poll_ns = self._stamper.state
+        source.lost_before, source.lost, source.frames = self._lost_before, self.counters.lost, 0
+        source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
+        source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
+        return True
 
-    def take_back(self, received: Received) -> None:
-        """What C code did meanwhile."""
-        self._stamper.state = received.offset_ns, received.last_poll_ns
-        self.counters.frames += received.frames
-        self.counters.lost = received.lost
-        self.wire_bits += received.wire_bits
-        self.fullest = max(self.fullest, received.fullest)
-        if received.frames:
+    def take_back(self, source: Source) -> None:
+        """Go on with what C code did meanwhile."""
+        self._stamper.state = source.offset_ns, source.last_poll_ns
+        self.counters.frames += source.frames
+        self.counters.lost = source.lost
+        self.wire_bits += source.wire_bits
+        self.fullest = max(self.fullest, source.fullest)
+        if source.frames:
             self._health.heard_data()
 
     def send(self, identifier: int, payload: bytes) -> None:
@@ -306,6 +301,10 @@ class SocketCanBus(Bus):
             self._speed_up = controller.data_bit_rate / controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
+            self._count_health()
+
+    def _count_health(self) -> None:
+        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
 
     def nothing_received(self, number: int) -> int:
         """What an error of the kernel in the place of frames means.
@@ -336,7 +335,7 @@ class SocketCanBus(Bus):
         self.samples.take(Unused.REFUSED, wire[other])
         good = np.flatnonzero(~(is_error | other))
         self._take_errors(np.flatnonzero(is_error), good, identifier, wire["payload"])
-        self.counters.overflows, self.counters.bus_offs = self._health.overflows, self._health.bus_offs
+        self._count_health()
         good += first
         kept = slice(first, first + len(good))
         batch.wire[kept], batch.time_ns[kept], batch.bus[kept] = batch.wire[good], batch.time_ns[good], batch.bus[good]

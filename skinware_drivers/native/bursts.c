@@ -7,11 +7,6 @@
 
 enum { NEVER = -1 };
 
-static bool lives(const struct path *path, int64_t module)
-{
-    return path->living_ns - path->plan->module_heard_ns[module] < path->plan->silence_ns;
-}
-
 void skip(struct path *path, int64_t patch, int64_t n)
 {
     const struct plan *plan = path->plan;
@@ -98,7 +93,8 @@ static void show_the_newest(struct path *path, const int64_t *updates, int64_t n
     show(path, updates, n);
 }
 
-static void find_begun(struct path *path)
+/* `has_begun`: patches of which this frame shows something. */
+void find_begun(struct path *path)
 {
     const struct plan *plan = path->plan;
     memset(path->has_begun, 0, (size_t)plan->n_patches);

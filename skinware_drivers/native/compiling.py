@@ -48,7 +48,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.value_type, plan.value_bytes = _type(structure.dtype)[0], structure.dtype.itemsize
     plan.width = decoder.width
 
-    plan.n_slots, plan.nobody, plan.n_sets = len(addresses.entry), addresses.nobody, len(addresses.sets)
+    plan.nobody = addresses.nobody
     plan.entry, plan.candidates = arrays.at(addresses.entry), arrays.at(addresses.candidates)
     plan.sets, plan.payload_names = arrays.at(addresses.sets), arrays.at(decoder.payload_names)
     plan.n_forms, plan.forms = arrays.structs(structs.Form, (_form(form, arrays) for form in addresses.forms))
@@ -59,7 +59,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     assemblies = [*decoder.alone.items()]
     groups = [([number], assembly) for number, assembly in assemblies]
     groups += [(cycle.members, cycle.assembly) for cycle in decoder.cycles]
-    plan.n_assemblies, plan.assemblies = arrays.structs(
+    _, plan.assemblies = arrays.structs(
         structs.Assembly,
         (
             structs.Assembly(

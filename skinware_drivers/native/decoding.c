@@ -125,7 +125,7 @@ static void sever(struct path *path)
 
 static bool is_awaited(const struct plan *plan, uint32_t identifier)
 {
-    bool found = plan->n_awaited < 0;
+    bool found = false;
     for (int64_t i = 0; i < plan->n_awaited && !found; i++)
         found = (identifier & plan->awaited[i].mask) == plan->awaited[i].value;
     return found;
@@ -137,7 +137,7 @@ static void part_with(struct path *path, int64_t time_ns)
     int64_t n_awaited = 0, n_strangers = 0, *awaited = path->rows, *strangers = path->foreign;
     for (int64_t i = 0; i < path->n_foreign; i++) {
         int64_t row = path->foreign[i];
-        if (path->plan->hooks.offer && is_awaited(path->plan, identifier_of(path->batch, row)))
+        if (is_awaited(path->plan, identifier_of(path->batch, row)))
             awaited[n_awaited++] = row;
         else
             strangers[n_strangers++] = row;
@@ -154,7 +154,7 @@ void decode_batch(struct path *path)
     const struct plan *plan = path->plan;
     int64_t time_ns = path_time_ns(path), first = path->n_updates;
     sever(path);
-    if (plan->hooks.hear)
+    if (path->words->expects_data)
         plan->hooks.hear();
     name_rows(path, time_ns);
     if (plan->hooks.tell_times)

@@ -12,9 +12,9 @@ enum { TURNS = 8, MOST_EVENTS = 64, FEW = 4 };
 enum taken { NOTHING, ALL, SOME };
 enum reason { TIME, LOOP, OTHER_BUS, NEWS, NO_MEMORY };
 
-SKINWARE_EXPORT int64_t skinware_flow_size(int64_t of_source)
+static int64_t earlier(int64_t one, int64_t other)
 {
-    return (int64_t)(of_source ? sizeof(struct source) : sizeof(struct flow));
+    return one < other ? one : other;
 }
 
 static struct source *source_of(const struct flow *flow, int fd)
@@ -31,18 +31,23 @@ static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t
     struct batch *batch = path->batch;
     int64_t n_heard = 0;
     bool is_news = false;
+    if (n < MOST_EVENTS)
+        path->words->read_ns = time_ns;
     batch->stop = batch->headroom;
-    *is_behind = false;
+    *is_behind = n == MOST_EVENTS;
     for (int64_t i = 0; i < n; i++) {
         batch->limit = batch->stop + (batch->capacity - batch->stop) / (n - i);
         if (ready[i]->fd < 0 || !receive(path, ready[i]))
             continue;
         n_heard++;
         ready[i]->heard_ns = time_ns;
-        *is_behind |= batch->stop == batch->limit;
+        if (batch->stop == batch->limit) {
+            *is_behind = true;
+            path->words->read_ns = earlier(path->words->read_ns, batch->time_ns[batch->stop - 1] - 1);
+        }
         is_news |= ready[i]->is_watched;
     }
-    if (is_news && path->plan->hooks.heard)
+    if (is_news)
         path->plan->hooks.heard();
     return n_heard;
 }
@@ -51,7 +56,7 @@ static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t
 static int64_t find_ready(struct flow *flow, struct source **ready)
 {
     struct epoll_event events[MOST_EVENTS];
-    if (flow->n_sources <= FEW) {
+    if (!flow->has_others && flow->n_sources <= FEW) {
         for (int64_t i = 0; i < flow->n_sources; i++)
             ready[i] = &flow->sources[i];
         return flow->n_sources;
@@ -77,9 +82,8 @@ static enum taken take(struct path *path, struct flow *flow, bool *is_other)
             return SOME;
         n = find_ready(flow, ready);
         *is_other |= n < 0;
-        if (n <= 0 || !fill(path, ready, n, time_ns, &is_behind))
+        if (n < 0 || !fill(path, ready, n, time_ns, &is_behind))
             return turn ? ALL : NOTHING;
-        flow->takes++;
         decode_batch(path);
         if (path->failed)
             return ALL;
@@ -102,11 +106,6 @@ static bool is_any_silent(const struct flow *flow, int64_t time_ns, int64_t *unt
             *until_ns = source->heard_ns + flow->silence_ns + 1;
     }
     return any;
-}
-
-static int64_t earlier(int64_t one, int64_t other)
-{
-    return one < other ? one : other;
 }
 
 /* Sleep until then, or until Python has something to do (true), or, if it may, a bus. */
@@ -155,7 +154,6 @@ SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
             return NEWS;
         if (is_resting)
             until_ns = earlier(until_ns, flow->rest_until_ns);
-        flow->wakes++;
         if (sleep_until(flow, until_ns, time_ns, is_resting))
             return LOOP;
     }

@@ -9,7 +9,6 @@ struct source { /* a socket whose datagrams are struct can_frame or canfd_frame,
     int64_t headers, control;                  /* addresses of a mmsghdr and of 8 words for every row of the batch */
     int64_t offset_ns, last_poll_ns;           /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
     int64_t lost_before, lost, frames, heard_ns; /* lost: ever; frames: since Python looked */
-    int64_t lost_column, frames_column;        /* of the bus' counts */
     int64_t is_counted, is_watched;            /* bits on the wire are; Python wants to know that frames come */
     int64_t is_small;                          /* its buffer is full after a few frames */
     double speed_up, wire_bits, fullest;
@@ -18,9 +17,9 @@ struct source { /* a socket whose datagrams are struct can_frame or canfd_frame,
 struct flow {
     int64_t loop_fd, epoll_fd;     /* readable: Python has something to do; a bus has something */
     int64_t until_ns, latency_ns;  /* when Python has something to do; the longest rest */
+    int64_t has_others;            /* buses are open that Python has to read */
     int64_t rest_until_ns, silence_ns, n_sources; /* silence_ns: after so long without a frame Python wants to know */
     struct source *sources;
-    int64_t takes, wakes;          /* since Python looked */
 };
 
 int64_t receive(struct path *path, struct source *source);

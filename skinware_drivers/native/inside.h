@@ -9,15 +9,17 @@
 struct words { /* what Python sees and sets between calls */
     int64_t fixed_ns; /* not 0: the time is this, whatever the clock says */
     int64_t carried;  /* rows before the batch's headroom ends that wait for partners */
-    int64_t n_updates, n_held; /* of the last take; updates that are held back from one take to the next */
+    int64_t n_held;   /* updates that are held back from one take to the next */
     int64_t newest_ns, due_ns, not_before_ns, last_published_ns;
     int64_t on_request, wanted_ns; /* publish only what is asked for; the oldest data that somebody waits for */
     int64_t hastened;              /* a patch sends too fast to tell its cycles apart */
     int64_t store;                 /* address of the updates */
     int64_t sequence;              /* of the newest frame */
     int64_t must_leave;            /* the event loop has something to do */
+    int64_t expects_data;          /* somebody waits for a frame that may be data */
     int64_t entry, kind;           /* addresses of what is known of the rows */
     int64_t ring;                  /* address of the ring's end: another one if somebody removed its file */
+    int64_t read_ns;               /* all that arrived until then was taken */
 };
 
 struct update { /* followed by int32_t sensors[width], values[width], uint8_t status[width] */
@@ -117,6 +119,11 @@ static inline int64_t chain_on(struct chain *chain, int64_t key, int64_t element
     return before;
 }
 
+static inline bool lives(const struct path *path, int64_t module)
+{
+    return path->living_ns - path->plan->module_heard_ns[module] < path->plan->silence_ns;
+}
+
 static inline int64_t floor_mod(int64_t value, int64_t by)
 {
     int64_t rest = value % by;
@@ -142,6 +149,7 @@ void publish(struct path *path);
 void show(struct path *path, const int64_t *updates, int64_t n);
 void skip(struct path *path, int64_t patch, int64_t n);
 bool find_open(struct path *path, int64_t time_ns);
+void find_begun(struct path *path);
 void cut_into_bursts(struct path *path, int64_t most);
 int64_t deadline_ns(const struct path *path);
 

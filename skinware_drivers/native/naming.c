@@ -95,7 +95,7 @@ static bool is_wrong(struct path *path, int64_t row, int64_t *why)
 
 static bool is_sample_wanted(const struct plan *plan, int64_t bus, int64_t why, int64_t time_ns)
 {
-    return plan->hooks.keep && time_ns >= plan->sample_next_ns[bus * N_SAMPLE_KINDS + why];
+    return time_ns >= plan->sample_next_ns[bus * N_SAMPLE_KINDS + why];
 }
 
 static void keep_samples(struct path *path, int64_t why, const int64_t *rows, int64_t n, int64_t time_ns)

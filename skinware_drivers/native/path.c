@@ -1,5 +1,5 @@
 /* A data path's life, and what Python calls. */
-#include "inside.h"
+#include "flow.h"
 
 #include <stdlib.h>
 
@@ -15,7 +15,8 @@ SKINWARE_EXPORT int64_t skinware_path_size(int64_t which)
 {
     const size_t sizes[] = {sizeof(struct plan),   sizeof(struct words),  sizeof(struct batch), sizeof(struct kind),
                             sizeof(struct flag),   sizeof(struct run),    sizeof(struct form),  sizeof(struct cycle),
-                            sizeof(struct number), sizeof(struct assembly), sizeof(struct update)};
+                            sizeof(struct number), sizeof(struct assembly), sizeof(struct flow),
+                            sizeof(struct source), sizeof(struct update)};
     return which >= 0 && which < (int64_t)(sizeof sizes / sizeof *sizes) ? (int64_t)sizes[which] : -1;
 }
 
@@ -122,11 +123,6 @@ SKINWARE_EXPORT int64_t skinware_path_digest(struct path *path)
         return -1;
     take_updates(path);
     return 0;
-}
-
-SKINWARE_EXPORT void skinware_path_publish(struct path *path)
-{
-    publish(path);
 }
 
 SKINWARE_EXPORT void skinware_path_publish_if_due(struct path *path)

@@ -15,7 +15,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, BUCKETS = 32, MOST_MEMBERS = 32, MUCH_HASTE = 200 };
+enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 32, MUCH_HASTE = 200 };
 #define NEVER_NS (-(INT64_C(1) << 62)) /* punctuality: none came yet */
 
 /* -- what a layout compiles to ------------------------------------------------------------------------------------- */
@@ -123,7 +123,7 @@ struct hooks {             /* NULL: there is nothing to do */
 
 enum { UNKNOWN, BAD_LENGTH, BAD_CONTENT, BEFORE_BOOT, N_DECODER_COUNTERS };               /* of a bus */
 enum { UPDATES, ORPHANS, LATE, SEQUENCE_LOST, SEQUENCE_REPEATED, SEQUENCE_BACK, N_PATCH_COUNTERS }; /* of a patch */
-enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, N_SAMPLE_KINDS = 6 };
+enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, N_SAMPLE_KINDS = 5 };
 
 struct columns { /* of a slot: where they begin, bytes from its start */
     int64_t values, status, module_time_ns, patch_state, bus_state, bus_reason, bus_since_ns, bus_load, bus_samples;
@@ -134,18 +134,18 @@ struct plan {
     int64_t n_buses, n_patches, n_modules, n_sensors, value_type, value_bytes, width;
 
     /* naming */
-    int64_t n_slots, nobody, n_sets, n_kinds, n_forms, length_columns, header_byte;
-    const int64_t *entry;       /* (n_slots,) */
-    const uint16_t *candidates; /* (n_slots,) row of sets */
-    const uint8_t *sets;        /* (n_sets, n_kinds) bool */
-    const uint8_t *payload_names; /* (n_sets,) bool */
+    int64_t nobody, n_kinds, n_forms, length_columns, header_byte;
+    const int64_t *entry;       /* of each slot */
+    const uint16_t *candidates; /* of each slot, row of sets */
+    const uint8_t *sets;        /* (sets, n_kinds) bool */
+    const uint8_t *payload_names; /* of each set, bool */
     const struct form *forms;
     const uint8_t *length_ok; /* (256, length_columns) bool */
     const uint8_t *header;    /* (256, length_columns) kind; NULL: conditions have to be looked at */
     const struct kind *kinds;
 
     /* updates */
-    int64_t n_assemblies, n_cycles;
+    int64_t n_cycles;
     const struct assembly *assemblies;
     const struct cycle *cycles;
     const int64_t *module_patch;  /* (n_modules,) */
@@ -186,13 +186,13 @@ struct plan {
     int64_t *skipped;              /* (n_buses,) updates that were never published, since Python looked */
     const int64_t *skipped_before; /* (n_buses,) and before that */
     const int64_t *patch_bus;
-    int64_t skipped_column;
-    int64_t *timing;  /* (2, n_patches, BUCKETS) */
+    int64_t skipped_column, lost_column, frames_column;
+    int64_t *timing;  /* (2, n_patches, SKINWARE__BUCKETS) */
     int64_t *timing_before_ns;
     struct columns columns;
 
     struct hooks hooks;
-    int64_t n_awaited; /* frames of no module that somebody waits for; -1: any */
+    int64_t n_awaited; /* frames of no module that somebody waits for */
     const struct identifier_condition *awaited;
 };
 

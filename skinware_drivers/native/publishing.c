@@ -1,15 +1,9 @@
 /* When a frame is published, and what it says: running/publisher.py and patch_timing.py. */
 #include "inside.h"
 
-#include <time.h>
-
 int64_t path_time_ns(const struct path *path)
 {
-    struct timespec now;
-    if (path->words->fixed_ns)
-        return path->words->fixed_ns;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+    return path->words->fixed_ns ? path->words->fixed_ns : skinware__clock_ns(CLOCK_MONOTONIC);
 }
 
 int64_t deadline_ns(const struct path *path)
@@ -23,27 +17,18 @@ int64_t deadline_ns(const struct path *path)
     return deadline_ns > words->not_before_ns ? deadline_ns : words->not_before_ns;
 }
 
-static int64_t bucket_of(int64_t value_ns)
-{
-    double value = value_ns > 0 ? (double)value_ns : 0;
-    uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    int64_t exponent = value > 0 ? (int64_t)(bits >> 52) - 1022 : 0;
-    return exponent < BUCKETS - 1 ? exponent : BUCKETS - 1;
-}
-
 static void count_timing(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
-    int64_t *intervals = plan->timing, *ages = plan->timing + plan->n_patches * BUCKETS;
+    int64_t *intervals = plan->timing, *ages = plan->timing + plan->n_patches * SKINWARE__BUCKETS;
     for (int64_t module = 0; module < plan->n_modules; module++) {
         if (!plan->updated[module])
             continue;
         int64_t shown_ns = plan->module_time_ns[module], before_ns = plan->timing_before_ns[module];
-        int64_t first = plan->module_patch[module] * BUCKETS;
+        int64_t first = plan->module_patch[module] * SKINWARE__BUCKETS;
         if (before_ns > 0)
-            intervals[first + bucket_of(shown_ns - before_ns)]++;
-        ages[first + bucket_of(time_ns - shown_ns)]++;
+            intervals[first + skinware__bucket(shown_ns - before_ns)]++;
+        ages[first + skinware__bucket(time_ns - shown_ns)]++;
         plan->timing_before_ns[module] = shown_ns;
     }
 }
@@ -53,9 +38,7 @@ static bool judge_modules(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     bool any = false;
-    memset(path->has_begun, 0, (size_t)plan->n_patches);
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        path->has_begun[plan->module_patch[module]] |= plan->updated[module];
+    find_begun(path);
     for (int64_t module = 0; module < plan->n_modules; module++) {
         int64_t patch = plan->module_patch[module], shown_ns = plan->module_time_ns[module];
         if (plan->by_cycle)
@@ -98,7 +81,7 @@ static void write_frame(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     const struct columns *columns = &plan->columns;
-    int64_t n_timing = plan->n_patches * BUCKETS;
+    int64_t n_timing = plan->n_patches * SKINWARE__BUCKETS;
     count_timing(path, time_ns);
     skinware_ring_writer *ring = (skinware_ring_writer *)(intptr_t)path->words->ring;
     uint8_t *slot = skinware_ring_begin(ring);
@@ -191,7 +174,7 @@ static void look_at_frame(struct path *path, int64_t time_ns)
     for (int64_t module = 0; module < plan->n_modules; module++) {
         any_updated |= plan->updated[module];
         any_touched |= plan->touched[module];
-        is_complete &= plan->touched[module] || time_ns - plan->module_heard_ns[module] >= plan->silence_ns;
+        is_complete &= plan->touched[module] || !lives(path, module);
     }
     if (any_updated && is_complete)
         publish(path);
@@ -233,8 +216,9 @@ void publish_if_due(struct path *path)
         publish(path);
         return;
     }
-    path->living_ns = time_ns;
-    if (find_open(path, time_ns)) {
+    int64_t read_ns = words->read_ns < time_ns ? words->read_ns : time_ns;
+    path->living_ns = read_ns;
+    if (find_open(path, read_ns)) {
         words->due_ns = 0;
         for (int64_t patch = 0; patch < plan->n_patches; patch++)
             if (path->is_open[patch] && plan->patch_time_ns[patch] + plan->burst_pause_ns[patch] >= words->due_ns)
@@ -244,5 +228,5 @@ void publish_if_due(struct path *path)
     }
     publish(path);
     cut_into_bursts(path, plan->most_at_once - 2);
-    look_at_frame(path, time_ns);
+    look_at_frame(path, read_ns);
 }

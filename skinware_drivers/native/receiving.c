@@ -3,7 +3,6 @@
 
 #include <errno.h>
 #include <sys/socket.h>
-#include <time.h>
 
 enum { ROWS_AT_ONCE = 64, CONTROL_BYTES = 64, SOFTWARE_WORD = 2, CLOCK_READS = 3, GOOD_READ_NS = 2000 };
 enum { MEMORY_INFO = 55, MEMORY_USED = 0, MEMORY_SIZE = 1, MEMORY_DROPS = 8, MEMORY_WORDS = 9 };
@@ -12,20 +11,13 @@ enum { SWITCHED = 1, PASSIVE_SENDER = 2, IS_FD = 4, CLASSIC_PAYLOAD = 8, LONGEST
 #define UNUSUAL UINT32_C(0x60000000) /* remote and error frames */
 #define EXTENDED UINT32_C(0x80000000)
 
-static int64_t clock_ns(clockid_t clock)
-{
-    struct timespec now;
-    clock_gettime(clock, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
-}
-
 /* CLOCK_MONOTONIC - CLOCK_REALTIME, not bent by a pause between reading the two; `poll_ns`: now. */
 static int64_t offset_now_ns(int64_t *poll_ns)
 {
     int64_t best_ns = INT64_MAX, offset_ns = 0;
     for (int i = 0; i < CLOCK_READS && best_ns >= GOOD_READ_NS; i++) {
-        int64_t first_ns = clock_ns(CLOCK_MONOTONIC), real_ns = clock_ns(CLOCK_REALTIME);
-        int64_t second_ns = clock_ns(CLOCK_MONOTONIC);
+        int64_t first_ns = skinware__clock_ns(CLOCK_MONOTONIC), real_ns = skinware__clock_ns(CLOCK_REALTIME);
+        int64_t second_ns = skinware__clock_ns(CLOCK_MONOTONIC);
         if (second_ns - first_ns < best_ns) {
             best_ns = second_ns - first_ns;
             offset_ns = (first_ns + second_ns) / 2 - real_ns;
@@ -106,7 +98,7 @@ static void read_memory(struct path *path, struct source *source)
     if (lost == source->lost)
         return;
     source->lost = lost;
-    path->plan->counts[source->bus * path->plan->n_counts + source->lost_column] = lost;
+    path->plan->counts[source->bus * path->plan->n_counts + path->plan->lost_column] = lost;
     path->plan->interrupted[source->bus] = 1;
 }
 
@@ -129,7 +121,7 @@ int64_t receive(struct path *path, struct source *source)
     while (n == ROWS_AT_ONCE && batch->stop < batch->limit) {
         int64_t first = batch->stop, kept;
         n = receive_some(path, source);
-        if (n < 0 && errno != EAGAIN && errno != EINTR && path->plan->hooks.lose) {
+        if (n < 0 && errno != EAGAIN && errno != EINTR) {
             path->plan->hooks.lose(source->bus, errno);
             source->fd = -1;
             return batch->stop - begin;
@@ -142,7 +134,7 @@ int64_t receive(struct path *path, struct source *source)
         kept = is_usual(path, source, first, n) ? n : path->plan->hooks.sort_out(source->bus, first, n);
         batch->stop += kept;
         source->frames += kept;
-        path->plan->counts[source->bus * path->plan->n_counts + source->frames_column] += kept;
+        path->plan->counts[source->bus * path->plan->n_counts + path->plan->frames_column] += kept;
         if (source->is_counted)
             source->wire_bits += wire_bits(path, source, first, kept);
     }

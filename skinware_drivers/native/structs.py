@@ -160,9 +160,9 @@ class Plan(ctypes.Structure):
 
     _fields_ = [
         *_fields("n_buses n_patches n_modules n_sensors value_type value_bytes width"),
-        *_fields("n_slots nobody n_sets n_kinds n_forms length_columns header_byte"),
+        *_fields("nobody n_kinds n_forms length_columns header_byte"),
         *_fields("entry candidates sets payload_names forms length_ok header kinds", _POINTER),
-        *_fields("n_assemblies n_cycles"),
+        *_fields("n_cycles"),
         *_fields("assemblies cycles module_patch sensor_module first_module", _POINTER),
         *_fields("last_sequence haste unknown_identifiers sample_next_ns interrupted", _POINTER),
         *_fields("values status module_time_ns patch_time_ns updated touched bus_counters patch_counters", _POINTER),
@@ -173,7 +173,7 @@ class Plan(ctypes.Structure):
         *_fields("bus_samples_bytes"),
         *_fields("latency_ns data_path", _POINTER),
         *_fields("counts skipped skipped_before patch_bus", _POINTER),
-        *_fields("skipped_column"),
+        *_fields("skipped_column lost_column frames_column"),
         *_fields("timing timing_before_ns", _POINTER),
         ("columns", Columns),
         ("hooks", Hooks),
@@ -186,8 +186,8 @@ class Words(ctypes.Structure):
     """What Python sees and sets between calls."""
 
     _fields_ = _fields(
-        "fixed_ns carried n_updates n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
-        " hastened store sequence must_leave entry kind ring"
+        "fixed_ns carried n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
+        " hastened store sequence must_leave expects_data entry kind ring read_ns"
     )
 
 
@@ -196,7 +196,7 @@ class Source(ctypes.Structure):
 
     _fields_ = [
         *_fields("fd bus headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
-        *_fields("lost_column frames_column is_counted is_watched is_small"),
+        *_fields("is_counted is_watched is_small"),
         *_fields("speed_up wire_bits fullest", _REAL),
     ]
 
@@ -205,9 +205,8 @@ class Flow(ctypes.Structure):
     """The loop that takes, publishes and rests."""
 
     _fields_ = [
-        *_fields("loop_fd epoll_fd until_ns latency_ns rest_until_ns silence_ns n_sources"),
+        *_fields("loop_fd epoll_fd until_ns latency_ns has_others rest_until_ns silence_ns n_sources"),
         *_fields("sources", _POINTER),
-        *_fields("takes wakes"),
     ]
 
 
@@ -215,12 +214,13 @@ UPDATE = np.dtype([(name, np.int64) for name in ["module", "row", "whole", "is_f
 """An update; its sensors (int32), values and status (uint8) follow."""
 
 SIZES = (
-    *(ctypes.sizeof(each) for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly)),
+    *(
+        ctypes.sizeof(each)
+        for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source)
+    ),
     UPDATE.itemsize,
 )
 """As ``skinware_path_size`` tells them."""
-FLOW_SIZES = ctypes.sizeof(Flow), ctypes.sizeof(Source)
-"""As ``skinware_flow_size`` tells them."""
 
 
 class Arrays:

@@ -15,8 +15,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import hook
-
-_NOBODY = (1 << 63) - 1
+from skinware_drivers.running.publisher import NOBODY_WAITS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -70,7 +69,7 @@ class RequestDesk:
     @property
     def wanted_ns(self) -> int:
         """The oldest data that is new enough for one of those who wait, CLOCK_MONOTONIC ns; far ahead: nobody does."""
-        return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=_NOBODY)
+        return min((time_ns for time_ns, request in self._waiting if not request.cancelled), default=NOBODY_WAITS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
         """A frame was published: answer those who waited for it.

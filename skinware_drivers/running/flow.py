@@ -10,13 +10,12 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import selectors
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import BusState
-from skinware_drivers.bus import Received
-from skinware_drivers.counters import OWN_BUS_COUNTERS
+from skinware.status import BusReason, BusState
 from skinware_drivers.native import structs
+from skinware_drivers.native.kernel_bus import KernelBus
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import bus_failure
@@ -26,7 +25,6 @@ _NEVER_NS = (1 << 63) - 1
 _OTHER_BUS, _NEWS, _NO_MEMORY = range(2, 5)  # of flow.c
 _LATENCY_WHILE_ASKING_S, _LATENCY_IN_STEP_S = 5e-4, 5e-5
 """The longest rest while devices are asked, and while the answer alone is what comes before the next question."""
-_LOST, _FRAMES = OWN_BUS_COUNTERS.index("lost"), OWN_BUS_COUNTERS.index("frames")
 
 
 class FlowSelector(selectors.EpollSelector):
@@ -56,13 +54,26 @@ class FlowLoop(asyncio.SelectorEventLoop):
         super().__init__(self.selector)
 
 
+def flow_of(
+    generation: Generation,
+    epoll_fd: int,
+    latency_s: float,
+    take: Callable[[], object],
+    fail: Callable[[BaseException], None],
+) -> Flow | None:
+    """What lets the frames of a generation flow (see ``Flow``), None if C cannot read all of its buses."""
+    buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
+    if generation.native is None or not all(isinstance(bus, KernelBus) and bus.reads_natively for bus in buses):
+        return None
+    return Flow(generation, generation.native, epoll_fd, latency_s, take, fail)
+
+
 class Flow:
     """The buses of one generation, as long as C reads them.
 
     Args:
         generation: what is in service.
-        path: its data path.
-        lines: the buses; the list may change.
+        path: its native path.
         epoll_fd: in which open buses are registered.
         latency_s: the longest rest.
         take: called in the loop when a bus has something that Python has to read.
@@ -73,18 +84,18 @@ class Flow:
         self,
         generation: Generation,
         path: NativePath,
-        lines: Sequence[BusLine],
         epoll_fd: int,
         latency_s: float,
         take: Callable[[], object],
         fail: Callable[[BaseException], None],
     ) -> None:
-        self._generation, self._path, self._lines, self._batch = generation, path, lines, generation.batch
+        self._generation, self._path = generation, path
+        self._lines, self._batch = generation.lines, generation.batch
         self._latency_s = latency_s
         self._take, self._fail = take, fail
         self._flow = structs.Flow(epoll_fd=epoll_fd)
         self._sources = (structs.Source * 0)()
-        self._line_of: list[BusLine] = []
+        self._handed: list[tuple[BusLine, KernelBus, structs.Source]] = []
         path.sort_out, path.lose, path.heard = self._sort_out, self._lose, self._heard
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
@@ -125,41 +136,46 @@ class Flow:
         return self._latency_s
 
     def _hand_over(self) -> None:
-        handed = [(line, source) for line in self._lines if (source := line.bus.hand_over(self._batch)) is not None]
-        if len(handed) != len(self._sources):
-            self._sources = (structs.Source * len(handed))()
-            self._flow.sources, self._flow.n_sources = ctypes.addressof(self._sources), len(handed)
-        self._line_of = [line for line, _ in handed]
-        for at, (line, source) in zip(self._sources, handed, strict=True):
-            at.fd, at.bus, at.headers, at.control = source.fd, line.ordinal, source.headers, source.control
-            at.offset_ns, at.last_poll_ns = source.offset_ns, source.last_poll_ns
-            at.lost_before, at.lost, at.frames = source.lost_before, line.bus.counters.lost, 0
-            at.lost_column, at.frames_column = _LOST, _FRAMES
-            at.is_counted, at.speed_up, at.wire_bits, at.fullest = source.is_counted, source.speed_up, 0.0, 0.0
-            at.is_small = source.is_small
-            at.heard_ns, at.is_watched = line.heard_ns, line.state != BusState.LIVE
+        if len(self._sources) < len(self._lines):
+            self._sources = (structs.Source * len(self._lines))()
+            self._flow.sources = ctypes.addressof(self._sources)
+        self._handed = []
+        for line in self._lines:
+            source = self._sources[len(self._handed)]
+            if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
+                source.bus, source.heard_ns, source.is_watched = (
+                    line.ordinal,
+                    line.heard_ns,
+                    line.state != BusState.LIVE,
+                )
+                self._handed.append((line, line.bus, source))
+        n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
+        self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)
 
     def _take_back(self) -> None:
-        for line, at in zip(self._line_of, self._sources, strict=True):
-            line.heard_ns = at.heard_ns
-            line.bus.take_back(Received(at.offset_ns, at.last_poll_ns, at.frames, at.lost, at.wire_bits, at.fullest))
+        for line, bus, source in self._handed:
+            line.heard_ns = source.heard_ns
+            bus.take_back(source)
 
     def _heard(self) -> None:
         """A bus that was silent is not."""
-        for line, at in zip(self._line_of, self._sources, strict=True):
-            line.heard_ns = at.heard_ns
+        for line, _, source in self._handed:
+            line.heard_ns = source.heard_ns
         self._generation.update_bus_states()
-        for line, at in zip(self._line_of, self._sources, strict=True):
-            at.is_watched = line.state != BusState.LIVE
+        for line, _, source in self._handed:
+            source.is_watched = line.state != BusState.LIVE
+
+    def _bus(self, ordinal: int) -> KernelBus:
+        return next(bus for line, bus, _ in self._handed if line.ordinal == ordinal)
 
     def _sort_out(self, bus: int, first: int, n: int) -> int:
-        kept = self._lines[bus].bus.sort_out(self._batch, slice(first, first + n))
+        kept = self._bus(bus).sort_out(self._batch, slice(first, first + n))
         self._path.interrupt(self._generation.interrupted())
         return kept
 
     def _lose(self, bus: int, number: int) -> None:
         line = self._lines[bus]
         try:
-            line.bus.nothing_received(number)
+            self._bus(bus).nothing_received(number)
         except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
             line.lose(bus_failure(line.name, "receive", error))

@@ -73,6 +73,8 @@ class Generation:
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
         self.native, self.why_python = path_for(self.decoder, self.publisher, self.batch)
+        if self.native is not None:
+            self.native.hear, self.native.offer = self._hear, self._offer
         self.publisher.data_path[:] = DataPath.PYTHON if self.native is None else DataPath.NATIVE
         for line in self.lines:
             if line.patches:
@@ -108,12 +110,16 @@ class Generation:
             self.decoder.count_unknown(batch, self._offer(foreign))
         self.publisher.take(found)
 
-    def publish_if_due(self) -> None:
-        """Publish if the time has come, and nothing speaks against it."""
+    def publish_if_due(self, read_ns: int) -> None:
+        """Publish if the time has come, and nothing speaks against it.
+
+        Args:
+            read_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
+        """
         if self.native is not None:
-            self.native.publish_if_due()
+            self.native.publish_if_due(read_ns)
         else:
-            self.publisher.publish_if_due()
+            self.publisher.publish_if_due(read_ns)
 
     @property
     def deadline_ns(self) -> int:
@@ -123,8 +129,7 @@ class Generation:
     def prepare_native(self) -> None:
         """Before C code runs: say who waits for frames now."""
         if self.native is not None:
-            self.native.hear = self._hear if any(line.link.expects_data for line in self.lines) else None
-            self.native.offer = self._offer if any(line.link.is_listening for line in self.lines) else None
+            self.native.expects_data = any(line.link.expects_data for line in self.lines)
             self.native.awaited = [wanted for line in self.lines for wanted in line.link.awaited]
 
     def _hear(self, rows: Rows) -> None:

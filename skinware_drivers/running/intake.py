@@ -34,6 +34,9 @@ class Intake:
         digest: gets it, filled.
         latency_s: the longest rest; may be changed.
         guard: makes of a callback one that may fail in the event loop.
+
+    Attributes:
+        read_until_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class Intake:
         self._empty_batch = empty_batch
         self._digest = digest
         self.latency_s: float = latency_s
+        self.read_until_ns: int = 0
         self._look = guard(self._on_readable)
         self._rest: asyncio.TimerHandle | None = None
         self._by_fd: dict[int, BusLine] = {}
@@ -68,15 +72,17 @@ class Intake:
         """Take what has arrived, now. ``some``: more is waiting."""
         begun_ns = now_ns()
         for turn in range(_TURNS):
-            if now_ns() - begun_ns > _TURN_NS:
+            time_ns = now_ns()
+            if time_ns - begun_ns > _TURN_NS:
                 return "some"
             events = self._epoll.poll(0)
             if not events:
+                self.read_until_ns = time_ns
                 return "all" if turn else "nothing"
             batch = self._empty_batch()
-            is_behind = self._fill(batch, [fd for fd, _ in events])
+            self.read_until_ns = self._fill(batch, [fd for fd, _ in events], time_ns)
             self._digest(batch)
-            if not is_behind:
+            if self.read_until_ns == time_ns:
                 return "all"
         return "some"
 
@@ -96,20 +102,24 @@ class Intake:
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
-    def _fill(self, batch: FrameBatch, fds: Sequence[int]) -> bool:
-        """Fill a batch from those buses that have something; whether one of them has more than its share."""
-        time_ns = now_ns()
+    def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> int:
+        """Fill a batch from those buses that have something.
+
+        Returns:
+            Until when all was taken: now, if no bus had more than its share.
+        """
         ready = [line for fd in fds if (line := self._line_of(fd)) is not None]
-        is_behind = False
+        read_until_ns = time_ns
         for number, line in enumerate(ready):
             batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
             try:
                 if line.bus.receive(batch, line.ordinal):
                     line.heard_ns = time_ns
-                    is_behind |= not batch.free
+                    if not batch.free:
+                        read_until_ns = min(read_until_ns, int(batch.time_ns[batch.stop - 1]) - 1)
             except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
                 line.lose(bus_failure(line.name, "receive", error))
-        return is_behind
+        return read_until_ns
 
     def _line_of(self, fd: int) -> BusLine | None:
         line = self._by_fd.get(fd)

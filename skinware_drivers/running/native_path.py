@@ -29,8 +29,6 @@ from skinware_drivers.watch import Watch
 Rows = npt.NDArray[np.int64]
 
 _real_now_ns = now_ns
-_NOBODY = (1 << 63) - 1
-_SAMPLE_KINDS = 6
 
 
 def path_for(decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> tuple[NativePath | None, str]:
@@ -54,9 +52,10 @@ class NativePath:
         batch: what buses fill.
 
     Attributes:
-        hear: shown the new rows of each batch, before anything else, while somebody waits for a frame that is data.
-        offer: shown rows that are of no module; returns those that nobody waited for. None: nobody waits for any.
-        awaited: what lets the rows through that are to be offered; None: all are.
+        expects_data: somebody waits for a frame that may be data; to be set before each call.
+        hear: shown the new rows of each batch, before anything else, while that is so.
+        awaited: lets the frames through that somebody waits for, of those that are of no module; likewise.
+        offer: shown the rows of these; returns those that nobody waited for.
         sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
         lose: told which bus went away, and the system's error number.
         heard: told that frames came on a bus that is watched.
@@ -64,20 +63,20 @@ class NativePath:
 
     def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
         self._decoder, self._publisher, self._batch = decoder, publisher, batch
-        self.hear: Callable[[Rows], None] | None = None
-        self.offer: Callable[[Rows], Rows] | None = None
-        self.awaited: Sequence[Filter] | None = None
-        self.sort_out: Callable[[int, int, int], int] | None = None
-        self.lose: Callable[[int, int], None] | None = None
-        self.heard: Callable[[], None] | None = None
+        self.expects_data = False
+        self.awaited: Sequence[Filter] = ()
+        self.hear: Callable[[Rows], None] = lambda _rows: None
+        self.offer: Callable[[Rows], Rows] = lambda rows: rows
+        self.sort_out: Callable[[int, int, int], int] = lambda _bus, _first, n: n
+        self.lose: Callable[[int, int], None] = lambda _bus, _error: None
+        self.heard: Callable[[], None] = lambda: None
         self._error: BaseException | None = None
         self._arrays = arrays = structs.Arrays()
         self._plan, self._words, self._rows = structs.Plan(), structs.Words(), structs.Batch()
         compile_decoder(decoder, self._plan, arrays)
         self._compile_publisher(publisher, arrays)
         self._compile_batch(batch, arrays)
-        self._hooks = self._make_hooks()
-        self._set_hooks()
+        self._plan.hooks = self._make_hooks()
         self._load(library)
         self._words.last_published_ns = now_ns()
         made = library.quick.skinware_path_new(
@@ -117,14 +116,13 @@ class NativePath:
         """Frames were lost on these buses: what waits for partners there is not joined with what comes now."""
         self._interrupted[list(buses)] = True
 
-    def publish(self) -> None:
-        """Publish what there is."""
-        self._enter()
-        self._publish(self._path)
-        self._leave()
+    def publish_if_due(self, read_ns: int) -> None:
+        """Publish if the time has come, and nothing speaks against it.
 
-    def publish_if_due(self) -> None:
-        """Publish if the time has come, and nothing speaks against it."""
+        Args:
+            read_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns.
+        """
+        self._words.read_ns = max(self._words.read_ns, read_ns)
         self._enter()
         self._publish_if_due(self._path)
         self._leave()
@@ -155,11 +153,11 @@ class NativePath:
         self._words.fixed_ns = 0 if now_ns is _real_now_ns else now_ns()
         self._words.wanted_ns = self._publisher.wanted_ns
         self._words.ring, self._words.sequence = self._publisher.ring_address or 0, self._publisher.sequence
-        self._set_hooks()
-        conditions = [structs.IdentifierCondition(mask, value) for value, mask in self.awaited or ()]
+        self._words.expects_data = self.expects_data
+        self._module_status[:] = self._publisher.watch.module_status
+        conditions = [structs.IdentifierCondition(mask, value) for value, mask in self.awaited]
         self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
-        self._plan.n_awaited = -1 if self.awaited is None else len(conditions)
-        self._plan.awaited = ctypes.addressof(self._awaited)
+        self._plan.n_awaited, self._plan.awaited = len(conditions), ctypes.addressof(self._awaited)
 
     def _leave(self) -> None:
         self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
@@ -188,7 +186,6 @@ class NativePath:
         self._deadline_ns.restype = ctypes.c_int64
         self._digest = library.waiting.skinware_path_digest
         self._digest.restype = ctypes.c_int64
-        self._publish = library.waiting.skinware_path_publish
         self._publish_if_due = library.waiting.skinware_path_publish_if_due
         self._run = library.waiting.skinware_flow_run
         self._run.restype = ctypes.c_int64
@@ -206,7 +203,8 @@ class NativePath:
         plan.patch_heard_ns = arrays.at(publisher.patch_heard_ns)
         plan.patch_updated_ns = arrays.at(publisher.patch_updated_ns)
         plan.behind, plan.patch_state = arrays.at(publisher.behind), arrays.at(publisher.patch_state)
-        plan.module_status = arrays.at(publisher.watch.module_status)
+        self._module_status = publisher.watch.module_status.copy()  # a watch may replace its own
+        plan.module_status = arrays.at(self._module_status)
         plan.bus_state, plan.bus_reason = arrays.at(publisher.bus_state), arrays.at(publisher.bus_reason)
         plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
         plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
@@ -215,11 +213,12 @@ class NativePath:
         counts = publisher.count_buses()
         plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
         plan.skipped_column = self._skipped_column
+        plan.lost_column, plan.frames_column = OWN_BUS_COUNTERS.index("lost"), OWN_BUS_COUNTERS.index("frames")
         self._skipped, self._skipped_before = np.zeros((2, n_buses), np.int64)
         plan.skipped, plan.skipped_before = arrays.at(self._skipped), arrays.at(self._skipped_before)
         self._interrupted = np.zeros(n_buses, bool)
         plan.interrupted = arrays.at(self._interrupted)
-        self._sample_next_ns = np.zeros((n_buses, _SAMPLE_KINDS), np.int64)
+        self._sample_next_ns = np.zeros((n_buses, len(Unused) + 1), np.int64)
         plan.sample_next_ns = arrays.at(self._sample_next_ns)
         timing = publisher.timing
         plan.timing, plan.timing_before_ns = arrays.at(timing.both), arrays.at(timing.before_ns)
@@ -261,37 +260,21 @@ class NativePath:
     # -- what C calls ---------------------------------------------------------------------------------------------
 
     def _make_hooks(self) -> structs.Hooks:
+        """What C may call; NULL where there never is anything to do."""
+        tells_times = self._decoder.device_stamps.are_told
+        looks = getattr(self._publisher.watch.look, "__func__", None) is not Watch.look
         return structs.Hooks(
-            structs.HEAR(self._guarded(self._on_hear)),
-            structs.HEAR(self._guarded(self._on_times)),
+            structs.HEAR(self._guarded(self._on_data)),
+            structs.HEAR(self._guarded(self._on_times)) if tells_times else structs.HEAR(),
             structs.OFFER(self._guarded(self._on_offer)),
             structs.KEEP(self._guarded(self._on_keep)),
             structs.EXPAND(self._guarded(self._on_expand)),
-            structs.OFFER(self._guarded(self._on_look)),
+            structs.OFFER(self._guarded(self._on_look)) if looks else structs.OFFER(),
             structs.PUBLISHED(self._guarded(self._on_published)),
             structs.SORT_OUT(self._guarded(self._on_unusual)),
             structs.LOSE(self._guarded(self._on_loss)),
-            structs.HEAR(self._guarded(lambda: None if self.heard is None else self.heard())),
+            structs.HEAR(self._guarded(lambda: self.heard())),
         )
-
-    def _set_hooks(self) -> None:
-        """Let C call what there is to call now."""
-        wanted = {
-            "hear": self.hear is not None,
-            "tell_times": self._decoder.device_stamps.are_told,
-            "offer": self.offer is not None,
-            "keep": True,
-            "expand": True,
-            "look": type(self._publisher.watch).look is not Watch.look,
-            "published": True,
-            "sort_out": self.sort_out is not None,
-            "lose": self.lose is not None,
-            "heard": self.heard is not None,
-        }
-        for name, is_wanted in wanted.items():
-            setattr(
-                self._plan.hooks, name, getattr(self._hooks, name) if is_wanted else type(getattr(self._hooks, name))()
-            )
 
     def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
         """What a hook raises cannot go through C: it is raised when C has come back."""
@@ -311,17 +294,15 @@ class NativePath:
 
     def _on_unusual(self, bus: int, first: int, n: int) -> int:
         self._words.must_leave = True
-        return n if self.sort_out is None else self.sort_out(bus, first, n)
+        return self.sort_out(bus, first, n)
 
     def _on_loss(self, bus: int, error: int) -> None:
         self._words.must_leave = True
-        if self.lose is not None:
-            self.lose(bus, error)
+        self.lose(bus, error)
 
-    def _on_hear(self) -> None:
+    def _on_data(self) -> None:
         self._words.must_leave = True
-        if self.hear is not None:
-            self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
+        self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
 
     def _on_times(self) -> None:
         batch = self._batch
@@ -331,15 +312,14 @@ class NativePath:
         self._decoder.device_stamps.tell(kind, entry, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
-        rows = _view(at, n, np.int64).copy()
-        left = rows if self.offer is None else self.offer(rows)
+        left = self.offer(_view(at, n, np.int64).copy())
         self._words.must_leave = True  # somebody may have what it waited for
         self._count_strangers(self._path, ctypes.c_void_p(left.ctypes.data), ctypes.c_int64(len(left)))
 
     def _on_keep(self, why: int, at: int, n: int) -> None:
         decoder = self._decoder
         decoder.keep_samples(Unused(why), self._batch.bus, self._batch.wire, _view(at, n, np.int64))
-        self._sample_next_ns[:, : len(Unused) + 1] = [samples.next_ns for samples in decoder.samples]
+        self._sample_next_ns[:] = [samples.next_ns for samples in decoder.samples]
 
     def _on_expand(self, number: int, updates_at: int, rows_at: int, failed_at: int, n: int) -> None:
         updates, rows = _view(updates_at, n, np.int64), _view(rows_at, n, np.int64)
@@ -363,6 +343,7 @@ class NativePath:
         sensors[~whole] = self._plan.n_sensors
         parts = records["values"], records["status"], records["oldest_ns"], records["newest_ns"]
         self._publisher.look(Updates(records["module"], whole, sensors, *parts, True))
+        self._module_status[:] = self._publisher.watch.module_status
 
     def _on_published(self, oldest_ns: int) -> None:
         self._publisher.answer(oldest_ns)

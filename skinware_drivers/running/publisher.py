@@ -27,7 +27,8 @@ ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
 _IDLE_NS = NS_PER_S // 4
-_NOBODY = (1 << 63) - 1
+NOBODY_WAITS = (1 << 63) - 1
+"""In place of the oldest data that is new enough for somebody."""
 _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
@@ -149,22 +150,28 @@ class Publisher:
         self.bursts.take(updates, self._living(time_ns), self.publish, self.most_at_once - 1)
         self._look_at_frame(time_ns)
 
-    def publish_if_due(self) -> None:
-        """Publish if the time has come, and nothing speaks against it."""
+    def publish_if_due(self, read_ns: int) -> None:
+        """Publish if the time has come, and nothing speaks against it.
+
+        Args:
+            read_ns: all that arrived until then was taken, CLOCK_MONOTONIC ns. What came since may belong to a burst
+                that has begun.
+        """
         time_ns = now_ns()
         if time_ns < self.deadline_ns:
             return
         self.count_buses()
         self._update_patch_states(time_ns)
         if self.by_cycle:
-            living = self._living(time_ns)
-            open_patches = self.bursts.in_the_middle(living, time_ns)
+            read_ns = min(read_ns, time_ns)
+            living = self._living(read_ns)
+            open_patches = self.bursts.in_the_middle(living, read_ns)
             if open_patches.any():
                 self._due_ns = self._not_before_ns = self.bursts.pause_ends_ns(open_patches)
                 return
             self.publish()
             self.bursts.take(None, living, self.publish, self.most_at_once - 2)
-            self._look_at_frame(time_ns)
+            self._look_at_frame(read_ns)
         else:
             self.publish()
 
@@ -207,13 +214,13 @@ class Publisher:
         columns["latency_ns"][:] = self.latency_ns
         columns["data_path"][:] = self.data_path
         self._writer.commit(state.newest_ns or time_ns)
-        if self.wanted_ns < _NOBODY:
+        if self.wanted_ns < NOBODY_WAITS:
             self.answer(self._oldest_new_ns(time_ns))
 
     @property
     def wanted_ns(self) -> int:
         """The oldest data that is new enough for one of those who wait for a frame; far ahead if nobody does."""
-        return _NOBODY if self._desk is None else self._desk.wanted_ns
+        return NOBODY_WAITS if self._desk is None else self._desk.wanted_ns
 
     def answer(self, oldest_ns: int) -> None:
         """A frame was published: tell those who waited for it.

@@ -28,7 +28,7 @@ from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk
 from skinware_drivers.running.figures import figures
-from skinware_drivers.running.flow import Flow, FlowLoop
+from skinware_drivers.running.flow import FlowLoop, flow_of
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
 from skinware_drivers.running.guard import end_of_driver, failure, hook
 from skinware_drivers.running.intake import Intake, latency_for
@@ -179,7 +179,7 @@ class Runner:
             self._failure = end_of_driver(error)
         self._stopping.set()
 
-    def _guard(self, callback: Callable[[], None]) -> Callable[[], None]:
+    def _guard(self, callback: Callable[[], object]) -> Callable[[], None]:
         """The same for the event loop, which would log what it raises and go on."""
 
         def call() -> None:
@@ -319,24 +319,17 @@ class Runner:
 
     def _let_flow(self) -> None:
         """Have C read the buses while the event loop rests, if that can be; else they wake the loop."""
-        loop, generation = asyncio.get_running_loop(), self.generation
-        self._flows = (
-            isinstance(loop, FlowLoop)
-            and generation is not None
-            and generation.native is not None
-            and all(line.bus.reads_natively for line in self.lines if line.reason != BusReason.REMOVED)
-        )
-        if not isinstance(loop, FlowLoop):
+        loop = asyncio.get_running_loop()
+        if not isinstance(loop, FlowLoop) or self.generation is None:
             return
-        loop.selector.flow = None
-        self._intake.start()
-        if self._flows and generation is not None and generation.native is not None:
+        take = self._guard(self._intake.take)
+        flow = flow_of(self.generation, self._epoll.fileno(), self._intake.latency_s, take, self.fail)
+        self._flows = flow is not None
+        loop.selector.flow = None if flow is None else flow.run
+        if flow is None:
+            self._intake.start()
+        else:
             self._intake.stop()
-            take, fail = self._guard(self._take), self.fail
-            flow = Flow(
-                generation, generation.native, self.lines, self._epoll.fileno(), self._intake.latency_s, take, fail
-            )
-            loop.selector.flow = flow.run
 
     @property
     def _periods_s(self) -> list[float]:
@@ -371,9 +364,6 @@ class Runner:
         self._first_batch.clear()
         return self._first_batch
 
-    def _take(self) -> None:
-        self._intake.take()
-
     def _digest(self, batch: FrameBatch) -> None:
         if self.generation is not None:
             self._machine.look()
@@ -393,7 +383,7 @@ class Runner:
         self.writer.keep_files()
         self._machine.look()
         self.generation.update_bus_states()
-        self.generation.publish_if_due()
+        self.generation.publish_if_due(self._intake.read_until_ns)
         self.generation.log_patches()
         self._arm_timer()
 

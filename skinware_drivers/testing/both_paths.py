@@ -30,13 +30,12 @@ from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.native_path import NativePath, path_for
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
 from skinware_drivers.testing.clock import HandClock, package_on
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.watch import Watch
 
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
-_NOBODY = (1 << 63) - 1
 _OF_STATE = (
     "values",
     "status",
@@ -84,7 +83,7 @@ class Asking:
     @property
     def wanted_ns(self) -> int:
         """Since when the first of them waits; far ahead if nobody does."""
-        return min(self.waiting, default=_NOBODY)
+        return min(self.waiting, default=NOBODY_WAITS)
 
     def published(self, oldest_ns: int, position: tuple[int, int]) -> None:
         """A frame was published."""
@@ -169,7 +168,7 @@ class Way:
         """Decode the batch and publish what is due; some buses have lost frames before it."""
         raise NotImplementedError
 
-    def publish_if_due(self) -> None:
+    def publish_if_due(self, read_ns: int) -> None:
         """Publish if the time has come."""
         raise NotImplementedError
 
@@ -233,8 +232,8 @@ class NumpyWay(Way):
             self.decoder.count_unknown(self.batch, foreign)
         self.publisher.take(updates)
 
-    def publish_if_due(self) -> None:
-        self.publisher.publish_if_due()
+    def publish_if_due(self, read_ns: int) -> None:
+        self.publisher.publish_if_due(read_ns)
 
     def inside(self) -> Arrays:
         kept, held = self.decoder._carried, self.publisher.bursts._held
@@ -269,8 +268,8 @@ class NativeWay(Way):
     def digest(self, interrupted: Sequence[int]) -> None:
         self._path.digest(interrupted)
 
-    def publish_if_due(self) -> None:
-        self._path.publish_if_due()
+    def publish_if_due(self, read_ns: int) -> None:
+        self._path.publish_if_due(read_ns)
 
     def inside(self) -> Arrays:
         words, batch = self._path._words, self.batch
@@ -324,6 +323,7 @@ class Pair:
         self.native = NativeWay("native", *more)
         self.why_not: str = self.native.why_not
         self.frames = 0
+        self._read_ns = 0
 
     def __enter__(self) -> Self:
         return self
@@ -366,9 +366,10 @@ class Pair:
             self.publish_if_due()
         self.clock.now_ns = max(self.clock.now_ns, time_ns)
 
-    def publish_if_due(self) -> None:
-        """Publish if the time has come."""
-        self.do(lambda way: way.publish_if_due())
+    def publish_if_due(self, unread_ns: int = 0) -> None:
+        """Publish if the time has come, and all that arrived was taken until so long ago."""
+        self._read_ns = max(self._read_ns, self.clock.now_ns - unread_ns)
+        self.do(lambda way: way.publish_if_due(self._read_ns))
 
     @property
     def deadline_ns(self) -> int:

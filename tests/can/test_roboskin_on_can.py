@@ -238,6 +238,9 @@ def test_real_fingertip_data_reaches_a_reader_unchanged(vcan: Callable[[], str])
                     frame = next(frames)
                     fingers = frame.status[:60]
                     flagged += bool(seen and fingers.any())
+                    orphans = int(reader.patch_counters(frame)[0]["orphans"])
+                    if not seen:
+                        orphans_before = orphans
                     if not fingers.any():
                         read.set()
                         seen.append(tuple(frame.values[:60].tolist()))
@@ -247,7 +250,8 @@ def test_real_fingertip_data_reaches_a_reader_unchanged(vcan: Callable[[], str])
         rest = iter(wanted)
         assert all(s in rest for s in distinct), "not in the order in which they were sent"
         assert distinct[0] == wanted[0]
-        assert len(wanted) - len(distinct) <= flagged
+        held_up = (orphans - orphans_before) // 10  # as a whole: no counter tells that from halves of two bursts
+        assert len(wanted) - len(distinct) <= flagged + held_up
         assert frame.structure.module_kind[0] == b"fingertip"
     finally:
         if emulator.is_alive():

@@ -189,6 +189,7 @@ class _Fuzz:
         self._time_ns = np.zeros(_MOST_ROWS, np.int64)
         self._bus = np.zeros(_MOST_ROWS, np.uint16)
         self._n = 0
+        self._read_ns = 0
         self._n_patches = pair.numpy.decoder.tables.structure.n_patches
         self._identifiers = [
             (number, frame, identifier_of(frame, patch.key, module.key))
@@ -209,7 +210,8 @@ class _Fuzz:
             elif what == 14:
                 self._digest()
                 self._pair.clock.now_ns += self._script.number(1 << 16) * self._pair.numpy.publisher.period_ns // 4096
-                self._do(lambda way: way.publish_if_due())
+                self._read_ns = max(self._read_ns, self._pair.clock.now_ns - self._script.number(1 << 10) * 10_000)
+                self._do(lambda way: way.publish_if_due(self._read_ns))
             else:
                 self._happen()
             if self._n == _MOST_ROWS:

@@ -66,10 +66,14 @@ class Digest:
 
 @dataclass(frozen=True)
 class Pass:
-    """Time passes, hundredths of a period; ``is_watched``: what is due meanwhile is published when it is."""
+    """Time passes, hundredths of a period; ``is_watched``: what is due meanwhile is published when it is.
+
+    ``unread``: at its end, what has arrived since is not taken yet, hundredths of a period.
+    """
 
     centiperiods: int = 100
     is_watched: bool = True
+    unread: int = 0
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,12 @@ _events = st.one_of(
     _bursts,
     _bursts,
     st.builds(Digest, st.sampled_from([0, 0, 0, 1, 2, 7])),
-    st.builds(Pass, st.sampled_from([100, 100, 50, 90, 110, 10, 200, 300, 1000, 5000]), st.booleans()),
+    st.builds(
+        Pass,
+        st.sampled_from([100, 100, 50, 90, 110, 10, 200, 300, 1000, 5000]),
+        st.booleans(),
+        st.sampled_from([0, 0, 5, 40, 120]),
+    ),
     st.builds(Pass),
     _strays,
     st.builds(Happen, st.sampled_from(["ask", "ask", "restart", "suspect", "calm"]), st.integers(0, 5)),
@@ -261,7 +270,7 @@ class Player:
         if event.is_watched:
             pair.pass_to(end_ns)
         self._stamp_ns = clock.now_ns = max(clock.now_ns, end_ns)
-        pair.publish_if_due()
+        pair.publish_if_due(event.unread * self._period_ns // 100)
 
     def _happen(self, event: Happen) -> None:
         number = event.patch % len(self._patches)

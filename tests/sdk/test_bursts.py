@@ -71,12 +71,12 @@ class Recorder:
             arrival_ns = stream[end - 1][0] + 100_000
             while publisher.deadline_ns < stream[begin][0]:  # later there is something to read, which comes first
                 clock.now_ns = max(clock.now_ns, publisher.deadline_ns)
-                publisher.publish_if_due()
+                publisher.publish_if_due(clock.now_ns)
             clock.now_ns = max(clock.now_ns, arrival_ns)
             self.desk.feed(stream[begin:end])
         for _ in range(3):
             clock.now_ns = max(clock.now_ns, publisher.deadline_ns)
-            publisher.publish_if_due()
+            publisher.publish_if_due(clock.now_ns)
 
     def check(self, missing: dict[int, set[tuple[int, int]]]) -> None:
         """Every burst of every board is in exactly one frame, in order, with all its modules."""

@@ -12,7 +12,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
@@ -21,13 +21,14 @@ from skinware import BusReason, BusState, DriverReader, Status
 from skinware.errors import DriverError
 from skinware.status import DataPath
 from skinware_drivers import native
-from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.can.roboskin_watch import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.cli.emulation import Emulation, JsonReport
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
+from skinware_drivers.native.structs import Source
 from skinware_drivers.running.flow import FlowLoop, FlowSelector
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.driving import Driving, driving_lines
@@ -121,6 +122,27 @@ def test_a_driver_flows_and_its_frames_are_whole(cable: Cable) -> None:
         assert counters["frames"] <= bus.counters.frames + 200
         assert counters["lost"] == bus.counters.lost == 0
     assert running.status()["data_path"] == "native"
+
+
+def test_a_bus_that_c_cannot_read_is_read_beside_one_that_it_can(cable: Cable, spare_cable: Cable) -> None:
+    """Whether a controller has stamps of its own is known only once it is open, which may be late."""
+
+    class ForPython(EndOfCable):
+        def hand_over(self, batch: FrameBatch, source: Source) -> bool:
+            return False
+
+    cables = cable, spare_cable
+    one, other = EndOfCable(cable.end), ForPython(spare_cable.end)
+    lines = [(RoboskinDriver(RoboskinOptions()), bus) for bus in (one, other)]
+    with ExitStack() as stack:
+        for number, end in enumerate(cables):
+            hardware = EmulatedRoboskin(EmulatorOptions(boards=(BOARDS[number],)))
+            stack.enter_context(boards_on(end, hardware))
+        stack.enter_context(driving_lines(lines, "roboskin"))
+        reader = stack.enter_context(DriverReader("roboskin"))
+        frame = follow(reader, lambda f: f.structure.n_patches == 2 and not f.status.any())
+        for _ in range(5):
+            frame = follow(reader, newer_and_good(frame))
 
 
 def test_questions_are_answered_while_frames_flow(cable: Cable) -> None:

@@ -107,6 +107,37 @@ def test_a_wake_up_ends_in_time_however_much_waits() -> None:
     assert taken == 2
 
 
+def test_it_says_until_when_all_was_taken() -> None:
+    clock_ns = 1_000_000_000
+    waiting = [*range(clock_ns - 100, clock_ns)]  # stamps
+
+    def receive(batch: FrameBatch, ordinal: int) -> int:
+        n = min(batch.free, len(waiting))
+        for _ in range(n):
+            batch.append(ordinal, waiting.pop(0), 0x100, bytes(8))
+        if not waiting:
+            os.eventfd_read(fd)
+        return n
+
+    def digest(_batch: FrameBatch) -> None:
+        nonlocal clock_ns
+        told.append(gather.read_until_ns)
+        clock_ns += 500  # what comes meanwhile nobody has seen
+
+    fd = os.eventfd(1, os.EFD_NONBLOCK)
+    told: list[int] = []
+    line: Any = SimpleNamespace(bus=SimpleNamespace(receive=receive, fileno=lambda: fd), ordinal=0)
+    with select.epoll() as epoll, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(intake, "now_ns", lambda: clock_ns)
+        epoll.register(fd, select.EPOLLIN)
+        gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, 0.0)
+        assert gather.take() == "all"
+        assert told == [1_000_000_000 - 100 + 63 - 1, 1_000_000_500]
+        assert gather.take() == "nothing"
+        assert gather.read_until_ns == 1_000_001_000
+    os.close(fd)
+
+
 @pytest.mark.parametrize("latency_s", [0.0, 1e-4, 1e-3])
 def test_it_is_never_longer_than_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, latency_s: float) -> None:
     assert rest_after_a_take(monkeypatch, latency_s=latency_s) == latency_s

@@ -134,7 +134,7 @@ def test_a_take_publishes_no_more_than_the_ring_holds_and_counts_what_it_skips(
     assert 2 <= published <= DEFAULT_SLOTS
     if desk.publisher._state.updated.any():  # the last one waits for the others of its board
         desk.clock.now_ns += 100 * MS
-        desk.publisher.publish_if_due()
+        desk.publisher.publish_if_due(desk.clock.now_ns)
         published = desk.writer.sequence - before
     frame = desk.reader.read()
     values = frame.values.reshape(16, 12)[triangles]
@@ -159,4 +159,28 @@ def test_a_missing_board_holds_nothing_up_for_long(monkeypatch: pytest.MonkeyPat
     desk.feed(desk.burst(10))
     assert desk.writer.sequence == before + 1
     assert set(desk.reader.read().values[:192].tolist()) == {10}  # shown when it is whole, not when the next begins
+    desk.close()
+
+
+def test_what_arrived_and_was_not_taken_yet_may_belong_to_the_burst(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver that was held up between its take and its look at the clock would cut all bursts from then on."""
+    desk = Desk(monkeypatch)
+    desk.feed(desk.burst(3))
+    desk.clock.now_ns += 50 * MS
+    burst, before = desk.burst(4), desk.writer.sequence
+    desk.feed(burst[:12])
+    read_ns = burst[11][0]
+    desk.clock.now_ns += 200 * MS
+    desk.publisher.publish_if_due(read_ns)
+    assert desk.writer.sequence == before
+    desk.feed(burst[12:])
+    desk.publisher.publish_if_due(desk.clock.now_ns)
+    frame = desk.reader.read()
+    assert frame.sequence == before + 1
+    assert set(frame.values.tolist()) == {4}
+    assert not frame.status.any()
+    desk.feed(desk.burst(5)[:12])
+    desk.clock.now_ns += 200 * MS
+    desk.publisher.publish_if_due(desk.clock.now_ns)  # nothing more has come: the burst is over
+    assert desk.writer.sequence == before + 2
     desk.close()

@@ -17,7 +17,9 @@ import pytest
 from skinware import BusReason
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can import recvmmsg
+from skinware_drivers.can import recvmmsg, socketcan
+from skinware_drivers.can.error_frames import CONTROLLER_STATES
+from skinware_drivers.can.interface import Controller
 from skinware_drivers.can.socketcan import SocketCanBus
 from tests.sdk.cable import SO_RCVBUFFORCE, Cable, ChoosySocket, drain
 
@@ -218,6 +220,19 @@ def test_what_the_controller_says_is_known_and_counted(cable: Cable) -> None:
     drain(bus, batch)
     assert bus.reason(time.monotonic_ns()) == BusReason.NONE
     assert (bus.counters.bus_offs, bus.counters.errors, bus.counters.frames) == (2, 3, 4)
+
+
+def test_what_no_error_frame_told_is_counted_too(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A controller that was off before the socket was opened, or whose error frame was lost."""
+    bus = SocketCanBus("can0")
+    bus.adopt(cable.end)
+    state = CONTROLLER_STATES.index(BusReason.BUS_OFF)
+    monkeypatch.setattr(socketcan, "read_controller", lambda _: Controller(bit_rate=1_000_000, state=state))
+    bus._ask_kernel()
+    assert bus.reason(time.monotonic_ns()) == BusReason.BUS_OFF
+    assert bus.counters.bus_offs == 1
+    bus._ask_kernel()
+    assert bus.counters.bus_offs == 1
 
 
 def test_a_storm_of_error_frames_costs_no_data(cable: Cable) -> None:

@@ -126,12 +126,9 @@ class Native(Numpy):
 
     def drain(self) -> int:
         """Take, decode and publish everything that waits; returns the number of frames."""
-        handed, total = self.bus.hand_over(self.batch), 0
-        if handed is None:
+        source, total = self.source[0], 0
+        if not self.bus.hand_over(self.batch, source):
             raise SystemExit("decode: the socket is not read natively")
-        source = self.source[0]
-        source.fd, source.headers, source.control = handed.fd, handed.headers, handed.control
-        source.offset_ns, source.last_poll_ns = handed.offset_ns, handed.last_poll_ns
         while True:
             source.frames, self.flow.rest_until_ns = 0, 0
             self.path.leave_soon()

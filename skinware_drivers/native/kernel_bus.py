@@ -1,0 +1,48 @@
+"""Buses from whose sockets C code can receive."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.native.structs import Source
+
+
+class KernelBus(Bus):
+    """A bus of the kernel: a socket whose datagrams are ``struct can_frame`` or ``struct canfd_frame``."""
+
+    @property
+    @abstractmethod
+    def reads_natively(self) -> bool:
+        """Whether C code can receive in place of ``receive`` while it is open."""
+
+    @abstractmethod
+    def hand_over(self, batch: FrameBatch, source: Source) -> bool:
+        """Tell C code how to receive in place of ``receive``.
+
+        Args:
+            batch: into whose rows.
+            source: told: the socket, where ancillary data goes, what is known of the clocks and counted so far.
+
+        Returns:
+            Whether it can, now.
+        """
+
+    @abstractmethod
+    def take_back(self, source: Source) -> None:
+        """Go on with what C code did since ``hand_over``; called before anything else is."""
+
+    @abstractmethod
+    def sort_out(self, batch: FrameBatch, new: slice) -> int:
+        """Take what is no data frame of this layout out of new rows of a batch; returns how many are left."""
+
+    @abstractmethod
+    def nothing_received(self, number: int) -> int:
+        """What an error of the kernel means in the place of frames.
+
+        Raises:
+            skinware.errors.BusNotAvailable: the interface went down or away.
+        """
+
+
+__all__ = ["KernelBus"]

@@ -13,27 +13,32 @@ void skip(struct path *path, int64_t patch, int64_t n)
     plan->skipped[plan->patch_bus[patch]] += n;
 }
 
+/* Put n elements of so many bytes where they belong. */
+static inline void scatter(uint8_t *to, const int32_t *places, const uint8_t *from, int64_t n, size_t bytes)
+{
+    for (int64_t i = 0; i < n; i++)
+        memcpy(to + bytes * (size_t)places[i], from + bytes * (size_t)i, bytes);
+}
+
 static void copy_values(const struct path *path, int64_t number)
 {
     const struct plan *plan = path->plan;
     const int32_t *sensors = sensors_of(path, number);
-    const uint8_t *values = values_of(path, number), *status = status_of(path, number);
-    for (int64_t i = 0; i < plan->width; i++) {
-        int64_t sensor = sensors[i];
-        switch (plan->value_bytes) {
-        case 1:
-            plan->values[sensor] = values[i];
-            break;
-        case 2:
-            memcpy(plan->values + 2 * sensor, values + 2 * i, 2);
-            break;
-        case 4:
-            memcpy(plan->values + 4 * sensor, values + 4 * i, 4);
-            break;
-        default:
-            memcpy(plan->values + 8 * sensor, values + 8 * i, 8);
-        }
-        plan->status[sensor] = status[i];
+    const uint8_t *values = values_of(path, number);
+    scatter(plan->status, sensors, status_of(path, number), plan->width, 1);
+    switch (plan->value_bytes) { /* constants: an element is moved in one instruction */
+    case 1:
+        scatter(plan->values, sensors, values, plan->width, 1);
+        break;
+    case 2:
+        scatter(plan->values, sensors, values, plan->width, 2);
+        break;
+    case 4:
+        scatter(plan->values, sensors, values, plan->width, 4);
+        break;
+    default:
+        scatter(plan->values, sensors, values, plan->width, 8);
+        break;
     }
 }
 

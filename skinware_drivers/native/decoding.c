@@ -118,8 +118,9 @@ static void put_back(struct path *path)
 static void sever(struct path *path)
 {
     const struct batch *batch = path->batch;
-    for (int64_t row = batch->start; row < batch->stop; row++)
-        path->is_severed[row] = row < batch->headroom && path->plan->interrupted[batch->bus[row]];
+    memset(path->is_severed + batch->start, 0, (size_t)(batch->stop - batch->start));
+    for (int64_t row = batch->start; row < batch->headroom && row < batch->stop; row++)
+        path->is_severed[row] = path->plan->interrupted[batch->bus[row]];
     memset(path->plan->interrupted, 0, (size_t)path->plan->n_buses);
 }
 

@@ -6,13 +6,14 @@
 #include <sys/epoll.h>
 #include <time.h>
 
-enum { TURNS = 8, MOST_EVENTS = 64, FEW = 4 };
+enum { TURNS = 32, MOST_EVENTS = 64, FEW = 4 };
+enum { MOST_ROWS = 512, FEWEST_ROWS = 64 }; /* of a turn: what the processor's nearest caches hold; of one bus */
 #define TURN_NS INT64_C(20000000)
 
 enum taken { NOTHING, ALL, SOME };
 enum reason { TIME, LOOP, OTHER_BUS, NEWS, NO_MEMORY };
 
-static int64_t earlier(int64_t one, int64_t other)
+static int64_t least(int64_t one, int64_t other)
 {
     return one < other ? one : other;
 }
@@ -29,21 +30,21 @@ static struct source *source_of(const struct flow *flow, int fd)
 static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns, bool *is_behind)
 {
     struct batch *batch = path->batch;
-    int64_t n_heard = 0;
+    int64_t n_heard = 0, most = n * FEWEST_ROWS > MOST_ROWS ? n * FEWEST_ROWS : MOST_ROWS;
     bool is_news = false;
     if (n < MOST_EVENTS)
         path->words->read_ns = time_ns;
     batch->stop = batch->headroom;
     *is_behind = n == MOST_EVENTS;
     for (int64_t i = 0; i < n; i++) {
-        batch->limit = batch->stop + (batch->capacity - batch->stop) / (n - i);
+        batch->limit = batch->stop + (least(batch->capacity, batch->headroom + most) - batch->stop) / (n - i);
         if (ready[i]->fd < 0 || !receive(path, ready[i]))
             continue;
         n_heard++;
         ready[i]->heard_ns = time_ns;
         if (batch->stop == batch->limit) {
             *is_behind = true;
-            path->words->read_ns = earlier(path->words->read_ns, batch->time_ns[batch->stop - 1] - 1);
+            path->words->read_ns = least(path->words->read_ns, batch->time_ns[batch->stop - 1] - 1);
         }
         is_news |= ready[i]->is_watched;
     }
@@ -149,11 +150,11 @@ SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
             due_ns = deadline_ns(path);
         }
         bool is_resting = time_ns < flow->rest_until_ns;
-        int64_t until_ns = earlier(flow->until_ns, due_ns);
+        int64_t until_ns = least(flow->until_ns, due_ns);
         if (is_any_silent(flow, time_ns, &until_ns))
             return NEWS;
         if (is_resting)
-            until_ns = earlier(until_ns, flow->rest_until_ns);
+            until_ns = least(until_ns, flow->rest_until_ns);
         if (sleep_until(flow, until_ns, time_ns, is_resting))
             return LOOP;
     }

@@ -107,14 +107,14 @@ static void keep_samples(struct path *path, int64_t why, const int64_t *rows, in
         }
 }
 
-static void count_wrong(struct path *path, int64_t time_ns)
+/* Of rows that are of a patch of ours, but of no kind. */
+static void count_wrong(struct path *path, const int64_t *rows, int64_t n, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     const struct batch *batch = path->batch;
     int64_t n_long = 0, n_odd = 0, *odd = path->found, why = 0;
-    for (int64_t row = batch->start; row < batch->stop; row++) {
-        if (path->kind[row] != NO_KIND || path->entry[row] >= plan->n_modules + plan->n_patches)
-            continue;
+    for (int64_t i = 0; i < n; i++) {
+        int64_t row = rows[i];
         path->is_wrong[row] = is_wrong(path, row, &why);
         if (!path->is_wrong[row])
             continue;
@@ -134,7 +134,7 @@ void name_rows(struct path *path, int64_t time_ns)
     const struct plan *plan = path->plan;
     const struct batch *batch = path->batch;
     int64_t ours = plan->n_modules + plan->n_patches;
-    bool any_unknown = false;
+    int64_t *outside = path->foreign, n_outside = 0, *unknown = path->order, n_unknown = 0;
     for (int64_t row = batch->start; row < batch->stop; row++) {
         int64_t identifier = identifier_of(batch, row), bus = batch->bus[row], length = length_of(batch, row);
         int64_t slot = identifier < STANDARD_IDENTIFIERS ? bus * STANDARD_IDENTIFIERS + identifier
@@ -153,14 +153,18 @@ void name_rows(struct path *path, int64_t time_ns)
                 if (kind != NO_KIND && !is_right_length(plan, kind, length))
                     kind = NO_KIND;
             }
-            any_unknown |= kind == NO_KIND;
+            if (kind == NO_KIND)
+                unknown[n_unknown++] = row;
         }
         path->kind[row] = kind;
+        if (path->entry[row] >= plan->n_modules)
+            outside[n_outside++] = row;
     }
-    if (any_unknown)
-        count_wrong(path, time_ns);
+    if (n_unknown)
+        count_wrong(path, unknown, n_unknown, time_ns);
     path->n_foreign = 0;
-    for (int64_t row = batch->start; row < batch->stop; row++) {
+    for (int64_t i = 0; i < n_outside; i++) {
+        int64_t row = outside[i];
         if (path->kind[row] != NO_KIND && plan->kinds[path->kind[row]].names_module)
             path->entry[row] = name_module(plan, &plan->kinds[path->kind[row]], path->entry[row], payload_of(batch, row));
         if (path->entry[row] >= plan->n_modules && !path->is_wrong[row])

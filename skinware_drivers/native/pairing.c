@@ -165,8 +165,10 @@ static void fill_in(struct path *path, const struct cycle *cycle, int64_t number
         path->is_member[i] = is_member;
         path->place[i] = (uint8_t)(is_member && !path->is_severed[row] ? kind->place : cycle->n);
         path->time_ns[i] = path->batch->time_ns[row];
-        path->is_soon[i] = path->is_held_up[i] = path->is_doubtful[i] = path->is_used[i] = path->is_waiting[i] = 0;
     }
+    uint8_t *unset[] = {path->is_soon, path->is_held_up, path->is_doubtful, path->is_used, path->is_waiting};
+    for (size_t i = 0; i < sizeof unset / sizeof *unset; i++)
+        memset(unset[i], 0, (size_t)m);
 }
 
 static void add_orphan(struct path *path, int64_t row)

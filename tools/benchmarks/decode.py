@@ -125,17 +125,14 @@ class Native(Numpy):
         self.flow.sources = ctypes.addressof(self.source)
 
     def drain(self) -> int:
-        """Take, decode and publish everything that waits; returns the number of frames."""
-        source, total = self.source[0], 0
+        """Take, decode and publish everything that waits, which one call does; returns the number of frames."""
+        source = self.source[0]
         if not self.bus.hand_over(self.batch, source):
             raise SystemExit("decode: the socket is not read natively")
-        while True:
-            source.frames, self.flow.rest_until_ns = 0, 0
-            self.path.leave_soon()
-            self.path.run(self.flow)
-            if not source.frames:
-                return total
-            total += source.frames
+        self.flow.rest_until_ns = 0
+        self.path.leave_soon()
+        self.path.run(self.flow)
+        return int(source.frames)
 
     def close(self) -> None:
         """Take the service back."""

@@ -15,7 +15,7 @@ from skinware.freshness import age_limit_ns
 from skinware.geometry import Geometry
 from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
@@ -187,9 +187,10 @@ class Skin:
         """
         snapshot: Snapshot | None = None
         if rate_hz is None:
-            while True:
-                snapshot = self.read(newer_than=snapshot, max_age_s=max_age_s, align=align, timeout_s=timeout_s)
-                yield snapshot
+            with short_turns():
+                while True:
+                    snapshot = self.read(newer_than=snapshot, max_age_s=max_age_s, align=align, timeout_s=timeout_s)
+                    yield snapshot
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
             yield self.read(max_age_s=max_age_s, align=align, timeout_s=timeout_s)

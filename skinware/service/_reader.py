@@ -12,7 +12,7 @@ from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._accounts import Accounts
 from skinware.service._attachment import GENERATION_ENDED, Attachment
 from skinware.service.messages import ACQUIRE
@@ -151,7 +151,8 @@ class ServiceReader(Attachment[FrameT]):
 
         Args:
             rate_hz: None: each time the writer publishes (ASAP). A rate: at the deadlines of that rate, whatever
-                is newest then; the same frame comes again if there is no newer one.
+                is newest then; the same frame comes again if there is no newer one. Without a rate, other threads of
+                this process keep the interpreter for 0.1 ms at the most, for as long as the loop lives.
             max_age_s: what is older is not handed out but waited for, as by ``read``; default: any age.
             timeout_s: longest wait for a frame; None for no limit. At a rate there is one to be had without a wait,
                 unless nothing was published yet or all is older than ``max_age_s``.
@@ -161,14 +162,15 @@ class ServiceReader(Attachment[FrameT]):
         """
         if rate_hz is None:
             self._accounts.begin_loop("asap")
-            while True:
-                deadline_ns = _deadline_ns(timeout_s)
-                in_c = self._turns_in_c and not self._closed and max_age_s is None
-                frame = self._ring.next_turn(deadline_ns) if in_c else None
-                if frame is None:
-                    frame = self._read(self._last, max_age_s, deadline_ns)
-                    self._go_round_in_c()
-                yield frame
+            with short_turns():
+                while True:
+                    deadline_ns = _deadline_ns(timeout_s)
+                    in_c = self._turns_in_c and not self._closed and max_age_s is None
+                    frame = self._ring.next_turn(deadline_ns) if in_c else None
+                    if frame is None:
+                        frame = self._read(self._last, max_age_s, deadline_ns)
+                        self._go_round_in_c()
+                    yield frame
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
         timer = Periodic(rate_hz)
         while timer.wait(lambda: self._closed):
@@ -186,20 +188,22 @@ class ServiceReader(Attachment[FrameT]):
         """Every frame, one after the other, as long as this program keeps up within the ring's slots.
 
         For recorders and tests; a control loop wants the newest (``frames``). What was overwritten before its turn
-        is counted in ``lost``.
+        is counted in ``lost``. Other threads of this process keep the interpreter for 0.1 ms at the most, for
+        as long as the loop lives.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         self._accounts.begin_loop("in order")
-        while True:
-            deadline_ns = _deadline_ns(timeout_s)
-            in_c = self._turns_in_c and not self._closed
-            frame = self._ring.next_turn(deadline_ns, in_order=True) if in_c else None
-            if frame is None:
-                frame = self._read_in_order(deadline_ns)
-                self._go_round_in_c()
-            yield frame
+        with short_turns():
+            while True:
+                deadline_ns = _deadline_ns(timeout_s)
+                in_c = self._turns_in_c and not self._closed
+                frame = self._ring.next_turn(deadline_ns, in_order=True) if in_c else None
+                if frame is None:
+                    frame = self._read_in_order(deadline_ns)
+                    self._go_round_in_c()
+                yield frame
 
     def request(self, *, timeout_s: float = 5.0) -> FrameT:
         """Ask the writer for a frame, and wait for it: its acquisition begins after the writer heard of it.

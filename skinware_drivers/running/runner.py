@@ -14,7 +14,7 @@ from skinware.driver_service import DriverWriter
 from skinware.errors import BusNotAvailable, DriverError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
-from skinware.realtime import NS_PER_S
+from skinware.realtime import NS_PER_S, short_turns
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
 from skinware.structure import Structure
@@ -35,7 +35,6 @@ from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
-from skinware_drivers.running.turns import short_turns
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

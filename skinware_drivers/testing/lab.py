@@ -30,6 +30,10 @@ FILES = (
     " -device virtio-9p-pci,fsdev=lab-files,mount_tag=lab-files"
 )
 """This machine's files once more: virtme-ng's way to them caches nothing, and Python starts in three times the time."""
+BOOTS, BOOT_S = 3, 300
+"""How often the guest is booted at the most, and how long it may take, s."""
+UP = b"CAN lab: up\n"
+"""What the guest says when it is."""
 PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
 COMMANDS = ("ip", "modprobe", "file")
 """Commands that are needed here or in the guest, beside those that every machine has; virtme-ng asks ``file``."""
@@ -100,6 +104,7 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
     """What the guest runs."""
     return f"""
         set -e
+        echo CAN lab: up
         export PATH={shlex.quote(_path())} SKINWARE_CAN_LAB=1 SKINWARE_CAN_LAB_KERNEL={flavour}
         export PYTHONDONTWRITEBYTECODE=1 HOME=/tmp HYPOTHESIS_STORAGE_DIRECTORY=/tmp/hypothesis
         modprobe -a {MODULES}
@@ -135,37 +140,56 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
     arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
     arguments += ["--exec", f"bash -c {shlex.quote(guest_script(flavour, command, folder))}"]
     environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
-    # through a pipe: given a file, QEMU opens it anew and overwrites what is in it
-    process: subprocess.Popen[bytes] | None = None
-    try:
-        process = subprocess.Popen(
-            arguments,
-            start_new_session=True,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-        )
-        relay = threading.Thread(target=copy_output, args=(process,), daemon=True)
+    for _ in range(BOOTS):
+        result = boot(arguments, environment, timeout_s)
+        if result is not None:
+            return result
+        sys.stderr.write(f"CAN lab: the guest did not come up within {BOOT_S} s, once more\n")
+    return 1
+
+
+def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) -> int | None:
+    """Boot the guest once, and wait for its end.
+
+    Returns:
+        The command's exit status; None if the guest does not come up, which an emulated kernel rarely does.
+    """
+    is_up = threading.Event()
+    with subprocess.Popen(
+        arguments,
+        start_new_session=True,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,  # given a file, QEMU opens it anew and overwrites what is in it
+        stderr=subprocess.STDOUT,
+    ) as process:
+        relay = threading.Thread(target=copy_output, args=(process, is_up), daemon=True)
         relay.start()
-        process.wait(timeout_s)
-        relay.join()
-        return process.returncode
-    except subprocess.TimeoutExpired:
-        sys.stderr.write(f"CAN lab: the guest was still running after {timeout_s:g} s and was stopped\n")
-        return 124
-    finally:
-        if process is not None:
+        try:
+            return process.wait(timeout_s) if is_up.wait(min(BOOT_S, timeout_s)) else None
+        except subprocess.TimeoutExpired:
+            sys.stderr.write(f"CAN lab: the guest was still running after {timeout_s:g} s and was stopped\n")
+            return 124
+        finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+            relay.join()
 
 
-def copy_output(process: subprocess.Popen[bytes]) -> None:
-    """What the guest prints, at once."""
+def copy_output(process: subprocess.Popen[bytes], is_up: threading.Event) -> None:
+    """What the guest prints, at once, from when it is up; what comes before is shown if it never is."""
+    before = b""
     while process.stdout is not None and (data := os.read(process.stdout.fileno(), 65536)):
+        if not is_up.is_set():
+            before, found, data = (before + data).partition(UP)
+            if not found:
+                continue
+            is_up.set()
         sys.stdout.buffer.write(data)
         sys.stdout.buffer.flush()
+    if not is_up.is_set():
+        sys.stdout.buffer.write(before)
+        is_up.set()  # it has ended
 
 
 def report(flavour: str, lacks: list[str]) -> int:

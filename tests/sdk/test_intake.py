@@ -1,4 +1,4 @@
-"""How long the driver rests after it has taken frames, and the turns of other threads meanwhile."""
+"""What an intake takes, how long it rests then, and the turns of other threads meanwhile."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader
-from skinware.realtime import now_ns
+from skinware.realtime import TURN_S, now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.running import intake
 from skinware_drivers.running.intake import Intake
-from skinware_drivers.running.turns import TURN_S, short_turns
 from tests.sdk.driving import driving, emulated
 
 TAKE_NS = 100_000
@@ -141,31 +140,6 @@ def test_it_says_until_when_all_was_taken() -> None:
 @pytest.mark.parametrize("latency_s", [0.0, 1e-4, 1e-3])
 def test_it_is_never_longer_than_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, latency_s: float) -> None:
     assert rest_after_a_take(monkeypatch, latency_s=latency_s) == latency_s
-
-
-def test_turns_are_short_until_the_last_driver_has_ended() -> None:
-    before_s = sys.getswitchinterval()
-    first, second = short_turns(), short_turns()
-    try:
-        first.__enter__()
-        second.__enter__()
-        assert sys.getswitchinterval() == pytest.approx(TURN_S, abs=3e-6)
-        first.__exit__(None, None, None)
-        assert sys.getswitchinterval() == pytest.approx(TURN_S, abs=3e-6)
-        second.__exit__(None, None, None)
-        assert sys.getswitchinterval() == pytest.approx(before_s, abs=3e-6)
-    finally:
-        sys.setswitchinterval(before_s)
-
-
-def test_turns_that_are_shorter_already_stay_so() -> None:
-    before_s = sys.getswitchinterval()
-    try:
-        sys.setswitchinterval(TURN_S / 10)
-        with short_turns():
-            assert sys.getswitchinterval() == pytest.approx(TURN_S / 10, abs=3e-6)
-    finally:
-        sys.setswitchinterval(before_s)
 
 
 def test_a_driver_shortens_the_turns_of_others_while_it_runs() -> None:

@@ -70,7 +70,7 @@ def test_a_kernel_is_one_that_has_all_modules(tmp_path: Path, suffix: str) -> No
 
 
 def test_the_guest_ends_with_the_lab(machine: Path) -> None:
-    put(machine / "vng", 'echo "guest $$"; exec sleep 600')
+    put(machine / "vng", 'echo CAN lab: up; echo "guest $$"; exec sleep 600')
     program = f"""
 import sys
 from pathlib import Path
@@ -86,3 +86,29 @@ sys.exit(lab.main(Path("/")))
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 128 + signal.SIGTERM
     wait_until(lambda: not Path(f"/proc/{guest}").exists())
+
+
+def test_a_guest_that_does_not_come_up_is_booted_again(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    put(
+        machine / "vng",
+        f"cd {machine}; echo BIOS; [ -e once ] || {{ : >once; exec /bin/sleep 600; }}; echo CAN lab: up; exit 3",
+    )
+    monkeypatch.setattr(lab, "BOOT_S", 2.0)
+    assert lab.run("plain", ["true"], 60, machine) == 3
+    shown = capfd.readouterr()
+    assert shown.err.startswith("CAN lab: the guest did not come up within 2.0 s, once more\n")
+    assert shown.out == "BIOS\n"  # of the one that never was up
+
+
+def test_a_machine_that_boots_no_guest_says_so(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    put(machine / "vng", "echo BIOS; exec /bin/sleep 600")
+    monkeypatch.setattr(lab, "BOOT_S", 0.2)
+    assert lab.run("plain", ["true"], 60, machine) == 1
+    assert capfd.readouterr().err.count("did not come up") == lab.BOOTS
+    put(machine / "vng", "echo no such processor; exit 5")
+    assert lab.run("plain", ["true"], 60, machine) == 5
+    assert "no such processor" in capfd.readouterr().out

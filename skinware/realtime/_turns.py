@@ -1,4 +1,4 @@
-"""Turns of the interpreter's threads while a driver runs beside others in its process."""
+"""Turns of the interpreter's threads beside one that must not wait for long."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ _before_s: list[float] = []
 def short_turns() -> Iterator[None]:
     """Let no thread keep the interpreter for longer than ``TURN_S`` when another wants it; Python's default is 5 ms.
 
-    A driver lets go of the interpreter dozens of times for a batch (numpy does, for arrays of some length, and so do
-    system calls), and beside a thread that computes it would wait for a turn each time: too long for the receive
-    buffer of a fast bus (docs/benchmarks.md). It holds for the whole process, until the last driver in it has ended.
+    Beside a thread that computes, whoever lets go of the interpreter waits that long for it: a reader after each sleep,
+    a driver dozens of times for a batch (numpy lets go for arrays of some length, and so do system calls). That is too
+    long for a ring of 8 slots at 1 kHz, or the receive buffer of a fast bus (docs/benchmarks.md). It holds for the
+    whole process, until the last one has ended.
     """
     _before_s.append(sys.getswitchinterval())
     sys.setswitchinterval(min(TURN_S, _before_s[-1]))

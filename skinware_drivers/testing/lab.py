@@ -20,6 +20,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -30,8 +31,8 @@ FILES = (
     " -device virtio-9p-pci,fsdev=lab-files,mount_tag=lab-files"
 )
 """This machine's files once more: virtme-ng's way to them caches nothing, and Python starts in three times the time."""
-BOOTS, BOOT_S = 3, 300
-"""How often the guest is booted at the most, and how long it may take, s."""
+BOOT_S = 300.0
+"""How long a boot may take, s: ten times what it does."""
 UP = b"CAN lab: up\n"
 """What the guest says when it is."""
 PACKAGES = "qemu-system-x86 {image} iproute2 kmod busybox-static file"
@@ -129,7 +130,8 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
         folder: where the command runs.
 
     Returns:
-        The command's exit status; 1 if the lab cannot run here, 124 after the timeout.
+        The command's exit status; 1 if the lab cannot run here, 124 after the timeout, or if the guest
+        does not come up.
     """
     lacks = missing(flavour)
     kernel, vng = find_kernel(flavour), find_vng()
@@ -138,22 +140,16 @@ def run(flavour: str, command: list[str], timeout_s: float, folder: Path) -> int
     # an emulated processor: slow, but there is none that it does not run on (KVM within a guest is often broken)
     arguments = [vng, "--run", str(kernel), "--disable-kvm", "--force-9p", "--disable-microvm", "--cpus", "2"]
     arguments += ["--memory", "2G", f"--qemu-opts={CONTROLLERS} {FILES}"]
-    arguments += ["--exec", f"bash -c {shlex.quote(guest_script(flavour, command, folder))}"]
     environment = {**os.environ, "PATH": f"{Path(vng).parent}{os.pathsep}{_path()}"}  # vng calls its neighbours
-    for _ in range(BOOTS):
-        result = boot(arguments, environment, timeout_s)
-        if result is not None:
-            return result
-        sys.stderr.write(f"CAN lab: the guest did not come up within {BOOT_S} s, once more\n")
-    return 1
+    with tempfile.NamedTemporaryFile("w", prefix="skinware-lab-") as script:
+        # in a file: a kernel takes 2,048 characters from its command line, and hangs without the rest
+        script.write(guest_script(flavour, command, folder))
+        script.flush()
+        return boot([*arguments, "--exec", f"bash {shlex.quote(script.name)}"], environment, timeout_s)
 
 
-def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) -> int | None:
-    """Boot the guest once, and wait for its end.
-
-    Returns:
-        The command's exit status; None if the guest does not come up, which an emulated kernel rarely does.
-    """
+def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) -> int:
+    """Boot the guest, and wait for its end; returns the command's exit status, or 124."""
     is_up = threading.Event()
     with subprocess.Popen(
         arguments,
@@ -166,7 +162,10 @@ def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) ->
         relay = threading.Thread(target=copy_output, args=(process, is_up), daemon=True)
         relay.start()
         try:
-            return process.wait(timeout_s) if is_up.wait(min(BOOT_S, timeout_s)) else None
+            if not is_up.wait(min(BOOT_S, timeout_s)):
+                sys.stderr.write(f"CAN lab: the guest did not come up within {min(BOOT_S, timeout_s):g} s\n")
+                return 124
+            return process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             sys.stderr.write(f"CAN lab: the guest was still running after {timeout_s:g} s and was stopped\n")
             return 124

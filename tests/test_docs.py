@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import re
+import runpy
 import shlex
 import signal
 import subprocess
@@ -241,3 +242,17 @@ def test_pages_that_messages_name_exist() -> None:
     assert len(named) >= 2
     assert named <= titles
     assert not re.findall(r"see docs/[\w/-]+\.md", code)
+
+
+def test_the_picture_of_the_benchmarks_shows_the_figures_of_the_page() -> None:
+    script = ROOT / "tools" / "pictures" / "benchmarks.py"
+    made = runpy.run_path(str(script))
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    table = "\n".join(line for line in page.splitlines() if not line.startswith("* "))
+    for bars in made["GROUPS"].values():
+        for bar in bars:
+            assert re.search(rf"(?<![\d.,]){re.escape(bar.text)}(?![\d,]|\.\d)", table), (
+                f"{bar.text} of {bar.who} is not on the page"
+            )
+    shown = (ROOT / "docs" / "images" / "benchmarks.svg").read_text(encoding="utf-8")
+    assert shown == made["picture"](), "run tools/pictures/benchmarks.py docs/images/benchmarks.svg"

@@ -160,8 +160,8 @@ def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) ->
         stderr=subprocess.STDOUT,
     ) as process:
         relay = threading.Thread(target=copy_output, args=(process, is_up), daemon=True)
-        relay.start()
-        try:
+        try:  # a signal to end may come at any moment
+            relay.start()
             if not is_up.wait(min(BOOT_S, timeout_s)):
                 sys.stderr.write(f"CAN lab: the guest did not come up within {min(BOOT_S, timeout_s):g} s\n")
                 return 124
@@ -172,7 +172,8 @@ def boot(arguments: list[str], environment: dict[str, str], timeout_s: float) ->
         finally:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-            relay.join()
+            if relay.is_alive():
+                relay.join()
 
 
 def copy_output(process: subprocess.Popen[bytes], is_up: threading.Event) -> None:

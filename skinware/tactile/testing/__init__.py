@@ -10,13 +10,15 @@ It gives arrays, so that algorithms can be tried against a truth that no real sk
         sample.values, sample.truth  # (n,) both
 """
 
+from skinware.tactile.testing.arm import ARM_FRAME, arm, arm_path
 from skinware.tactile.testing.bench import BENCH_S, bench_world
-from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke
+from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke, Wander
 from skinware.tactile.testing.response import Response
 from skinware.tactile.testing.surface import Surface, grid, triangles
 from skinware.tactile.testing.world import Block, Sample, World
 
 __all__ = [
+    "ARM_FRAME",
     "BENCH_S",
     "Block",
     "Cover",
@@ -26,7 +28,10 @@ __all__ = [
     "Sample",
     "Stroke",
     "Surface",
+    "Wander",
     "World",
+    "arm",
+    "arm_path",
     "bench_world",
     "grid",
     "triangles",

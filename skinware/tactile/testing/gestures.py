@@ -130,10 +130,8 @@ class Stroke(Gesture):
             raise ConfigurationError("a stroke needs a path of at least two points")
 
     def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
-        path = np.array(self.path_m)
-        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-        way = (time_s - self.begin_s) / (self.end_s - self.begin_s) * length[-1]
-        return np.stack([np.interp(way, length, path[:, axis]) for axis in range(3)], axis=1)
+        path, length = self._line()
+        return _along(path, length, (time_s - self.begin_s) / (self.end_s - self.begin_s) * length[-1])
 
     def distances_m(  # noqa: D102 - inherited
         self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]
@@ -143,7 +141,14 @@ class Stroke(Gesture):
         return distance
 
     def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
-        path = np.array(self.path_m)
+        return self._least(surface, self._line()[0])
+
+    def _line(self, *, closed: bool = False) -> tuple[ArrayF, ArrayF]:
+        """(k, 3) the points, and (k,) the way to each of them."""
+        path = np.array(self.path_m + self.path_m[: int(closed)], np.float64)
+        return path, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+
+    def _least(self, surface: Surface, path: ArrayF) -> ArrayF:
         least = np.full(len(surface), np.inf)
         for start, way in zip(path, np.diff(path, axis=0), strict=False):
             from_start = surface.position_m - start
@@ -151,6 +156,41 @@ class Stroke(Gesture):
             np.fmin(least, np.linalg.norm(from_start - part[:, np.newaxis] * way, axis=1), out=least)
         nearest: ArrayF = np.maximum(least - self.radius_m, 0)
         return nearest
+
+
+def _along(path: ArrayF, length: ArrayF, way: ArrayF) -> ArrayF:
+    """(m, 3) the places at m ways along a line of points."""
+    return np.stack([np.interp(way, length, path[:, axis]) for axis in range(3)], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wander(Stroke):
+    """A finger that goes round a closed path, and presses and lets go while it does.
+
+    Attributes:
+        speed_m_s: along the path.
+        press_s: how long each press lasts, with ``rise_s`` and ``falls_s`` in it.
+        pause_s: from the end of a press to the next.
+    """
+
+    speed_m_s: float = 0.03
+    press_s: float = 2.6
+    pause_s: float = 1.4
+
+    def forces(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+        since_s = time_s - self.begin_s
+        moment_s = since_s % (self.press_s + self.pause_s)
+        points = np.array([0, self.rise_s, self.press_s - self.falls_s, self.press_s])
+        full = np.interp(moment_s, points, [0.0, 1.0, 1.0, 0.0], right=0.0)
+        forces: ArrayF = self.force * full * ((since_s >= 0) & (time_s < self.end_s))
+        return forces
+
+    def points_m(self, time_s: ArrayF) -> ArrayF:  # noqa: D102 - inherited
+        path, length = self._line(closed=True)
+        return _along(path, length, (time_s - self.begin_s) * self.speed_m_s % length[-1])
+
+    def least_distances_m(self, surface: Surface) -> ArrayF:  # noqa: D102 - inherited
+        return self._least(surface, self._line(closed=True)[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,4 +218,4 @@ class Cover(Gesture):
         return distance
 
 
-__all__ = ["Cover", "Gesture", "How", "Push", "Stroke"]
+__all__ = ["Cover", "Gesture", "How", "Push", "Stroke", "Wander"]

@@ -25,6 +25,9 @@ _CELLS = ((2, 5), (3, 6), (3, 4), (2, 3), (3, 2), (3, 0), (2, 1), (1, 2), (0, 3)
 """The ten taxels of a triangle in the order of their channels: row from its tip, and column in halves of a pitch."""
 TRIANGLE_M = np.array([[(half - 3) / 2, (2 - row) * np.sqrt(0.75)] for row, half in _CELLS]) * PITCH_M
 """(10, 2) where the taxels of a triangle are, from its centre, seen from outside, its tip up, m."""
+_PADS = ((3, 4, 6), (7, 8, 9))
+CHANNELS_M = np.insert(TRIANGLE_M, [6, 9], [TRIANGLE_M[list(corners)].mean(axis=0) for corners in _PADS], axis=0)
+"""(12, 2) the same of all channels: the thermal pads, 6 and 10, lie between three taxels each (which is assumed)."""
 
 
 @dataclass(frozen=True)
@@ -176,4 +179,4 @@ def _numbered(of: npt.NDArray[Any]) -> ArrayI:
     return np.unique(of, return_inverse=True)[1].astype(np.int64)
 
 
-__all__ = ["PITCH_M", "SIDE_M", "TRIANGLE_M", "Surface", "Taxels", "grid", "triangles"]
+__all__ = ["CHANNELS_M", "PITCH_M", "SIDE_M", "TRIANGLE_M", "Surface", "Taxels", "grid", "triangles"]

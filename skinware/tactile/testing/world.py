@@ -273,13 +273,39 @@ class World:
             for patch in np.unique(self.surface.patch[near]).tolist():
                 taxels = np.flatnonzero(near & (self.surface.patch == patch))
                 rows = slice(*np.searchsorted(time_s[:, patch], [gesture.begin_s, gesture.end_s], "left").tolist())
-                at_s = time_s[rows, patch]
-                force = self.sensitivity * gesture.forces(at_s)[:, np.newaxis] * self.gain[taxels]
-                distance = gesture.distances_m(at_s, self.surface, taxels)
-                load[rows, taxels] += force * self.response.bell(distance)
+                felt, sagged = self._felt(gesture, time_s[rows, patch], taxels)
+                load[rows, taxels] += felt
                 if self.response.sag:
-                    missing[rows, taxels] += force * self.response.ring(distance)
+                    missing[rows, taxels] += sagged
         return load, missing
+
+    def felt(self, time_s: ArrayF, taxels: Taxels) -> ArrayF:
+        """What some of the taxels feel of all gestures at any moments, in counts: the load less what sags.
+
+        For who makes frames of it in his own time, and of his own noise.
+
+        Args:
+            time_s: (m,).
+            taxels: k of them.
+
+        Returns:
+            (m, k).
+        """
+        numbers = self.surface.taxels(taxels)
+        total = np.zeros((len(time_s), len(numbers)))
+        for gesture in self.gestures:
+            if gesture.forces(time_s).any():
+                load, missing = self._felt(gesture, time_s, numbers)
+                total += load - missing
+        total *= self.faults.feels[numbers]
+        return total
+
+    def _felt(self, gesture: Gesture, time_s: ArrayF, taxels: npt.NDArray[np.int64]) -> tuple[ArrayF, ArrayF]:
+        """(m, k) load, and what is missing round it: 0 where nothing sags."""
+        force = self.sensitivity * gesture.forces(time_s)[:, np.newaxis] * self.gain[taxels]
+        distance = gesture.distances_m(time_s, self.surface, taxels)
+        load = force * self.response.bell(distance)
+        return load, force * self.response.ring(distance) if self.response.sag else np.zeros_like(load)
 
 
 class _State:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
@@ -19,6 +20,10 @@ EMULATORS = "skinware.emulators"
 
 
 _FARTHEST_M, _STRONGEST_N, _WIDEST_M, _SHORTEST_S, _LONGEST_S = 100.0, 100.0, 0.1, 0.05, 3600.0
+
+
+Point = tuple[float, float, float]
+"""x, y and z, m."""
 
 
 class WireFrame(NamedTuple):
@@ -75,7 +80,7 @@ class EmulatedHardware(Protocol):
 class Pressing(NamedTuple):
     """Somebody presses."""
 
-    at_m: tuple[float, float, float]
+    at_m: Point
     """Where, in the frame of the places, m."""
     force_n: float = 3.0
     radius_m: float = 0.006
@@ -103,6 +108,9 @@ class Pressing(NamedTuple):
 @runtime_checkable
 class PlacedHardware(EmulatedHardware, Protocol):
     """Emulated hardware whose sensors have places, at which it can be pressed."""
+
+    def pressing(self, now_ns: int) -> Sequence[tuple[Point, float]]:
+        """What presses it at ``now_ns``: where, in the frame of the places, m, and with how many newtons."""
 
     def geometry(self) -> Geometry:
         """Where the sensors are, by the types and uids of their driver."""
@@ -170,6 +178,7 @@ __all__ = [
     "EventLog",
     "HardwareFactory",
     "PlacedHardware",
+    "Point",
     "Pressing",
     "WireFrame",
     "emulators_instead",

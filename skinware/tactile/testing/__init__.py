@@ -12,10 +12,12 @@ It gives arrays, so that algorithms can be tried against a truth that no real sk
 
 from skinware.tactile.testing.arm import ARM_FRAME, arm, arm_path
 from skinware.tactile.testing.bench import BENCH_S, bench_world
+from skinware.tactile.testing.block import Block, Sample
 from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke, Wander
 from skinware.tactile.testing.response import Response
+from skinware.tactile.testing.stage import Play, read_stage
 from skinware.tactile.testing.surface import Surface, grid, triangles
-from skinware.tactile.testing.world import Block, Sample, World
+from skinware.tactile.testing.world import World
 
 __all__ = [
     "ARM_FRAME",
@@ -23,6 +25,7 @@ __all__ = [
     "Block",
     "Cover",
     "Gesture",
+    "Play",
     "Push",
     "Response",
     "Sample",
@@ -34,5 +37,6 @@ __all__ = [
     "arm_path",
     "bench_world",
     "grid",
+    "read_stage",
     "triangles",
 ]

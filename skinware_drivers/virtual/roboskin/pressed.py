@@ -6,11 +6,12 @@ The boards cover a forearm and a hand: boards 7 to 10 one arm, 11 to 14 another 
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
-from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path
-from skinware_drivers.virtual.hardware import Pressing
+from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, read_stage
+from skinware_drivers.virtual.hardware import Point, Pressing
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 
@@ -31,7 +32,10 @@ class PressedSkin:
     """The skin of all boards, and the presses on it.
 
     Args:
-        options: which boards there are, and whether a finger wanders over each.
+        options: which boards there are, and what presses them.
+
+    Raises:
+        ConfigurationError: the file of the option ``stage`` cannot be used.
 
     Attributes:
         version: changes whenever what is felt from now on does.
@@ -44,6 +48,17 @@ class PressedSkin:
         self._paths = [arm_path(number) for number in numbers]
         self._world = World(arm(numbers, pads=True), sensitivity=_COUNTS_PER_N)
         self._fingers: dict[int, Wander] = {}
+        self._stage = World(self._world.surface, sensitivity=_COUNTS_PER_N)
+        self._repeat_s: float | None = None
+        self._origin_ns = 0
+        if options.stage:
+            play = read_stage(options.stage)
+            self._stage.gestures += play.gestures
+            self._repeat_s = play.repeat_s
+
+    def begin(self, now_ns: int) -> None:
+        """The boards get power: from now on the time of the stage file counts."""
+        self._origin_ns = now_ns
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
         """Press from now on, wherever the board there streams or not.
@@ -81,6 +96,12 @@ class PressedSkin:
             "distance_m": round(float(distance[nearest]), 6),
         }
 
+    def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
+        """Where somebody presses now, m, and with how many newtons."""
+        on_stage_s = float(self._on_stage(np.array([now_ns]))[0])
+        found = self._world.pressing(now_ns / NS_PER_S) + self._stage.pressing(on_stage_s)
+        return [((float(at[0]), float(at[1]), float(at[2])), force) for _, at, force in found]
+
     def stream_from(self, ordinal: int, time_ns: int | None) -> None:
         """Say when a board began to stream, or (None) that it lost its power.
 
@@ -90,7 +111,7 @@ class PressedSkin:
         if finger is not None:
             self._world.gestures.remove(finger)
             self.version += 1
-        if time_ns is not None and self._options.pattern == "touch":
+        if time_ns is not None and self._options.pattern == "touch" and not self._options.stage:
             random = np.random.default_rng([self._options.seed, ordinal, 5])
             path = np.roll(self._paths[ordinal], -int(random.integers(len(self._paths[ordinal]))), axis=0)
             finger = Wander(
@@ -108,7 +129,15 @@ class PressedSkin:
     def felt(self, ordinal: int, times_ns: ArrayI) -> ArrayI:
         """(m, 16, 12) capacitance counts that presses add on a board, at m times."""
         taxels = slice(ordinal * _SENSORS, (ordinal + 1) * _SENSORS)
-        return self._world.felt(times_ns / NS_PER_S, taxels).astype(np.int64).reshape(-1, TRIANGLES, CHANNELS)
+        felt = self._world.felt(times_ns / NS_PER_S, taxels)
+        if self._stage.gestures:
+            felt += self._stage.felt(self._on_stage(times_ns), taxels)
+        return felt.astype(np.int64).reshape(-1, TRIANGLES, CHANNELS)
+
+    def _on_stage(self, times_ns: ArrayI) -> npt.NDArray[np.float64]:
+        """(m,) seconds of the stage file at m times."""
+        since_s: npt.NDArray[np.float64] = (times_ns - self._origin_ns) / NS_PER_S
+        return since_s if self._repeat_s is None else since_s % self._repeat_s
 
     def geometry(self) -> Geometry:
         """Where all sensors are, by the uid that their driver gives them: board << 16 | triangle << 8 | channel.

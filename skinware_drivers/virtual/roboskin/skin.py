@@ -20,7 +20,7 @@ from skinware_drivers.virtual.stage import Actor, Stage
 
 if TYPE_CHECKING:  # what needs numpy is imported when the boards are made: commands show these options fast
     from skinware.geometry import Geometry
-    from skinware_drivers.virtual.hardware import Pressing
+    from skinware_drivers.virtual.hardware import Point, Pressing
     from skinware_drivers.virtual.roboskin.boards import Board
     from skinware_drivers.virtual.roboskin.faults import TriangleState
     from skinware_drivers.virtual.roboskin.touch import WireSource
@@ -56,6 +56,10 @@ class EmulatedRoboskin(Stage):
     def geometry(self) -> Geometry:
         """Where the sensors are: the boards cover a forearm and a hand."""
         return self._skin.geometry()
+
+    def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
+        """What presses the boards: where, m, and with how many newtons."""
+        return self._skin.pressing(self.run_to(now_ns))
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
         """Press somewhere from now on, beside the wandering fingers of the option ``pattern``.
@@ -116,6 +120,7 @@ class EmulatedRoboskin(Stage):
         from skinware_drivers.virtual.roboskin.patch import make_boards, make_foreign_traffic
 
         options = self._options
+        self._skin.begin(now_ns)
         self._boards = make_boards(options, self.wire, self.log, self.counts, self._source, self._skin, now_ns)
         for address, triangle, taxel in options.places("out_of_range", 3):
             self.log.append(events.TaxelOutOfRange(time_ns=now_ns, board=address, triangle=triangle, taxel=taxel))

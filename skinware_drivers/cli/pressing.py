@@ -49,6 +49,7 @@ class PressingService:
             description="what presses an emulated skin",
             operations={"press": self.press},
         )
+        self._writer.request_server()  # from now on, not from the first turn of the loop on
 
     def fileno(self) -> int:
         """Readable when a program asks for something."""

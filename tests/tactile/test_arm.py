@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from skinware.errors import ConfigurationError
@@ -12,8 +13,8 @@ from skinware.tactile.testing import Push, Stroke, Surface, Wander, World, arm, 
 from skinware.tactile.testing.surface import CHANNELS_M
 
 
-def distances(surface: Surface) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    found = np.linalg.norm(surface.position_m[:, np.newaxis] - surface.position_m, axis=2)
+def distances(surface: Surface) -> npt.NDArray[np.float64]:
+    found: npt.NDArray[np.float64] = np.linalg.norm(surface.position_m[:, np.newaxis] - surface.position_m, axis=2)
     np.fill_diagonal(found, np.inf)
     return found
 
@@ -182,5 +183,5 @@ def test_a_mistake_in_a_stage_file_is_told_with_its_line(tmp_path: Path, old: st
 
 
 def test_a_stage_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="nothing.toml"):
+    with pytest.raises(ConfigurationError, match=r"nothing\.toml"):
         read_stage(tmp_path / "nothing.toml")

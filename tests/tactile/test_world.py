@@ -307,6 +307,8 @@ def test_taxels_without_a_place_feel_no_push_and_break_nothing() -> None:
 
 def test_nothing_at_all() -> None:
     assert not list(quiet().frames(0))
+    with pytest.raises(ConfigurationError, match="no frames"):
+        quiet().record(0)
     empty = Surface.at(np.zeros((0, 3)))
     assert (len(empty), empty.n_modules, empty.n_patches) == (0, 0, 0)
 

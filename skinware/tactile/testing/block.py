@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import ConfigurationError
 from skinware.status import Status
 
 _UNUSABLE = Status.NEVER_SEEN | Status.STALE | Status.MASKED | Status.NOT_CONNECTED
@@ -31,6 +32,18 @@ class Block:
     values: npt.NDArray[np.generic]
     status: npt.NDArray[np.uint8]
     truth: npt.NDArray[np.float32]
+
+    @classmethod
+    def joined(cls, blocks: Sequence[Block]) -> Block:
+        """One after the other.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        if not blocks:
+            raise ConfigurationError("no frames: the time is over before it began")
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
     def __len__(self) -> int:
         return len(self.time_ns)

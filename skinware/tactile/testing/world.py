@@ -21,6 +21,7 @@ ArrayF = npt.NDArray[np.float64]
 
 _START_NS = 1_000_000_000
 _ROWS = 2048
+_MOST_KNOWN = 1000
 
 
 @dataclass
@@ -84,6 +85,9 @@ class World:
     follows: ArrayF = field(init=False)
     wave_phase: ArrayF = field(init=False)
     late_s: ArrayF = field(init=False)
+    _known_near: dict[tuple[Gesture, float], npt.NDArray[np.bool_]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         if not self.rate_hz > 0 or not 0 <= self.jitter <= 0.9 or not self.minimum <= self.idle <= self.maximum:
@@ -189,9 +193,12 @@ class World:
             yield from block
 
     def record(self, until_s: float) -> Block:
-        """Every frame from second 0 on, in one block."""
-        frames = max(int(np.ceil(until_s * self.rate_hz - 1e-9)), 1)
-        return next(self.blocks(until_s, rows=frames))
+        """Every frame from second 0 on, in one block.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        return Block.joined(list(self.blocks(until_s)))
 
     def blocks(self, until_s: float, rows: int = _ROWS) -> Iterator[Block]:
         """Every frame from second 0 on, in blocks of at most ``rows``; the values do not depend on ``rows``."""
@@ -215,7 +222,7 @@ class World:
         for gesture in self.gestures:
             if gesture.begin_s > last_s or gesture.end_s < first_s:
                 continue
-            near = gesture.least_distances_m(self.surface) <= self.response.reach_m
+            near = self._near(gesture)
             for patch in np.unique(self.surface.patch[near]).tolist():
                 taxels = np.flatnonzero(near & (self.surface.patch == patch))
                 rows = slice(*np.searchsorted(time_s[:, patch], [gesture.begin_s, gesture.end_s], "left").tolist())
@@ -240,11 +247,22 @@ class World:
         numbers = self.surface.taxels(taxels)
         total = np.zeros((len(time_s), len(numbers)))
         for gesture in self.gestures:
-            if gesture.forces(time_s).any():
-                load, missing = self._felt(gesture, time_s, numbers)
-                total += load - missing
+            near = np.flatnonzero(self._near(gesture)[numbers])
+            if len(near) and gesture.forces(time_s).any():
+                load, missing = self._felt(gesture, time_s, numbers[near])
+                total[:, near] += load - missing
         total *= self.faults.feels[numbers]
         return total
+
+    def _near(self, gesture: Gesture) -> npt.NDArray[np.bool_]:
+        """(n,) bool: the taxels that it ever reaches."""
+        key = gesture, self.response.reach_m
+        near = self._known_near.get(key)
+        if near is None:
+            if len(self._known_near) >= _MOST_KNOWN:
+                self._known_near.clear()
+            near = self._known_near[key] = gesture.least_distances_m(self.surface) <= self.response.reach_m
+        return near
 
     def _felt(self, gesture: Gesture, time_s: ArrayF, taxels: npt.NDArray[np.int64]) -> tuple[ArrayF, ArrayF]:
         """(m, k) load, and what is missing round it: 0 where nothing sags."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -17,6 +18,8 @@ from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
     import msgspec
+
+    from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
 
 _DEFAULT_DRIVER = "roboskin"
 _LONGEST_COMMAND = {"can": 8, "serial": 4096}
@@ -55,6 +58,13 @@ class EmulateCommand(HardwareCommand):
 )
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
 @click.option(
+    "--geometry",
+    "geometry_path",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Write the places of the emulated sensors to FILE, for skin-driver --geometry FILE.",
+)
+@click.option(
     "--name", metavar="NAME", help="Let programs press the skin (skin-press) by a service of that name.  [default: no]"
 )
 @namespace_option
@@ -65,6 +75,7 @@ def command(
     bus_name: str,
     driver: str,
     log_path: str | None,
+    geometry_path: Path | None,
     name: str | None,
     namespace: str | None,
     as_json: bool,
@@ -105,13 +116,34 @@ def command(
     with contextlib.ExitStack() as open_things:
         log = open_things.enter_context(contextlib.closing(JsonLinesLog(log_path))) if log_path else None
         hardware = emulator(options, log=log)
+        if geometry_path is not None:
+            _write_geometry(geometry_path, _placed(hardware, "--geometry"), short_name(driver))
         beside = None
         if name is not None:
-            service = PressingService(name, hardware, bus_name, Namespace(namespace))
+            service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
             beside = open_things.enter_context(contextlib.closing(service))
         emulation = Emulation(bus, hardware, report, beside=beside)
         signals = open_things.enter_context(SignalWatch())
         emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
+
+
+def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
+    """The same, if it knows where its sensors are.
+
+    Raises:
+        ConfigurationError: it does not.
+    """
+    from skinware_drivers.virtual.hardware import PlacedHardware
+
+    if not isinstance(hardware, PlacedHardware):
+        raise ConfigurationError(f"{option}: these emulated devices have no places")
+    return hardware
+
+
+def _write_geometry(path: Path, hardware: PlacedHardware, driver: str) -> None:
+    from skinware.geometry import geometry_to_toml
+
+    path.write_text(geometry_to_toml(hardware.geometry().to_groups(), f"the sensors of an emulated {driver}"))
 
 
 def main() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
@@ -26,13 +25,10 @@ class PressingService:
         namespace: of the service.
 
     Raises:
-        ConfigurationError: the devices have no places.
-        NameInUse, NamespaceError: as for :class:`skinware.ServiceWriter`.
+        NameInUse, NamespaceError, ConfigurationError: as for :class:`skinware.ServiceWriter`.
     """
 
-    def __init__(self, name: str, hardware: object, bus_name: str, namespace: Namespace | None = None) -> None:
-        if not isinstance(hardware, PlacedHardware):
-            raise ConfigurationError("--name: these devices have no places, so nobody can press there")
+    def __init__(self, name: str, hardware: PlacedHardware, bus_name: str, namespace: Namespace | None = None) -> None:
         self._hardware = hardware
         self._bus_name = bus_name
         self._now_ns = 0

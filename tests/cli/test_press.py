@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceReader, ServiceWriter
 from skinware.cli._command import exit_status
 from skinware.cli.press import command as press
+from skinware.geometry import read_geometry
 from skinware_drivers.cli.emulate import command as emulate
 from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import run, running
 
 IDLE = "virtual?boards=7,8&pattern=idle"
@@ -93,7 +97,21 @@ def test_wrong_usage_is_told(arguments: list[str], capsys: pytest.CaptureFixture
 
 
 def test_an_emulator_without_places_has_no_service(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:
-    arguments = ["--driver", "xela", "--bus", "udp_multicast:239.74.163.34", "--name", "hand"]
-    assert exit_status(emulate, arguments) == 2
-    assert "these devices have no places" in capsys.readouterr().err
+    for option in ("--name", "--geometry"):
+        arguments = ["--driver", "xela", "--bus", "udp_multicast:239.74.163.34", option, "hand"]
+        assert exit_status(emulate, arguments) == 2
+        assert f"{option}: these emulated devices have no places" in capsys.readouterr().err
     assert namespace.services() == []
+
+
+def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "arm.toml"
+    arguments = ["--bus", "udp_multicast:239.74.163.35", "--boards", "7,9", "--geometry", str(file), "-T", "0"]
+    assert exit_status(emulate, arguments) == 0
+    written = read_geometry(file)
+    own = EmulatedRoboskin(RoboskinOptions(boards=(7, 9))).geometry()
+    assert written.type_name.tolist() == own.type_name.tolist()
+    assert (set(written.frame), written.uid.tolist()) == ({"arm"}, own.uid.tolist())
+    for name in ("position_m", "normal", "radius_m"):
+        assert np.allclose(getattr(written, name), getattr(own, name))
+    capsys.readouterr()

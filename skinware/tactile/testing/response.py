@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import ConfigurationError
+
 ArrayF = npt.NDArray[np.float64]
 _FAR = 5.0
 """Beyond so many widths nothing is felt."""
@@ -23,6 +25,9 @@ class Response:
         creep: under a load the value grows by this part of it.
         remainder: when a load goes, this part of it stays for a while.
         creep_s: time constant of both.
+
+    Raises:
+        ConfigurationError: a width, radius or time constant that is not above 0.
     """
 
     width_m: float = 0.004
@@ -31,6 +36,11 @@ class Response:
     creep: float = 0.0
     remainder: float = 0.0
     creep_s: float = 40.0
+
+    def __post_init__(self) -> None:
+        for name in ("width_m", "sag_radius_m", "creep_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} {getattr(self, name)}: give more than 0")
 
     @property
     def reach_m(self) -> float:

@@ -90,19 +90,29 @@ class World:
     )
 
     def __post_init__(self) -> None:
-        if not self.rate_hz > 0 or not 0 <= self.jitter <= 0.9 or not self.minimum <= self.idle <= self.maximum:
-            raise ConfigurationError(
-                f"rate_hz {self.rate_hz}, jitter {self.jitter}, idle {self.idle} in {self.minimum} to {self.maximum}: "
-                "one of them makes no sense"
-            )
+        self._check()
         self.faults = Faults.none(len(self.surface))
         random = np.random.default_rng([self.seed, 0])
         self.gain = np.clip(1 + self.gain_spread * random.standard_normal(len(self.surface)), 0.3, 3)
         self.follows = np.clip(1 + self.drift_spread * random.standard_normal(len(self.surface)), 0.1, 3)
         self.wave_phase = random.uniform(0, 2 * np.pi, self.surface.n_patches)
         self.late_s = random.uniform(0, 1 / self.rate_hz, self.surface.n_patches)
-        if self.surface.n_patches:
-            self.late_s[random.integers(self.surface.n_patches)] = 0  # the newest of a frame
+        self.late_s[random.integers(self.surface.n_patches)] = 0  # the newest of a frame
+
+    def _check(self) -> None:
+        if not len(self.surface):
+            raise ConfigurationError("a world needs at least one taxel")
+        if not self.rate_hz > 0 or not 0 <= self.jitter <= 0.9 or not self.wave_s > 0 or not self.step >= 0:
+            raise ConfigurationError(
+                f"rate_hz {self.rate_hz}, jitter {self.jitter}, wave_s {self.wave_s}, step {self.step}:"
+                " one of them makes no sense"
+            )
+        dtype = np.dtype(self.dtype)
+        info = np.iinfo(dtype) if dtype.kind in "iu" else np.finfo(dtype)
+        if not self.minimum <= self.idle <= self.maximum:
+            raise ConfigurationError(f"idle {self.idle} is not between {self.minimum} and {self.maximum}")
+        if not info.min <= self.minimum <= self.maximum <= info.max:
+            raise ConfigurationError(f"{self.minimum} to {self.maximum}: more than {dtype.name} holds")
 
     # What somebody does
 
@@ -143,7 +153,9 @@ class World:
         self.faults.feels[self.surface.taxels(taxels)] = False
 
     def stuck(self, taxels: Taxels, value: float) -> None:
-        """These show one value for ever."""
+        """These show one value for ever, between ``minimum`` and ``maximum``."""
+        if not self.minimum <= value <= self.maximum:
+            raise ConfigurationError(f"stuck at {value}: values are between {self.minimum} and {self.maximum}")
         self.faults.stuck[self.surface.taxels(taxels)] = value
 
     def noisy(self, taxels: Taxels, factor: float) -> None:
@@ -179,6 +191,9 @@ class World:
             status: what the driver says of them; ``Status(0)``: nothing.
             value: what stands in their place (NaN, if the dtype has it); None: what was there before.
         """
+        dtype = np.dtype(self.dtype)
+        if value is not None and not (dtype.kind == "f" or np.iinfo(dtype).min <= value <= np.iinfo(dtype).max):
+            raise ConfigurationError(f"values of {dtype.name} cannot be {value}")
         self.faults.missing.append(Missing(self.surface.taxels(taxels), begin_s, end_s, status, value))
 
     def jump(self, taxels: Taxels, counts: float, at_s: float, *, suspect_s: float = 0.0) -> None:

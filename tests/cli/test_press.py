@@ -19,6 +19,7 @@ from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.commands import run, running
 
 IDLE = "virtual?boards=7,8&pattern=idle"
+BUS = "udp_multicast:239.74.163.2?port=43121"
 
 
 def pressed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> str:
@@ -55,14 +56,14 @@ def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.Capture
 def test_an_emulator_takes_presses_by_a_service_and_tells_where_it_is_pressed(
     capsys: pytest.CaptureFixture[str], namespace: Namespace
 ) -> None:
-    with running("skin-emulate", "--bus", "udp_multicast:239.74.163.33", "--pattern", "idle", "--name", "hand") as hand:
+    with running("skin-emulate", "--bus", BUS, "--pattern", "idle", "--name", "hand") as hand:
         hand.wait_for("ready")
         with ServiceReader("hand") as reader:
             assert reader.operations() == {"press": "Press the emulated skin at a place for a while."}
             wait_until(lambda: reader.latest is not None)
             assert reader.read().column("count")[0] == 0
             told = pressed(capsys, "0.19", "0", "-0.0125", "--seconds", "60")
-            assert told.startswith("hand on udp_multicast:239.74.163.33: 3 N for 60 s; the nearest taxel: board 10")
+            assert told.startswith(f"hand on {BUS}: 3 N for 60 s; the nearest taxel: board 10")
             frame = reader.request()
             assert frame.column("count")[0] == 1
             assert frame.column("point_m")[0].tolist() == [0.19, 0, -0.0125]
@@ -98,7 +99,7 @@ def test_wrong_usage_is_told(arguments: list[str], capsys: pytest.CaptureFixture
 
 def test_an_emulator_without_places_has_no_service(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:
     for option in ("--name", "--geometry"):
-        arguments = ["--driver", "xela", "--bus", "udp_multicast:239.74.163.34", option, "hand"]
+        arguments = ["--driver", "xela", "--bus", BUS, option, "hand"]
         assert exit_status(emulate, arguments) == 2
         assert f"{option}: these emulated devices have no places" in capsys.readouterr().err
     assert namespace.services() == []
@@ -106,7 +107,7 @@ def test_an_emulator_without_places_has_no_service(capsys: pytest.CaptureFixture
 
 def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "arm.toml"
-    arguments = ["--bus", "udp_multicast:239.74.163.35", "--boards", "7,9", "--geometry", str(file), "-T", "0"]
+    arguments = ["--bus", BUS, "--boards", "7,9", "--geometry", str(file), "-T", "0"]
     assert exit_status(emulate, arguments) == 0
     written = read_geometry(file)
     own = EmulatedRoboskin(RoboskinOptions(boards=(7, 9))).geometry()

@@ -166,6 +166,25 @@ class Geometry:
         """Sensors whose places nobody knows."""
         return _empty(0).at(type_name, uid)
 
+    def to_groups(self) -> list[GeometryGroup]:
+        """The sensors whose places are known, for a file: a group for each type, frame and radius."""
+        rows_of: dict[tuple[str, str, float | None], list[int]] = {}
+        for row in np.flatnonzero(self.known).tolist():
+            radius_m = float(self.radius_m[row])
+            known_radius_m = None if np.isnan(radius_m) else radius_m
+            rows_of.setdefault((self.type_name[row], self.frame[row], known_radius_m), []).append(row)
+        return [
+            GeometryGroup(
+                type=type_name,
+                frame=frame,
+                uid=tuple(self.uid[rows].tolist()),
+                position_m=_triples(self.position_m[rows]),
+                normal=None if np.isnan(self.normal[rows]).all() else _triples(self.normal[rows]),
+                radius_m=radius_m,
+            )
+            for (type_name, frame, radius_m), rows in rows_of.items()
+        ]
+
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """As named columns, for a driver's file.
 
@@ -312,6 +331,10 @@ def _empty(n: int) -> Geometry:
         normal=nowhere,
         radius_m=np.full(n, np.nan),
     )
+
+
+def _triples(rows: npt.NDArray[np.float64]) -> tuple[Triple, ...]:
+    return tuple((x, y, z) for x, y, z in rows.tolist())
 
 
 def _string(text: str) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusSendError, ConfigurationError
+from skinware.geometry import Geometry
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.samples import Samples
@@ -295,6 +296,11 @@ class Bus(ABC):
             time_ns: now, CLOCK_MONOTONIC ns.
         """
         return BusReason.NONE
+
+    @property
+    def geometry(self) -> Geometry | None:
+        """Where the sensors on it are, by the types and uids of their driver; None: the bus does not know."""
+        return None
 
     @property
     def note(self) -> str:

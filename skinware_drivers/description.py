@@ -91,6 +91,11 @@ class SkinTables:
         return replace(self, structure=self.structure.placed(geometry))
 
 
+def uid_on_bus(bus: int, uid: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """What the whole driver calls sensors that have these uids on their bus."""
+    return uid | np.uint64(bus << _BUS_SHIFT)
+
+
 def join_types(types_of_buses: Sequence[Sequence[SensorType]]) -> list[SensorType]:
     """The types of all buses, each once.
 

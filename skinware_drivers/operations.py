@@ -1,4 +1,4 @@
-"""What user programs may ask a driver to do: methods of its adapter that are marked as operations."""
+"""What user programs may ask a driver to do: methods of its adapter, or of its bus, that are marked as operations."""
 
 from __future__ import annotations
 

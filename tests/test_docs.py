@@ -20,6 +20,7 @@ import pytest
 
 import skinware
 from skinware import realtime, threads
+from skinware.tactile.testing import read_stage
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from tests.commands import PATIENCE_S, running
@@ -127,10 +128,14 @@ def fenced(page: Path, language: str) -> list[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if fenced(page, "toml")], ids=lambda page: page.stem)
 def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
-    """Geometry and packages are TOML too; their tables tell."""
+    """Geometry, stages and packages are TOML too; their tables tell."""
     file = tmp_path / "page.toml"
     for text in fenced(page, "toml"):
-        if not {"project", "group"} & tomllib.loads(text).keys():
+        found = tomllib.loads(text)
+        if found.get("format") == "skinware-stage":
+            file.write_text(text)
+            read_stage(file)
+        elif not {"project", "group"} & found.keys():
             file.write_text(re.sub(r"^cpus = .*", "", text, flags=re.MULTILINE))  # that this machine may not have
             read = ConfigFile(file)
             driver = load_driver(read.settings.driver or DEFAULT_DRIVER)

@@ -5,17 +5,21 @@ The command line is the emulator's options beside a few of its own; :mod:`.emula
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, run, seconds, version_option
+from skinware.cli._command import CONTEXT_SETTINGS, examples, namespace_option, run, seconds, version_option
 from skinware.errors import ConfigurationError
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
     import msgspec
+
+    from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
 
 _DEFAULT_DRIVER = "roboskin"
 _LONGEST_COMMAND = {"can": 8, "serial": 4096}
@@ -53,6 +57,17 @@ class EmulateCommand(HardwareCommand):
     help="Driver whose devices are emulated, or a file with an emulator.",
 )
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
+@click.option(
+    "--geometry",
+    "geometry_path",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Write the places of the emulated sensors to FILE, for skin-driver --geometry FILE.",
+)
+@click.option(
+    "--name", metavar="NAME", help="Let programs press the skin (skin-press) by a service of that name.  [default: no]"
+)
+@namespace_option
 @click.option("--json", "as_json", is_flag=True, help="Print the state every second, as JSON lines.")
 @click.option("-T", "duration_s", type=seconds, metavar="SECONDS", help="End after SECONDS.")
 @version_option
@@ -60,6 +75,9 @@ def command(
     bus_name: str,
     driver: str,
     log_path: str | None,
+    geometry_path: Path | None,
+    name: str | None,
+    namespace: str | None,
     as_json: bool,
     duration_s: float | None,
     **hardware_options: str | None,
@@ -68,9 +86,11 @@ def command(
 
     Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
     """
+    from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.cli.emulation import Emulation, HumanReport, JsonReport, SignalWatch
+    from skinware_drivers.cli.pressing import PressingService
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import make_bus
@@ -92,15 +112,38 @@ def command(
         raise ConfigurationError(
             f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"
         )
-    log = JsonLinesLog(log_path) if log_path else None
-    try:
-        report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)
-        emulation = Emulation(bus, emulator(options, log=log), report)
-        with SignalWatch() as signals:
-            emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
-    finally:
-        if log is not None:
-            log.close()
+    report = JsonReport(sys.stdout) if as_json else HumanReport(sys.stdout)
+    with contextlib.ExitStack() as open_things:
+        log = open_things.enter_context(contextlib.closing(JsonLinesLog(log_path))) if log_path else None
+        hardware = emulator(options, log=log)
+        if geometry_path is not None:
+            _write_geometry(geometry_path, _placed(hardware, "--geometry"), short_name(driver))
+        beside = None
+        if name is not None:
+            service = PressingService(name, _placed(hardware, "--name"), bus_name, Namespace(namespace))
+            beside = open_things.enter_context(contextlib.closing(service))
+        emulation = Emulation(bus, hardware, report, beside=beside)
+        signals = open_things.enter_context(SignalWatch())
+        emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
+
+
+def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
+    """The same, if it knows where its sensors are.
+
+    Raises:
+        ConfigurationError: it does not.
+    """
+    from skinware_drivers.virtual.hardware import PlacedHardware
+
+    if not isinstance(hardware, PlacedHardware):
+        raise ConfigurationError(f"{option}: these emulated devices have no places")
+    return hardware
+
+
+def _write_geometry(path: Path, hardware: PlacedHardware, driver: str) -> None:
+    from skinware.geometry import geometry_to_toml
+
+    path.write_text(geometry_to_toml(hardware.geometry().to_groups(), f"the sensors of an emulated {driver}"))
 
 
 def main() -> None:

@@ -110,6 +110,16 @@ class Stop(Protocol):
         """Readable when ``stopped`` may have changed."""
 
 
+class Beside(Protocol):
+    """What is done in the same loop."""
+
+    def fileno(self) -> int:
+        """Readable when ``step`` has something to do."""
+
+    def step(self, now_ns: int) -> int:
+        """Do what is due; returns when something will be due by itself."""
+
+
 class Emulation:
     """Emulated hardware on a bus.
 
@@ -124,6 +134,7 @@ class Emulation:
         report: told what happens.
         clock: CLOCK_MONOTONIC ns.
         poll: waits for one of the readable descriptors for so many seconds: ``(descriptors, timeout_s)``.
+        beside: what else there is to do.
     """
 
     def __init__(
@@ -134,9 +145,11 @@ class Emulation:
         *,
         clock: Callable[[], int] = time.monotonic_ns,
         poll: Callable[[list[int], float | None], None] | None = None,
+        beside: Beside | None = None,
     ) -> None:
         self._bus, self._hardware, self._report = bus, hardware, report
         self._clock, self._poll = clock, poll or wait_readable
+        self._beside = beside
         self._outbox: deque[WireFrame] = deque()
         self._batch = FrameBatch(256, bus.payload_size)
         self._open = False
@@ -175,7 +188,8 @@ class Emulation:
                     self._report.event("status", **self._totals())
                     status_ns += _STATUS_NS * (1 + (now_ns - status_ns) // _STATUS_NS)
                 next_ns = self._step(now_ns)
-                moments = [moment for moment in (next_ns, end_ns, status_ns) if moment is not None]
+                beside_ns = None if self._beside is None else self._beside.step(now_ns)
+                moments = [moment for moment in (next_ns, beside_ns, end_ns, status_ns) if moment is not None]
                 self._wait(stop, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
@@ -233,6 +247,8 @@ class Emulation:
 
     def _wait(self, stop: Stop, timeout_s: float) -> None:
         descriptors = [stop.fileno(), self._bus.fileno()] if self._open else [stop.fileno()]
+        if self._beside is not None:
+            descriptors.append(self._beside.fileno())
         self._poll(descriptors, timeout_s)
 
     def _totals(self) -> dict[str, int]:

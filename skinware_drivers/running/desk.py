@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, NamedTuple
 
 from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.realtime import now_ns
@@ -93,16 +94,17 @@ class RequestDesk:
         arguments = dict(request.arguments)
         bus, patch = arguments.pop("bus", None), arguments.pop("patch", None)
         try:
-            if self._listen_only:
+            does = {line: job for line in self._lines if (job := _job(line, request.operation)) is not None}
+            if self._listen_only and any(job.doer is line.adapter for line, job in does.items()):
                 raise ConfigurationError("this driver only listens (--listen-only)")
-            meant = self._meant(bus, patch)
-            operation = operations_of(type(self._lines[0].adapter))[request.operation]
-            check_arguments(operation.method, arguments)
+            meant = self._meant(list(does), bus, patch)
+            for line, _ in meant:
+                check_arguments(does[line].operation.method, arguments)
         except (ConfigurationError, TypeError) as error:
             request.fail(f"{request.operation}: {error}", "refused")
             return
         results = await asyncio.gather(
-            *(self._on_bus(line, patches, request, operation, arguments) for line, patches in meant),
+            *(self._on_bus(line, patches, request, does[line], arguments) for line, patches in meant),
             return_exceptions=True,
         )
         failures = [
@@ -116,7 +118,7 @@ class RequestDesk:
             request.reply({line.name: result for (line, _), result in zip(meant, results, strict=True)})
 
     async def _on_bus(
-        self, line: BusLine, patches: Sequence[Patch], request: Request, operation: Operation, arguments: dict[str, Any]
+        self, line: BusLine, patches: Sequence[Patch], request: Request, job: _Job, arguments: dict[str, Any]
     ) -> object:
         async with line.busy:
             if request.cancelled:
@@ -125,22 +127,22 @@ class RequestDesk:
                 raise ConfigurationError("the bus is away")
             try:
                 with hook(request.operation, line.name):
-                    result = await operation.method(line.adapter, line.link, patches, **arguments)
+                    result = await job.operation.method(job.doer, line.link, patches, **arguments)
             except DriverError as error:
                 if not isinstance(error.__cause__, ValueError):  # which says that the arguments make no sense
                     log.warning("%s", str(error))
                 raise error.__cause__ if isinstance(error.__cause__, Exception) else error from None
         try:
-            self._changed(line, patches, operation.sets_up)
+            self._changed(line, patches, job.operation.sets_up)
         except Exception as error:
             self._fail(error)
             raise
         return result
 
-    def _meant(self, bus: object, patch: object) -> list[tuple[BusLine, Sequence[Patch]]]:
-        lines = [line for line in self._lines if bus in (None, line.name) and line.patches]
+    def _meant(self, able: Sequence[BusLine], bus: object, patch: object) -> list[tuple[BusLine, Sequence[Patch]]]:
+        lines = [line for line in able if bus in (None, line.name) and line.patches]
         if not lines:
-            there_are = ", ".join(line.name for line in self._lines if line.patches) or "none"
+            there_are = ", ".join(line.name for line in able if line.patches) or "none"
             raise ConfigurationError(f"no bus {bus!r} with patches; there are: {there_are}")
         if patch is None:
             return [(line, line.patches or ()) for line in lines]
@@ -149,6 +151,33 @@ class RequestDesk:
             there_are = ", ".join(p.name for line in lines for p in line.patches or ())
             raise ConfigurationError(f"no patch {patch!r}; there are: {there_are}")
         return [(line, patches) for line, patches in meant if patches]
+
+
+class _Job(NamedTuple):
+    """Who does an operation on one bus: the driver's object for it, or the bus itself."""
+
+    doer: object
+    operation: Operation
+
+
+_declared = cache(operations_of)
+
+
+def _job(line: BusLine, operation: str) -> _Job | None:
+    """Who does it, None if nobody can."""
+    for doer in (line.adapter, line.bus):
+        found = _declared(type(doer)).get(operation)
+        if found is not None:
+            return _Job(doer, found)
+    return None
+
+
+def offered(lines: Sequence[BusLine]) -> dict[str, Callable[..., Any]]:
+    """What programs may ask a driver with these buses to do."""
+    declared: dict[str, Operation] = {}
+    for line in lines:
+        declared |= _declared(type(line.bus)) | _declared(type(line.adapter))
+    return {name: operation.method for name, operation in sorted(declared.items())}
 
 
 def _why(error: BaseException) -> str:

@@ -17,22 +17,21 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, short_turns
 from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
-from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
-from skinware_drivers.operations import operations_of
 from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.desk import RequestDesk
+from skinware_drivers.running.desk import RequestDesk, offered
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.flow import FlowLoop, flow_of
 from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
 from skinware_drivers.running.guard import end_of_driver, failure, hook
 from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.places import put_in_place
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
 
@@ -264,9 +263,7 @@ class Runner:
                 join_types([adapter.types for adapter in adapters]),
                 np.result_type(*(adapter.dtype for adapter in adapters)),
             )
-            if self._geometry is not None:
-                tables = tables.placed(self._geometry)
-                _warn_of_foreign(tables.structure)
+            tables = put_in_place(tables, self._geometry, [line.bus.geometry for line in self.lines])
         except StructureError as error:
             log.error("the devices that were found do not form a valid skin: %s", str(error))
             return
@@ -281,7 +278,6 @@ class Runner:
         self._built.notify_all()
 
     def _go_over_to(self, tables: SkinTables) -> None:
-        adapter = self.lines[0].adapter
         if self.writer is None:
             self.writer = writer = DriverWriter(
                 self.name,
@@ -292,7 +288,7 @@ class Runner:
                 namespace=self._namespace,
                 slots=self._slots,
                 rate_hz=1 / self._period_s,
-                operations={name: operation.method for name, operation in operations_of(type(adapter)).items()},
+                operations=offered(self.lines),
             )
             server = writer.request_server()
             self._desk = RequestDesk(server, self.lines, self._listen_only, self._after_operation, self.fail)
@@ -303,6 +299,7 @@ class Runner:
             log.info("new generation: %r", tables.structure)
         periods_s = [line.adapter.period_s for line in self.lines]
         decoder = Decoder(self._layouts, tables, periods_s)
+        adapter = self.lines[0].adapter
         try:
             watch = adapter.watch(tables)
         except Exception as error:
@@ -400,8 +397,3 @@ class Runner:
     def status(self) -> dict[str, Any]:
         """Figures of every bus and patch, for ``skin-driver --json``."""
         return figures(self.lines, self._machine, self.writer, self.generation)
-
-
-def _warn_of_foreign(structure: Structure) -> None:
-    if structure.geometry is not None and not structure.geometry.known.any():
-        log.warning("the geometry has no place for any of the sensors: types and uid in its file are of another skin")

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from importlib.metadata import entry_points
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import msgspec
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.loading import Kind, load
 
+if TYPE_CHECKING:  # needs numpy: commands show the options of emulators fast
+    from skinware.geometry import Geometry
+
 EMULATORS = "skinware.emulators"
 """The entry point group in which emulators register, under the name of the driver they serve."""
+
+
+_FARTHEST_M, _STRONGEST_N, _WIDEST_M, _SHORTEST_S, _LONGEST_S = 100.0, 100.0, 0.1, 0.05, 3600.0
+
+
+Point = tuple[float, float, float]
+"""x, y and z, m."""
 
 
 class WireFrame(NamedTuple):
@@ -66,6 +77,58 @@ class EmulatedHardware(Protocol):
         """Exact counts since power-up; at least ``frames`` (given by ``emit``), ``bursts``, ``commands``."""
 
 
+class Pressing(NamedTuple):
+    """Somebody presses."""
+
+    at_m: Point
+    """Where, in the frame of the places, m."""
+    force_n: float = 3.0
+    radius_m: float = 0.006
+    """Of the thing that presses."""
+    seconds: float = 1.0
+
+    @classmethod
+    def of(cls, at_m: Any, force_n: Any, radius_m: Any, seconds: Any) -> Pressing:
+        """What a program asks for.
+
+        Raises:
+            ValueError: it makes no sense.
+        """
+        if not isinstance(at_m, list | tuple) or len(at_m) != 3:
+            raise ValueError(f"at_m {at_m!r}: give x, y and z in m")
+        x, y, z = (_number("at_m", value, -_FARTHEST_M, _FARTHEST_M) for value in at_m)
+        return cls(
+            (x, y, z),
+            _number("force_n", force_n, 0, _STRONGEST_N),
+            _number("radius_m", radius_m, 0, _WIDEST_M),
+            _number("seconds", seconds, _SHORTEST_S, _LONGEST_S),
+        )
+
+
+@runtime_checkable
+class PlacedHardware(EmulatedHardware, Protocol):
+    """Emulated hardware whose sensors have places, at which it can be pressed."""
+
+    def pressing(self, now_ns: int) -> Sequence[tuple[Point, float]]:
+        """What presses it at ``now_ns``: where, in the frame of the places, m, and with how many newtons."""
+
+    def geometry(self) -> Geometry:
+        """Where the sensors are, by the types and uids of their driver."""
+
+    def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
+        """Press from ``now_ns`` on; tells what is nearest, in whatever words the hardware has for it.
+
+        Raises:
+            ValueError: nothing would feel it, or there are too many presses at a time.
+        """
+
+
+def _number(name: str, value: Any, least: float, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+        raise ValueError(f"{name} {value!r}: give a number from {least:g} to {most:g}")
+    return float(value)
+
+
 class HardwareFactory(Protocol):
     """What the entry points of group ``skinware.emulators`` name: a class with ``Options``."""
 
@@ -114,6 +177,9 @@ __all__ = [
     "EmulatedHardware",
     "EventLog",
     "HardwareFactory",
+    "PlacedHardware",
+    "Point",
+    "Pressing",
     "WireFrame",
     "emulators_instead",
     "load_emulator",

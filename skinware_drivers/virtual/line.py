@@ -12,7 +12,14 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import DEFAULT_EMULATOR, VirtualCanBus
-from skinware_drivers.virtual.hardware import EmulatedHardware, emulators_instead, load_emulator, medium_of
+from skinware_drivers.virtual.hardware import (
+    EmulatedHardware,
+    PlacedHardware,
+    emulators_instead,
+    load_emulator,
+    medium_of,
+)
+from skinware_drivers.virtual.placed import PlacedCanBus
 from skinware_drivers.virtual.timer import MonotonicTimer
 
 _LONGEST_BACKLOG_NS = 1_000_000_000
@@ -100,8 +107,12 @@ def virtual_bus(
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
-    is_serial = medium_of(load_emulator(channel or DEFAULT_EMULATOR)) == "serial"
-    bus = VirtualSerialBus if is_serial else VirtualCanBus
+    emulator = load_emulator(channel or DEFAULT_EMULATOR)
+    bus: type[VirtualSerialBus | VirtualCanBus] = VirtualCanBus
+    if medium_of(emulator) == "serial":
+        bus = VirtualSerialBus
+    elif isinstance(emulator, type) and issubclass(emulator, PlacedHardware):
+        bus = PlacedCanBus
     return bus(channel, options, payload_size=payload_size, listen_only=listen_only)
 
 

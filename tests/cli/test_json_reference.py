@@ -15,6 +15,7 @@ import pytest
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.cli._command import exit_status
 from skinware.cli.info import command as info
+from skinware.cli.press import command as press
 from skinware.cli.top import command as top
 from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
@@ -220,6 +221,12 @@ class _Stop:
         self.bus.time_ns += 100_000_000
         self.bus.up = not 20 < self.turns < 30
         self.stopped = self.turns > 100
+
+
+def test_press(printing: Print) -> None:
+    with running("skin-driver", "--bus", VIRTUAL) as driver:
+        driver.wait_for("ready")
+        check("`skin-press`", *printing(press, "0.07", "0.0225", "0"))
 
 
 def test_an_emulation() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from skinware import Structure
 from skinware.errors import ConfigurationError, StructureError
-from skinware.geometry import GeometryGroup, _from_data, geometry_to_toml, read_geometry
+from skinware.geometry import Geometry, GeometryGroup, _from_data, geometry_to_toml, read_geometry
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 
 HEAD = 'format = "skinware-geometry"\nversion = 1\n'
@@ -179,3 +179,24 @@ def test_no_data_raises_anything_else(group: dict[str, Any]) -> None:
         assert str(error).startswith("here: ")  # noqa: PT017
     else:
         assert len(geometry) == len(group["uid"])
+
+
+def test_groups_of_a_geometry_are_what_is_known_of_it_and_read_the_same(tmp_path: Path) -> None:
+    nan = float("nan")
+    groups = [
+        GeometryGroup("pressure", "arm", (1, 2), ((0, 0, 1), (0, 1, 0)), ((0, 0, 1), (nan, nan, nan)), 0.002),
+        GeometryGroup("pressure", "hand", (3,), ((1, 0, 0),)),
+        GeometryGroup("pressure", "arm", (4,), ((1, 1, 0),), None, 0.001),
+        GeometryGroup("temperature", "arm", (1,), ((0, 0, 2),), ((1, 0, 0),), 0.002),
+    ]
+    path = tmp_path / "places.toml"
+    path.write_text(geometry_to_toml(groups))
+    read = read_geometry(path)
+    with_unknown = Geometry.joined([read, Geometry.unknown(["pressure"], np.array([9], np.uint64))])
+    path.write_text(geometry_to_toml(with_unknown.to_groups()))
+    again = read_geometry(path)
+    for name in ("type_name", "uid", "frame"):
+        assert getattr(again, name).tolist() == getattr(read, name).tolist()
+    for name in ("position_m", "normal", "radius_m"):
+        assert np.array_equal(getattr(again, name), getattr(read, name), equal_nan=True)
+    assert Geometry.unknown(["pressure"], np.array([9], np.uint64)).to_groups() == []

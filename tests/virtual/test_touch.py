@@ -70,7 +70,7 @@ def test_thermal_pads_feel_warmth_and_no_pressure() -> None:
 def test_a_skin_that_nobody_touches_stays_in_range_for_an_hour_whenever_its_baseline_was_taken() -> None:
     seconds = np.arange(3600)
     offset = np.full((16, 1), DEFAULT_CDC_OFFSET)
-    raw = Touch(0, 0, pressed=False).capacitances(seconds * NS_PER_S, seconds, offset, fingertip=False)
+    raw = Touch(0, 0).capacitances(seconds * NS_PER_S, seconds, offset, fingertip=False)
     for skin_type in (0, 2):
         arithmetic = Arithmetic(skin_type, 240, (2,) * 16, mtb3=False)
         for baseline in raw[::97]:

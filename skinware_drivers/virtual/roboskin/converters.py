@@ -57,8 +57,13 @@ class Converters:
         self._cdc_offset = np.full((TRIANGLES, 1), DEFAULT_CDC_OFFSET, np.int64)
         self._baseline: ArrayI = np.zeros((TRIANGLES, CHANNELS), np.int64)
         self._ahead: deque[Acquisition] = deque()
-        self._ahead_version = faults.version
+        self._ahead_version = self._version
         self._settings_changed()
+
+    @property
+    def _version(self) -> tuple[int, int]:
+        """Changes whenever acquisitions that were computed ahead no longer hold."""
+        return self._faults.version, self._touch.version
 
     def set_board(self, skin_type: int, no_load: int) -> None:
         """Settings of all triangles."""
@@ -95,10 +100,10 @@ class Converters:
     def acquire(self, time_ns: int, cycle: int, period_ns: int) -> Acquisition:
         """What the skin feels at ``time_ns``; the next call is likely to come one period later."""
         ahead = self._ahead
-        if ahead and ahead[0].time_ns == time_ns and self._ahead_version == self._faults.version:
+        if ahead and ahead[0].time_ns == time_ns and self._ahead_version == self._version:
             return ahead.popleft()
         ahead.clear()
-        self._ahead_version = self._faults.version
+        self._ahead_version = self._version
         steps = np.arange(_AHEAD)
         ahead.extend(self._acquisitions(time_ns + steps * period_ns, cycle + steps, {}))
         return ahead.popleft()

@@ -32,6 +32,7 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(description="input: a wandering press, nothing, or each burst's number modulo 256"),
     ] = "touch"
     seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
+    stage: Annotated[str, Meta(description="TOML file of what presses the boards, instead of the wandering press")] = ""
     streaming: Annotated[
         bool, Meta(description="stream from power-up, as if a host had configured the boards already")
     ] = False

@@ -12,6 +12,7 @@ from skinware_drivers.virtual.roboskin.faults import BoardFaults
 from skinware_drivers.virtual.roboskin.mtb3 import Mtb3
 from skinware_drivers.virtual.roboskin.mtb4 import Mtb4
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
+from skinware_drivers.virtual.roboskin.pressed import PressedSkin
 from skinware_drivers.virtual.roboskin.touch import Touch, WireSource, cycle_pattern
 from skinware_drivers.virtual.wire import Wire
 
@@ -22,6 +23,7 @@ def make_boards(
     log: EventLog,
     counts: dict[str, int],
     source: WireSource | None,
+    skin: PressedSkin,
     now_ns: int,
 ) -> list[Board]:
     """The boards in the order of the option ``boards``, each powered up at ``now_ns`` and with its own phase."""
@@ -31,7 +33,7 @@ def make_boards(
     boards: list[Board] = []
     for ordinal, address in enumerate(options.boards):
         parts = BoardParts(
-            touch=Touch(options.seed, ordinal, pressed=options.pattern == "touch"),
+            touch=Touch(options.seed, ordinal, skin),
             transmitter=wire.attach(),
             faults=BoardFaults(options, address, ordinal),
             log=log,

@@ -2,7 +2,7 @@
 
 The boards are silent until a host starts them (or the option ``streaming`` says that one did). What each kind of
 board does is in :mod:`.mtb3` and :mod:`.mtb4`, what it computes in :mod:`.firmware`, what it feels in
-:mod:`.touch`, what goes wrong in :mod:`.faults`, and what is written down about it in
+:mod:`.touch` and :mod:`.pressed`, what goes wrong in :mod:`.faults`, and what is written down about it in
 :mod:`skinware_drivers.virtual.events`.
 """
 
@@ -19,6 +19,8 @@ from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.stage import Actor, Stage
 
 if TYPE_CHECKING:  # what needs numpy is imported when the boards are made: commands show these options fast
+    from skinware.geometry import Geometry
+    from skinware_drivers.virtual.hardware import Point, Pressing
     from skinware_drivers.virtual.roboskin.boards import Board
     from skinware_drivers.virtual.roboskin.faults import TriangleState
     from skinware_drivers.virtual.roboskin.touch import WireSource
@@ -43,10 +45,29 @@ class EmulatedRoboskin(Stage):
     def __init__(
         self, options: RoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
     ) -> None:
+        from skinware_drivers.virtual.roboskin.pressed import PressedSkin
+
         super().__init__(log, _COUNTED)
         self._options = options
         self._source = source
         self._boards: list[Board] = []
+        self._skin = PressedSkin(options)
+
+    def geometry(self) -> Geometry:
+        """Where the sensors are: the boards cover a forearm and a hand."""
+        return self._skin.geometry()
+
+    def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
+        """What presses the boards: where, m, and with how many newtons."""
+        return self._skin.pressing(self.run_to(now_ns))
+
+    def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
+        """Press somewhere from now on, beside the wandering fingers of the option ``pattern``.
+
+        Raises:
+            ValueError: nothing of the skin would feel it, or too many presses have not ended yet.
+        """
+        return self._skin.press(press, self.run_to(now_ns))
 
     def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
         """Let all boards hear a command; those that obeyed or answered, by the address they had before."""
@@ -99,7 +120,8 @@ class EmulatedRoboskin(Stage):
         from skinware_drivers.virtual.roboskin.patch import make_boards, make_foreign_traffic
 
         options = self._options
-        self._boards = make_boards(options, self.wire, self.log, self.counts, self._source, now_ns)
+        self._skin.begin(now_ns)
+        self._boards = make_boards(options, self.wire, self.log, self.counts, self._source, self._skin, now_ns)
         for address, triangle, taxel in options.places("out_of_range", 3):
             self.log.append(events.TaxelOutOfRange(time_ns=now_ns, board=address, triangle=triangle, taxel=taxel))
         for board in self._boards:

@@ -1,7 +1,6 @@
-"""What the skin of one board feels: capacitances of a hand that wanders, presses and lets go, and of a warm robot.
+"""What the skin of one board feels: capacitances of whatever presses it (:mod:`.pressed`), and of a warm robot.
 
-Everything is a function of time and seed, so that runs can be repeated. Nobody presses before a board streams, nor
-for a second after that: otherwise a press would be taken for the idle state whenever a host starts the board.
+Everything is a function of time and seed, so that runs can be repeated.
 """
 
 from __future__ import annotations
@@ -10,9 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
+from skinware_drivers.virtual.roboskin.pressed import PressedSkin
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values that go on the wire, 0-255, whatever is felt."""
@@ -26,12 +25,6 @@ _WARMTH = np.array([70, 96, 83, 38, 38, 70, 128, 45, 77, 164, 128, 77]) / 128
 _WARM_COUNTS, _LUKEWARM_COUNTS = 13, 6
 """A slow wave of warmth and a faster one. Whenever the baseline was taken, values on the wire stay below 255: at the
 usual shift of 2 and no load of 240, that is at 60 counts."""
-_PRESS_COUNTS = 480
-"""Capacitance counts of a firm press: 120 of the values on the wire at the usual shift of 2."""
-_PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
-_BLOB_RADIUS = 0.7
-"""Of the pressed spot; triangles are 1 apart."""
-_CALM_S = 1.0
 _NOISE_SCALE, _NOISE_LIMIT = 1.8, 4
 """Of the noise, in counts: at most 2 of the values on the wire at a shift of 2, baseline and reading together."""
 _NOISE_PERIOD = 61
@@ -43,32 +36,34 @@ class Touch:
     Args:
         seed: of the whole patch; boards with different ``ordinal`` feel different things.
         ordinal: of the board in the patch.
-        pressed: False for a skin that nobody touches.
+        skin: all boards', and what presses it; None for a board that nobody touches.
     """
 
-    def __init__(self, seed: int, ordinal: int, *, pressed: bool = True) -> None:
+    def __init__(self, seed: int, ordinal: int, skin: PressedSkin | None = None) -> None:
         random = np.random.default_rng([seed, ordinal])
-        self._pressed = pressed
+        self._ordinal, self._skin = ordinal, skin
         self._rest = random.integers(0x8800, 0x9800, (TRIANGLES, CHANNELS))
         noise = random.normal(0, _NOISE_SCALE, (_NOISE_PERIOD, TRIANGLES, CHANNELS))
         self._noise = np.clip(np.rint(noise), -_NOISE_LIMIT, _NOISE_LIMIT).astype(np.int64)
         self._noise[:, :, _THERMAL_PADS] //= 4
         self._warmth_phase = random.uniform(0, 2 * math.pi, (TRIANGLES, 1))
-        self._first_press_s, self._path_phase = _CALM_S + random.uniform(0, _PAUSE_S), random.uniform(0, 9)
-        self._streams_from_ns: int | None = None
-        triangle, channel = np.divmod(np.arange(TRIANGLES * CHANNELS), CHANNELS)
-        angle = channel * (2 * math.pi / CHANNELS)
-        self._x = (triangle % 4 + 0.35 * np.cos(angle)).reshape(TRIANGLES, CHANNELS)
-        self._y = (triangle // 4 + 0.35 * np.sin(angle)).reshape(TRIANGLES, CHANNELS)
+        self._streams = False
 
     def stream_from(self, time_ns: int | None) -> None:
         """Say when the board began to stream, or (None) that it does not: it lost its power."""
-        self._streams_from_ns = time_ns
+        self._streams = time_ns is not None
+        if self._skin is not None:
+            self._skin.stream_from(self._ordinal, time_ns)
 
     @property
     def streams(self) -> bool:
         """Whether the board has begun to stream."""
-        return self._streams_from_ns is not None
+        return self._streams
+
+    @property
+    def version(self) -> int:
+        """Changes whenever what is felt from now on does, otherwise than with time."""
+        return 0 if self._skin is None else self._skin.version
 
     def capacitances(self, times_ns: ArrayI, cycles: ArrayI, cdc_offset: ArrayI, *, fingertip: bool) -> ArrayI:
         """(n, 16, 12) what the converters read, 1-65534.
@@ -82,8 +77,8 @@ class Touch:
         """
         times_s = times_ns[:, np.newaxis, np.newaxis].astype(np.float64) * 1e-9
         raw: ArrayI = self._rest + self._noise[cycles % _NOISE_PERIOD]
-        if self._pressed and self._streams_from_ns is not None:
-            pressure = self._pressure(times_s - self._streams_from_ns * 1e-9)
+        if self._skin is not None:
+            pressure = self._skin.felt(self._ordinal, times_ns)
             if not fingertip:
                 pressure[:, :, _THERMAL_PADS] = 0
             raw += pressure
@@ -94,18 +89,6 @@ class Touch:
             raw += (warmer * _WARMTH).astype(np.int64)
         raw -= cdc_offset - DEFAULT_CDC_OFFSET
         return np.clip(raw, 1, 0xFFFE, out=raw)
-
-    def _pressure(self, times_s: npt.NDArray[np.float64]) -> ArrayI:
-        """(n, 16, 12) counts that a press adds, at times since the board streams."""
-        since_s = times_s - self._first_press_s
-        moment_s = since_s % (_PRESS_S + _PAUSE_S)
-        ramp = np.clip(np.minimum(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0, 1) * (since_s > 0)
-        strength = _PRESS_COUNTS * (0.5 - 0.5 * np.cos(math.pi * ramp))
-        at = times_s + self._path_phase
-        centre_x, centre_y = 1.5 + 1.5 * np.sin(0.71 * at), 1.5 + 1.5 * np.sin(0.53 * at + 1)
-        distance2 = (self._x - centre_x) ** 2 + (self._y - centre_y) ** 2
-        pressure: ArrayI = (strength * np.exp(distance2 * (-0.5 / _BLOB_RADIUS**2))).astype(np.int64)
-        return pressure
 
 
 def cycle_pattern(board: int, triangle: int, cycle: int, time_ns: int) -> Sequence[int]:  # noqa: ARG001 - a WireSource

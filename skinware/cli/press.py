@@ -1,0 +1,125 @@
+"""``skin-press``: press an emulated skin, in whatever process it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    version_option,
+)
+from skinware.errors import ConfigurationError, ServiceNotFound, SkinwareError
+
+if TYPE_CHECKING:
+    from skinware.memory.namespace import Namespace
+
+_OPERATION = "press"
+_ASK_S = 1.0
+
+
+@click.command(
+    "skin-press",
+    context_settings={**CONTEXT_SETTINGS, "ignore_unknown_options": True},  # -0.02 is a coordinate
+    epilog=examples(
+        "skin-driver --bus virtual                       an emulated forearm and hand, in another terminal",
+        "skin-press 0.07 0.0225 0                        for one second",
+        "skin-press 0.19 0 -0.0125 --seconds 60          its palm, for a minute",
+        "skin-press 0.07 0 0.02 --force 6 --radius 0.01  hard, with a thumb",
+    ),
+)
+@click.argument("x", type=float)
+@click.argument("y", type=float)
+@click.argument("z", type=float)
+@click.option("--force", "force_n", type=float, metavar="N", default=3.0, show_default=True, help="Newtons.")
+@click.option(
+    "--radius", "radius_m", type=float, metavar="M", default=0.006, show_default=True, help="Of what presses, metres."
+)
+@click.option(
+    "--seconds", type=float, metavar="S", default=1.0, show_default=True, help="How long; the command does not wait."
+)
+@click.option("--name", metavar="NAME", help="Driver or emulator.  [default: the only one that can be pressed]")
+@namespace_option
+@json_option
+@version_option
+def command(
+    x: float,
+    y: float,
+    z: float,
+    force_n: float,
+    radius_m: float,
+    seconds: float,
+    name: str | None,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Press an emulated skin at a place: X, Y and Z in metres, in the frame of its geometry.
+
+    The skin is one of "skin-driver --bus virtual", or of "skin-emulate --name NAME". Emulated ROBOSKIN boards cover a
+    forearm along x, from 0 to 0.14, and a hand from there to 0.23.
+
+    Exit status: 0 pressed, 1 nothing would feel it or no such skin runs, 2 wrong usage.
+    """
+    from skinware.memory.namespace import Namespace
+    from skinware.service import ServiceReader
+
+    place = Namespace(namespace)
+    name = name or _the_only_one(place)
+    with ServiceReader(name, namespace=place, announce=False) as reader:
+        if _OPERATION not in reader.operations():
+            raise ConfigurationError(f"{name} cannot be pressed: it is no emulated skin with places")
+        pressed = reader.call(_OPERATION, at_m=(x, y, z), force_n=force_n, radius_m=radius_m, seconds=seconds)
+    if as_json:
+        print_json({"name": name, "pressed": pressed})
+        return
+    for bus, nearest in pressed.items():
+        click.echo(f"{name} on {bus}: {force_n:g} N for {seconds:g} s; the nearest taxel: {_in_words(nearest)}")
+
+
+def _the_only_one(namespace: Namespace) -> str:
+    """The service that can be pressed.
+
+    Raises:
+        ServiceNotFound: there is none.
+        ConfigurationError: there are several.
+    """
+    able = [name for name in namespace.services() if _can_be_pressed(namespace, name)]
+    if not able:
+        raise ServiceNotFound(
+            f"nothing in the namespace {namespace.name!r} can be pressed; start skin-driver --bus virtual,"
+            " or skin-emulate with --name"
+        )
+    if len(able) > 1:
+        raise ConfigurationError(f"several can be pressed; give --name: {', '.join(able)}")
+    return able[0]
+
+
+def _can_be_pressed(namespace: Namespace, name: str) -> bool:
+    from skinware.service import ServiceReader
+
+    try:
+        with ServiceReader(name, namespace=namespace, announce=False) as reader:
+            return _OPERATION in reader.operations(timeout_s=_ASK_S)
+    except SkinwareError:
+        return False  # dead, hung, just withdrawn, not ours to read, or it takes no requests
+
+
+def _in_words(nearest: dict[str, Any]) -> str:
+    """``board 8, triangle 3, channel 7, 1.1 mm away``."""
+    distance_m = nearest.pop("distance_m")
+    return ", ".join([*(f"{key} {value}" for key, value in nearest.items()), f"{distance_m * 1e3:.1f} mm away"])
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)
+
+
+if __name__ == "__main__":
+    main()

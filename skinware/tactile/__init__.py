@@ -1,0 +1,1 @@
+"""The skin understood: numpy only, over arrays first; services and commands are built round it."""

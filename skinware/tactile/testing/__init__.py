@@ -1,0 +1,42 @@
+"""A world to test in: a skin with places, somebody who presses it, and all that is wrong with real skins.
+
+It gives arrays, so that algorithms can be tried against a truth that no real skin tells::
+
+    from skinware.tactile.testing import World, grid
+
+    world = World(grid(modules=10), seed=1, drift_per_min=0.5, noise=0.8)
+    world.push(world.surface.position_m[5], 25, begin_s=10, end_s=20)
+    for sample in world.frames(until_s=30):
+        sample.values, sample.truth  # (n,) both
+"""
+
+from skinware.tactile.testing.arm import ARM_FRAME, arm, arm_path
+from skinware.tactile.testing.bench import BENCH_S, bench_world
+from skinware.tactile.testing.block import Block, Sample
+from skinware.tactile.testing.gestures import Cover, Gesture, Push, Stroke, Wander
+from skinware.tactile.testing.response import Response
+from skinware.tactile.testing.stage import Play, read_stage
+from skinware.tactile.testing.surface import Surface, grid, triangles
+from skinware.tactile.testing.world import World
+
+__all__ = [
+    "ARM_FRAME",
+    "BENCH_S",
+    "Block",
+    "Cover",
+    "Gesture",
+    "Play",
+    "Push",
+    "Response",
+    "Sample",
+    "Stroke",
+    "Surface",
+    "Wander",
+    "World",
+    "arm",
+    "arm_path",
+    "bench_world",
+    "grid",
+    "read_stage",
+    "triangles",
+]

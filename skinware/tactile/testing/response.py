@@ -1,0 +1,81 @@
+"""How a skin answers a force: a bell round the place, a ring that sags, and what stays for a while afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+
+ArrayF = npt.NDArray[np.float64]
+_FAR = 5.0
+"""Beyond so many widths nothing is felt."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What taxels at a distance from a force show of it.
+
+    Attributes:
+        width_m: of the bell, m: its standard deviation.
+        sag: the cover is pulled down round a contact: so much of the load is missing at ``sag_radius_m``.
+        sag_radius_m: where it sags most, m.
+        creep: under a load the value grows by this part of it.
+        remainder: when a load goes, this part of it stays for a while.
+        creep_s: time constant of both.
+
+    Raises:
+        ConfigurationError: a width, radius or time constant that is not above 0.
+    """
+
+    width_m: float = 0.004
+    sag: float = 0.0
+    sag_radius_m: float = 0.012
+    creep: float = 0.0
+    remainder: float = 0.0
+    creep_s: float = 40.0
+
+    def __post_init__(self) -> None:
+        for name in ("width_m", "sag_radius_m", "creep_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} {getattr(self, name)}: give more than 0")
+
+    @property
+    def reach_m(self) -> float:
+        """Farther than that from a contact nothing changes."""
+        return _FAR * self.width_m if self.sag == 0 else max(_FAR * self.width_m, 4 * self.sag_radius_m)
+
+    def bell(self, distance_m: ArrayF) -> ArrayF:
+        """The part of the force that is felt as load, at distances; 0 at NaN."""
+        near = distance_m <= _FAR * self.width_m
+        load: ArrayF = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
+        return load
+
+    def ring(self, distance_m: ArrayF) -> ArrayF:
+        """The part of the force that is missing round it, at distances; 0 at NaN."""
+        squared = np.where(distance_m <= 4 * self.sag_radius_m, distance_m / self.sag_radius_m, 0) ** 2
+        missing: ArrayF = self.sag * squared * np.exp(1 - squared)
+        return missing
+
+    def slowly(self, load: ArrayF, crept: ArrayF, period_s: float) -> ArrayF:
+        """What creep and remainder add to a block of loads.
+
+        Args:
+            load: (m, k) at even times.
+            crept: (k,) the load that the material has got used to; brought up to date.
+            period_s: between the rows.
+
+        Returns:
+            (m, k).
+        """
+        gain = 1 - np.exp(-period_s / self.creep_s)
+        used_to = np.empty_like(load)
+        for row, now in enumerate(load):
+            crept += gain * (now - crept)
+            used_to[row] = crept
+        return self.creep * np.minimum(used_to, load) + self.remainder * np.maximum(used_to - load, 0)
+
+
+__all__ = ["Response"]

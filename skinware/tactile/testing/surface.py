@@ -1,0 +1,182 @@
+"""Where the taxels of a world are, and to which modules and patches they belong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry
+from skinware.structure import Structure
+
+ArrayF = npt.NDArray[np.float64]
+ArrayI = npt.NDArray[np.int64]
+Taxels = slice | npt.ArrayLike
+"""Some of n taxels: whatever indexes an array of them (numbers, a slice, a mask)."""
+
+PITCH_M = 0.0065
+"""Between neighbouring taxels of a ROBOSKIN triangle."""
+SIDE_M = 0.03
+"""Of a ROBOSKIN triangle."""
+_CELLS = ((2, 5), (3, 6), (3, 4), (2, 3), (3, 2), (3, 0), (2, 1), (1, 2), (0, 3), (1, 4))
+"""The ten taxels of a triangle in the order of their channels: row from its tip, and column in halves of a pitch."""
+TRIANGLE_M = np.array([[(half - 3) / 2, (2 - row) * np.sqrt(0.75)] for row, half in _CELLS]) * PITCH_M
+"""(10, 2) where the taxels of a triangle are, from its centre, seen from outside, its tip up, m."""
+_PADS = ((3, 4, 6), (7, 8, 9))
+CHANNELS_M = np.insert(TRIANGLE_M, [6, 9], [TRIANGLE_M[list(corners)].mean(axis=0) for corners in _PADS], axis=0)
+"""(12, 2) the same of all channels: the thermal pads, 6 and 10, lie between three taxels each (which is assumed)."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """n taxels of one type, in the driver's order.
+
+    Attributes:
+        position_m: (n, 3) float64, m; NaN where nobody knows: no push reaches such a taxel.
+        normal: (n, 3) float64, outwards, of length 1; NaN where nobody knows.
+        module: (n,) int64, from 0 without gaps.
+        patch: (n,) int64, from 0 without gaps; a module is of one patch.
+
+    Raises:
+        ConfigurationError: the arrays do not fit each other, or a module is in two patches.
+    """
+
+    position_m: ArrayF
+    normal: ArrayF
+    module: ArrayI
+    patch: ArrayI
+
+    def __post_init__(self) -> None:
+        n = len(self.position_m)
+        if self.position_m.shape != (n, 3) or self.normal.shape != (n, 3):
+            raise ConfigurationError(f"positions {self.position_m.shape}, normals {self.normal.shape}: give (n, 3)")
+        for name, of in (("module", self.module), ("patch", self.patch)):
+            if of.shape != (n,):
+                raise ConfigurationError(f"{n} taxels, but {name} has the shape {of.shape}")
+            if n and not np.array_equal(np.unique(of), np.arange(of.max() + 1)):
+                raise ConfigurationError(f"{name} must count from 0 without gaps")
+        if len(np.unique(np.stack([self.module, self.patch]), axis=1).T) != self.n_modules:
+            raise ConfigurationError("a module is in two patches")
+
+    @classmethod
+    def at(
+        cls,
+        position_m: npt.ArrayLike,
+        *,
+        normal: npt.ArrayLike | None = None,
+        module: npt.ArrayLike | None = None,
+        patch: npt.ArrayLike | None = None,
+    ) -> Surface:
+        """Taxels at given places; what is left out is unknown (normals), or one module, or one patch."""
+        position = np.array(position_m, np.float64).reshape(-1, 3)
+        nothing = np.zeros(len(position), np.int64)
+        return cls(
+            position_m=position,
+            normal=np.full_like(position, np.nan) if normal is None else np.array(normal, np.float64),
+            module=nothing if module is None else np.array(module, np.int64),
+            patch=nothing if patch is None else np.array(patch, np.int64),
+        )
+
+    @classmethod
+    def of(cls, structure: Structure, type_name: str, geometry: Geometry | None = None) -> Surface:
+        """The taxels of one type of a driver, at the places of ``geometry`` or else of the structure's own.
+
+        Raises:
+            StructureError: the driver has no such type.
+        """
+        index = structure.index(type_name)
+        geometry = structure.geometry if geometry is None else geometry
+        n = len(structure.sensor_uid[index])
+        nowhere = np.full((n, 3), np.nan)
+        places = geometry.of(structure, type_name) if geometry is not None else None
+        return cls(
+            position_m=nowhere if places is None else places.position_m,
+            normal=nowhere if places is None else places.normal,
+            module=_numbered(structure.sensor_module[index]),
+            patch=_numbered(structure.sensor_patch[index]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    @property
+    def n_modules(self) -> int:
+        """Number of modules."""
+        return int(self.module.max()) + 1 if len(self) else 0
+
+    @property
+    def n_patches(self) -> int:
+        """Number of patches."""
+        return int(self.patch.max()) + 1 if len(self) else 0
+
+    def taxels(self, some: Taxels) -> ArrayI:
+        """The numbers of some taxels.
+
+        Raises:
+            ConfigurationError: there are no such taxels.
+        """
+        try:
+            found: ArrayI = np.arange(len(self))[some if isinstance(some, slice) else np.asarray(some)]
+        except IndexError as error:
+            raise ConfigurationError(f"of {len(self)} taxels: {error}") from None
+        return np.atleast_1d(found)
+
+
+def grid(
+    modules: int = 1,
+    rows: int = 3,
+    columns: int = 4,
+    *,
+    patches: int = 1,
+    pitch_m: float = PITCH_M,
+    gap_m: float = 0.05,
+) -> Surface:
+    """Flat rectangular modules in a row along x, facing +z; modules are given to patches in equal shares.
+
+    Args:
+        modules: how many.
+        rows: of taxels in a module, along y.
+        columns: of taxels in a module, along x.
+        patches: how many.
+        pitch_m: between neighbours in a module.
+        gap_m: between the last column of a module and the first of the next.
+    """
+    y, x = np.divmod(np.arange(rows * columns), columns)
+    module = np.repeat(np.arange(modules), rows * columns)
+    width_m = (columns - 1) * pitch_m + gap_m
+    places = np.stack([np.tile(x, modules) * pitch_m + module * width_m, np.tile(y, modules) * pitch_m], axis=1)
+    return _flat(places, module, modules, patches)
+
+
+def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
+    """A flat strip of triangles of ten taxels along x, as of a ROBOSKIN, facing +z; every second one upside down.
+
+    Args:
+        modules: how many.
+        patches: how many; the triangles are given to them in equal shares.
+    """
+    places = [
+        TRIANGLE_M * (-1 if number % 2 else 1) + [number * SIDE_M / 2, number % 2 * SIDE_M / np.sqrt(12)]
+        for number in range(modules)
+    ]
+    return _flat(np.concatenate(places), np.repeat(np.arange(modules), len(TRIANGLE_M)), modules, patches)
+
+
+def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) -> Surface:
+    """A surface in the plane z = 0."""
+    position = np.zeros((len(places), 3))
+    position[:, :2] = places
+    normal = np.zeros_like(position)
+    normal[:, 2] = 1
+    return Surface(position, normal, module, module * patches // modules)
+
+
+def _numbered(of: npt.NDArray[Any]) -> ArrayI:
+    """The same groups, numbered from 0 without gaps."""
+    return np.unique(of, return_inverse=True)[1].astype(np.int64)
+
+
+__all__ = ["CHANNELS_M", "PITCH_M", "SIDE_M", "TRIANGLE_M", "Surface", "Taxels", "grid", "triangles"]

@@ -1,0 +1,97 @@
+"""The service beside ``skin-emulate`` by which programs press the emulated skin, and that tells where it is pressed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from skinware.memory.namespace import Namespace
+from skinware.memory.schema import Column
+from skinware.realtime import NS_PER_S
+from skinware.service import Request, ServiceWriter
+from skinware.service.messages import ACQUIRE
+from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
+
+_RATE_HZ = 50
+_MOST = 16
+
+
+class PressingService:
+    """Publishes what presses the skin, at 50 Hz, and takes presses: the operation ``press``, as of the bus ``virtual``.
+
+    Args:
+        name: of the service.
+        hardware: that is pressed.
+        bus_name: of the emulation, for the answers.
+        namespace: of the service.
+
+    Raises:
+        NameInUse, NamespaceError, ConfigurationError: as for :class:`skinware.ServiceWriter`.
+    """
+
+    def __init__(self, name: str, hardware: PlacedHardware, bus_name: str, namespace: Namespace | None = None) -> None:
+        self._hardware = hardware
+        self._bus_name = bus_name
+        self._now_ns = 0
+        self._due_ns = 0
+        self._writer = ServiceWriter(
+            name,
+            {
+                "count": Column(np.dtype("<u4"), (1,), "", "of the presses; the rows behind them are old"),
+                "point_m": Column(np.dtype("<f8"), (_MOST, 3), "m", "where each is, in the frame of the geometry"),
+                "force_n": Column(np.dtype("<f8"), (_MOST,), "N", "of each"),
+            },
+            namespace=namespace,
+            rate_hz=_RATE_HZ,
+            description="what presses an emulated skin",
+            operations={"press": self.press},
+        )
+        self._writer.request_server()  # from now on, not from the first turn of the loop on
+
+    def fileno(self) -> int:
+        """Readable when a program asks for something."""
+        return self._writer.request_server().fileno()
+
+    def step(self, now_ns: int) -> int:
+        """Publish and answer what is due; returns when it will be due by itself, CLOCK_MONOTONIC ns."""
+        self._now_ns = now_ns
+        waiting: list[Request] = []
+        for request in self._writer.requests():
+            if request.operation == ACQUIRE:
+                waiting.append(request)
+                continue
+            try:
+                request.reply(self.press(**request.arguments))
+            except (TypeError, ValueError) as error:
+                request.fail(f"{request.operation}: {error}")
+        if waiting or now_ns >= self._due_ns:
+            self._publish(now_ns)
+            self._due_ns = now_ns + NS_PER_S // _RATE_HZ
+        for request in waiting:
+            request.reply(position=self._writer.position)
+        return self._due_ns
+
+    def press(
+        self, at_m: object, force_n: object = 3.0, radius_m: object = 0.006, seconds: object = 1.0
+    ) -> dict[str, object]:
+        """Press the emulated skin at a place for a while.
+
+        Raises:
+            ValueError: the numbers make no sense, or nothing of the skin would feel it.
+        """
+        pressing = Pressing.of(at_m, force_n, radius_m, seconds)
+        return {self._bus_name: self._hardware.press(pressing, self._now_ns)}
+
+    def close(self) -> None:
+        """Withdraw it."""
+        self._writer.close()
+
+    def _publish(self, now_ns: int) -> None:
+        found = self._hardware.pressing(now_ns)[:_MOST]
+        columns = self._writer.begin(from_last=True)
+        columns["count"][0] = len(found)
+        for row, (point_m, force_n) in enumerate(found):
+            columns["point_m"][row], columns["force_n"][row] = point_m, force_n
+        self._writer.commit(now_ns)
+
+
+__all__ = ["PressingService"]

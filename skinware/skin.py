@@ -15,6 +15,7 @@ from skinware.freshness import age_limit_ns
 from skinware.geometry import Geometry
 from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
+from skinware.memory.native_look import Look, PythonsTurn, look_at
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.skin_layout import SkinLayout
@@ -27,7 +28,7 @@ log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
 _POLL_NS = 1_000_000
-_REFUSED_FOR_NS, _WHATEVER_TIME_NS = 10 * NS_PER_S, 1 << 62
+_REFUSED_FOR_NS, _NEVER_NS = 10 * NS_PER_S, 1 << 62
 
 DriverCallback = Callable[[str, Structure], object]
 """Called with a driver's name and a structure."""
@@ -73,6 +74,8 @@ class Skin:
         self._readers: dict[str, _Reader] = {}
         self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
+        self._in_c: Look[DriverFrame] | None = None
+        self._latest: Snapshot | None = None  # what C looks for news of
         self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
 
@@ -137,17 +140,47 @@ class Skin:
             NamespaceError: the namespace cannot be trusted or read.
             Closed: this skin was closed.
         """
-        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        deadline_ns = _NEVER_NS if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        any_will_do = max_age_s is None and not align
         while True:
+            slept, snapshot = self._look_in_c(newer_than, deadline_ns) if any_will_do else (False, None)
+            if snapshot is not None:
+                return snapshot
             words, snapshot = self._look(newer_than, align)
             too_old = _too_old(snapshot, max_age_s) if snapshot is not None else []
             if snapshot is not None and not too_old:
+                if any_will_do:
+                    self._go_on_in_c(snapshot)
                 return snapshot
             time_ns = now_ns()
-            if deadline_ns is not None and time_ns >= deadline_ns:
+            if time_ns >= deadline_ns:
                 raise ServiceTimeout(self._why_nothing_came(too_old))
-            until_ns = time_ns + WAIT_SLICE_NS
-            _sleep_on(words, until_ns if deadline_ns is None else min(until_ns, deadline_ns))
+            if not slept:
+                _sleep_on(words, min(time_ns + WAIT_SLICE_NS, deadline_ns))
+
+    def _look_in_c(self, known: Snapshot | None, deadline_ns: int) -> tuple[bool, Snapshot | None]:
+        """Whether C had a look for anything newer and waited for it, and a snapshot if it found it."""
+        time_ns = now_ns()
+        if self._in_c is None or self._closed or time_ns >= self._next_discovery_ns:
+            return False, None
+        if known is not None and known is not self._latest:
+            return False, None
+        try:
+            frames = self._in_c.newest(None if known is None else min(deadline_ns, self._next_discovery_ns))
+        except PythonsTurn:
+            self._in_c = None
+            return False, None
+        if frames is None:
+            return True, None
+        self._latest = Snapshot(self._layout, frames)
+        return True, self._latest
+
+    def _go_on_in_c(self, snapshot: Snapshot) -> None:
+        """Leave the looks after this one to C, where there is C, until something else happens than frames."""
+        rings = [reader.ring_in_c() for reader in self._readers.values()]
+        if self._in_c is None or self._in_c.rings != rings:
+            self._in_c = look_at(rings)
+        self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[futex.Word, int]], Snapshot | None]:
         """What to sleep on if that is not enough, and a snapshot if there is one that is newer."""
@@ -207,7 +240,7 @@ class Skin:
         self._closed = True
         for reader in self._readers.values():
             reader.close()
-        self._readers = {}
+        self._readers, self._in_c, self._latest = {}, None, None
 
     def _discover(self) -> None:
         self._next_look_ns = now_ns() + WAIT_SLICE_NS
@@ -225,7 +258,7 @@ class Skin:
         if drivers != self._layout.drivers or any(
             a is not b for a, b in zip(structures, self._layout.structures, strict=True)
         ):
-            before, self._layout = self._layout, SkinLayout(drivers, structures)
+            before, self._layout, self._in_c = self._layout, SkinLayout(drivers, structures), None
             self._tell(before, self._layout)
 
     def _tell(self, before: SkinLayout, after: SkinLayout) -> None:
@@ -262,7 +295,7 @@ class Skin:
     def _has_wanted(self, reader: _Reader) -> bool:
         if self._types is None or any(sensor_type.name in self._types for sensor_type in reader.structure.types):
             return True
-        self._refused[reader.name] = reader.inode, _WHATEVER_TIME_NS
+        self._refused[reader.name] = reader.inode, _NEVER_NS
         return False
 
     def _still_there(self, reader: _Reader) -> bool:

@@ -59,7 +59,7 @@ class _Request(_Ring):
 
 
 class _TurnsState(_Ring):
-    """``skinware_native_turns`` of turns.c."""
+    """``skinware_native_turns`` of turns.h."""
 
     _fields_ = [
         ("last", ctypes.c_uint64),
@@ -94,6 +94,17 @@ class NativeRingReader(RingReader[FrameT]):
         self._turns.descriptor, self._turns.process = segment.descriptor.fd, os.getpid()
         self._turns.deadline_ns = _NEVER_NS
         self._asked: tuple[int | None, bool] = (None, False)
+
+    @property
+    def turns_address(self) -> int:
+        """Of its ``skinware_native_turns``."""
+        return ctypes.addressof(self._turns)
+
+    def frame_to_fill(self) -> tuple[FrameT, int]:
+        """A frame that nobody has, for C to fill, and the address of its bytes."""
+        frame, _, memory = self._pool.free()
+        frame.stale = False
+        return frame, ctypes.addressof(memory)
 
     def copy(self, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
@@ -147,7 +158,7 @@ class NativeRingReader(RingReader[FrameT]):
     def end_turn(self) -> tuple[int, int] | None:
         """As in Python."""
         state = self._turns
-        taken_ns, state.taken_ns = state.taken_ns, 0
+        taken_ns, state.taken_ns, state.last = state.taken_ns, 0, 0
         return (state.acquired_ns, taken_ns) if taken_ns else None
 
 

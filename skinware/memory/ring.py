@@ -127,13 +127,13 @@ class Turn(NamedTuple):
         acquired_ns: of its frame.
         taken_ns: when that was handed out.
         ended_ns: when the loop came back.
-        cpu_ns: CPU time of the thread then; None if it was not asked for.
+        cpu_ns: CPU time of the thread then; 0 if it was not asked for.
     """
 
     acquired_ns: int
     taken_ns: int
     ended_ns: int
-    cpu_ns: int | None
+    cpu_ns: int
 
 
 class Turns(NamedTuple):

@@ -6,7 +6,7 @@
 #include "ring.h"
 
 /* Changes whenever a function or structure here does; skinware/native/__init__.py has the same number. */
-#define ABI 2
+#define ABI 3
 
 /* What a reader asks for. The map outlives it. */
 typedef struct skinware_native_request {
@@ -19,8 +19,6 @@ typedef struct skinware_native_request {
 
 /* What a copy can come to. */
 enum { NOTHING = 0, COPIED = 1, OVERTAKEN = -1 };
-
-enum { ATTEMPTS = 64 };
 
 SKINWARE_EXPORT uint32_t skinware_native_abi(void);
 SKINWARE_EXPORT void skinware_native_fence(void);
@@ -44,7 +42,7 @@ int skinware_native_copy(const skinware__ring *ring, uint64_t wanted, unsigned c
     uint64_t copied;
     if (wanted != 0)
         return skinware__copy(ring, wanted, to) ? COPIED : NOTHING;
-    copied = skinware__copy_newest(ring, to, ATTEMPTS);
+    copied = skinware__copy_newest(ring, to, SKINWARE__COPY_ATTEMPTS);
     return copied == 0 ? NOTHING : copied == UINT64_MAX ? OVERTAKEN : COPIED;
 }
 

@@ -20,6 +20,9 @@
 /* What a library shows to those who load it: all else is hidden. */
 #define SKINWARE_EXPORT __attribute__((visibility("default")))
 
+/* How often a reader tries again while the writer overwrites what it copies. */
+enum { SKINWARE__COPY_ATTEMPTS = 64 };
+
 /* Words of 8 bytes from the beginning of the file. */
 enum {
     SKINWARE__WORD_TIMED = 576 / 8,

@@ -66,7 +66,7 @@ class Accounts:
         """Note the turn that ends now, if there is one; add up and tell everybody now and then."""
         time_ns = now_ns()
         if turn is not None:
-            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else None))
+            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
         if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
             self._add_up()
             self._announce(time_ns)
@@ -78,7 +78,7 @@ class Accounts:
             age_ns = taken_ns - acquired_ns
             record.age.add(age_ns)
             record.age_ms = round(age_ns / 1e6, 3)
-            if cpu_ns is not None:
+            if cpu_ns:
                 record.wall.add(ended_ns - taken_ns)
                 if 0 < self._cpu_ns <= cpu_ns:
                     record.cpu.add(cpu_ns - self._cpu_ns)

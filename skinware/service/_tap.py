@@ -6,7 +6,7 @@ from typing import Any
 
 from skinware.errors import Overrun
 from skinware.memory.futex import Word
-from skinware.memory.ring import FrameT
+from skinware.memory.ring import FrameT, RingReader
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader
 
@@ -34,6 +34,12 @@ class Tap(ServiceReader[FrameT]):
     def period_ns(self) -> int:
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
+
+    def ring_in_c(self) -> RingReader[FrameT]:
+        """The ring, whose next turns are left to C, where there is C."""
+        if not self._turns_in_c:
+            self._go_round_in_c()
+        return self._ring
 
     def newest(self) -> FrameT:
         """A copy of the newest frame of the generation at hand.

@@ -1,0 +1,94 @@
+"""The newest frames of several rings in one call of C: one sleep on all of them, one copy of each."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Generic
+
+from skinware import native
+from skinware.memory import futex
+from skinware.memory.native_ring import NativeRingReader
+from skinware.memory.ring import FrameT, RingReader
+
+_NEWS, _NO_NEWS = 1, 0  # what look.c answers
+
+
+class PythonsTurn(Exception):
+    """Something else than frames is to be done, for which there is no C."""
+
+
+class _SeenRing(ctypes.Structure):
+    """``seen_ring`` of look.c."""
+
+    _fields_ = [("turns", ctypes.c_void_p), ("to", ctypes.c_void_p)]
+
+
+class _LookState(ctypes.Structure):
+    """``skinware_native_look`` of look.c."""
+
+    _fields_ = [
+        ("count", ctypes.c_uint64),
+        ("news_only", ctypes.c_uint64),
+        ("until_ns", ctypes.c_int64),
+        ("asked_ns", ctypes.c_int64),
+        ("rings", _SeenRing * futex.MAX_WORDS),
+        ("words", (ctypes.c_uint64 * 3) * futex.MAX_WORDS),
+    ]
+
+
+class Look(Generic[FrameT]):
+    """A look at several rings whose readers have left their turns to C.
+
+    Args:
+        rings: 1 to :data:`skinware.memory.futex.MAX_WORDS`.
+        library: with their C.
+    """
+
+    def __init__(self, rings: Sequence[NativeRingReader[FrameT]], library: native.Library) -> None:
+        self.rings = rings
+        self._at_once = library.quick.skinware_native_newest
+        self._with_sleep = library.waiting.skinware_native_newest
+        self._state = _LookState(len(rings))
+        self._state_at = ctypes.byref(self._state)
+        self._seen = self._state.rings[: len(rings)]
+        for seen, ring in zip(self._seen, rings, strict=True):
+            seen.turns = ring.turns_address
+
+    def newest(self, until_ns: int | None) -> tuple[FrameT, ...] | None:
+        """The newest frame of every ring, each a private copy.
+
+        Args:
+            until_ns: wait for another frame than those of the last look, at most until then (CLOCK_MONOTONIC ns), and
+                maybe not as long. None: take what is there.
+
+        Returns:
+            None if there is nothing new.
+
+        Raises:
+            PythonsTurn: nothing was taken, and the readers have to look.
+        """
+        frames = []
+        for ring, seen in zip(self.rings, self._seen, strict=True):
+            frame, seen.to = ring.frame_to_fill()
+            frames.append(frame)
+        state = self._state
+        state.news_only, state.until_ns = until_ns is not None, 0
+        result = self._at_once(self._state_at)  # which keeps the interpreter lock: others may have it for long
+        if result == _NO_NEWS:
+            state.until_ns = until_ns
+            result = self._with_sleep(self._state_at)
+        if result == _NEWS:
+            return tuple(frames)
+        if result == _NO_NEWS:
+            return None
+        raise PythonsTurn
+
+
+def look_at(rings: Sequence[RingReader[FrameT]]) -> Look[FrameT] | None:
+    """A look at these rings, None where there is no C for it."""
+    library = native.core()
+    natives = [ring for ring in rings if isinstance(ring, NativeRingReader)]
+    if library is None or len(natives) < len(rings) or not 1 <= len(rings) <= futex.MAX_WORDS:
+        return None
+    return Look(natives, library)

@@ -161,9 +161,11 @@ class Skin:
     def _look_in_c(self, known: Snapshot | None, deadline_ns: int) -> tuple[bool, Snapshot | None]:
         """Whether C had a look for anything newer and waited for it, and a snapshot if it found it."""
         time_ns = now_ns()
-        if self._in_c is None or self._closed or time_ns >= self._next_discovery_ns:
-            return False, None
-        if known is not None and known is not self._latest:
+        if self._in_c is not None and time_ns >= self._next_discovery_ns:
+            self._discover()
+            for reader in self._readers.values():
+                reader.tell()
+        if self._in_c is None or self._closed or (known is not None and known is not self._latest):
             return False, None
         try:
             frames = self._in_c.newest(None if known is None else min(deadline_ns, self._next_discovery_ns))

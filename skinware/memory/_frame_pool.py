@@ -1,4 +1,4 @@
-"""Memory for the frames of one reader, used again as soon as nobody has the frame any more.
+"""Memory for the frames of one reader, or of several at once, used again as soon as nobody has them any more.
 
 New memory for every frame would have to be cleared, and found by a processor whose caches do not have it; with several
 readers on a processor that makes the frames of all of them older.
@@ -8,54 +8,55 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
+from itertools import accumulate
 from sys import getrefcount
-from types import SimpleNamespace
-from typing import Any, Generic, cast
+from typing import Generic
 
-from skinware.memory.ring import Frame, FrameT
+from skinware.memory.ring import FrameT, RingReader
 
 Memory = ctypes.Array[ctypes.c_char]
-_Place = tuple[FrameT, bytearray, Memory]
+_Place = tuple[tuple[FrameT, ...], bytearray, Memory]
+
+_COUNTS_COME_LATE = not getattr(sys, "_is_gil_enabled", lambda: True)()  # those of other threads
 
 
 class FramePool(Generic[FrameT]):
-    """Frames to be filled by C. Not for several threads at once.
+    """Frames to be filled by C: one of each ring, all in one piece of memory. Not for several threads at once.
 
     Args:
-        make: makes a frame in memory.
-        size: bytes of a frame.
+        rings: whose frames.
+
+    Attributes:
+        starts: where each frame begins in the memory, bytes.
     """
 
-    def __init__(self, make: Callable[[bytearray], FrameT], size: int) -> None:
-        self._make, self._size = make, size
-        self._memory_type = ctypes.c_char * size
-        self._places = [self._place(), self._place()]  # a loop still has the frame before when it asks for the next
+    def __init__(self, rings: Sequence[RingReader[FrameT]]) -> None:
+        *self.starts, self._size = accumulate((ring.frame_size for ring in rings), initial=0)
+        self._rings = rings
+        self._memory_type = ctypes.c_char * self._size
+        self._places = [self._place(), self._place()]  # a loop still has the frames before when it asks for the next
+        self._references_of_nobody = -1 if _COUNTS_COME_LATE else _references(self._places[0])
         self._turn = 0
 
     def free(self) -> _Place[FrameT]:
-        """A frame that nobody has, its bytes, and the same for calls of C.
+        """Frames that nobody has, their bytes, and the same for calls of C.
 
-        Whoever has a frame has a reference to it, and whoever has an array of it one to its bytes.
+        Whoever has a frame has a reference to it or to all of them, and whoever has an array of one, to the bytes.
         """
         self._turn = turn = 1 - self._turn
         place = self._places[turn]
-        if getrefcount(place[0]) > _FRAME_ALONE or getrefcount(place[1]) > _BYTES_ALONE:
+        if _references(place) != self._references_of_nobody:
             place = self._places[turn] = self._place()
         return place
 
     def _place(self) -> _Place[FrameT]:
         data = bytearray(self._size)
-        return self._make(data), data, self._memory_type.from_buffer(data)
+        frames = tuple([ring.frame_in(data, start) for ring, start in zip(self._rings, self.starts, strict=True)])
+        return frames, data, self._memory_type.from_buffer(data)
 
 
-def _alone() -> tuple[int, int]:
-    """What ``getrefcount`` says of a frame and of its bytes that only a pool has."""
-    if not getattr(sys, "_is_gil_enabled", lambda: True)():
-        return 0, 0  # counts of other threads come late: nothing is used again
-    ring = cast(Any, SimpleNamespace(columns={}, context=None, generation=0, period_ns=0))
-    place = FramePool(lambda data: Frame(ring, data), 64)._places[0]  # noqa: SLF001
-    return getrefcount(place[0]), getrefcount(place[1])
-
-
-_FRAME_ALONE, _BYTES_ALONE = _alone()
+def _references(place: _Place[FrameT]) -> int:
+    """How many there are to the frames of a place and to its bytes."""
+    frames, data, _ = place
+    return getrefcount(frames) + getrefcount(data) + sum(map(getrefcount, frames))

@@ -11,6 +11,7 @@ from errno import EACCES, EAGAIN
 from typing import ClassVar
 
 _FLOCK = struct.Struct("hhqqi4x")  # struct flock: l_type, l_whence, l_start, l_len, l_pid (0 for OFD locks)
+_TO_READ = _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0)
 
 
 def try_lock(fd: int) -> bool:
@@ -26,7 +27,7 @@ def try_lock(fd: int) -> bool:
 
 def is_locked(fd: int) -> bool:
     """Whether somebody else holds the exclusive lock; takes no lock itself, a read-only descriptor will do."""
-    reply = fcntl.fcntl(fd, fcntl.F_OFD_GETLK, _FLOCK.pack(fcntl.F_RDLCK, os.SEEK_SET, 0, 0, 0))
+    reply = fcntl.fcntl(fd, fcntl.F_OFD_GETLK, _TO_READ)
     lock_type: int = _FLOCK.unpack(reply[: _FLOCK.size])[0]
     return lock_type == fcntl.F_WRLCK
 

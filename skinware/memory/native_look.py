@@ -8,6 +8,7 @@ from typing import Generic
 
 from skinware import native
 from skinware.memory import futex
+from skinware.memory._frame_pool import FramePool
 from skinware.memory.native_ring import NativeRingReader
 from skinware.memory.ring import FrameT, RingReader
 
@@ -21,7 +22,7 @@ class PythonsTurn(Exception):
 class _SeenRing(ctypes.Structure):
     """``seen_ring`` of look.c."""
 
-    _fields_ = [("turns", ctypes.c_void_p), ("to", ctypes.c_void_p)]
+    _fields_ = [("turns", ctypes.c_void_p), ("start", ctypes.c_uint64)]
 
 
 class _LookState(ctypes.Structure):
@@ -51,9 +52,9 @@ class Look(Generic[FrameT]):
         self._with_sleep = library.waiting.skinware_native_newest
         self._state = _LookState(len(rings))
         self._state_at = ctypes.byref(self._state)
-        self._seen = self._state.rings[: len(rings)]
-        for seen, ring in zip(self._seen, rings, strict=True):
-            seen.turns = ring.turns_address
+        self._pool = FramePool(rings)
+        for seen, ring, start in zip(self._state.rings, rings, self._pool.starts, strict=False):
+            seen.turns, seen.start = ring.turns_address, start
 
     def newest(self, until_ns: int | None) -> tuple[FrameT, ...] | None:
         """The newest frame of every ring, each a private copy.
@@ -68,18 +69,17 @@ class Look(Generic[FrameT]):
         Raises:
             PythonsTurn: nothing was taken, and the readers have to look.
         """
-        frames = []
-        for ring, seen in zip(self.rings, self._seen, strict=True):
-            frame, seen.to = ring.frame_to_fill()
-            frames.append(frame)
+        frames, _, memory = self._pool.free()
+        for frame in frames:
+            frame.stale = False
         state = self._state
         state.news_only, state.until_ns = until_ns is not None, 0
-        result = self._at_once(self._state_at)  # which keeps the interpreter lock: others may have it for long
+        result = self._at_once(self._state_at, memory)  # which keeps the interpreter lock: others may have it for long
         if result == _NO_NEWS:
             state.until_ns = until_ns
-            result = self._with_sleep(self._state_at)
+            result = self._with_sleep(self._state_at, memory)
         if result == _NEWS:
-            return tuple(frames)
+            return frames
         if result == _NO_NEWS:
             return None
         raise PythonsTurn

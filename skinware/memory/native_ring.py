@@ -82,7 +82,7 @@ class NativeRingReader(RingReader[FrameT]):
 
     def __init__(self, segment: Segment, frame_class: type[FrameT], context: object, library: native.Library) -> None:
         super().__init__(segment, frame_class, context)
-        self._pool = FramePool(lambda data: frame_class(self, data), segment.layout.slot_stride)
+        self._pool = FramePool([self])
         self._copy_call = library.quick.skinware_native_copy
         self._wait_call = library.waiting.skinware_native_wait
         self._turn_call = library.waiting.skinware_native_turn
@@ -100,21 +100,15 @@ class NativeRingReader(RingReader[FrameT]):
         """Of its ``skinware_native_turns``."""
         return ctypes.addressof(self._turns)
 
-    def frame_to_fill(self) -> tuple[FrameT, int]:
-        """A frame that nobody has, for C to fill, and the address of its bytes."""
-        frame, _, memory = self._pool.free()
-        frame.stale = False
-        return frame, ctypes.addressof(memory)
-
     def copy(self, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
-        frame, _, memory = self._pool.free()
+        (frame,), _, memory = self._pool.free()
         wanted = _NEWEST if sequence is None else ctypes.c_uint64(sequence)
         return self._copied(self._copy_call(self._request_at, wanted, memory), frame)
 
     def wait(self, wake_count: int, latest: int, timeout_ns: int, sequence: int | None = None) -> FrameT | None:
         """As in Python."""
-        frame, _, memory = self._pool.free()
+        (frame,), _, memory = self._pool.free()
         request = self._request
         request.wake_count, request.known = wake_count, latest
         request.wanted, request.timeout_ns = sequence or 0, timeout_ns
@@ -130,7 +124,7 @@ class NativeRingReader(RingReader[FrameT]):
 
     def next_turn(self, deadline_ns: int | None, *, in_order: bool = False) -> FrameT | None:
         """One call of C, which lets go of the interpreter lock only if it has to sleep: others may keep it for long."""
-        frame, _, memory = self._pool.free()
+        (frame,), _, memory = self._pool.free()
         frame.stale = False
         state = self._turns
         if (deadline_ns, in_order) != self._asked:

@@ -31,6 +31,8 @@ _HEADER_WORDS = file_layout.SLOT.itemsize // 8
 class Frame:
     """One published frame: a private copy, or (from ``view``) the ring's own memory.
 
+    Copies that were made in one look share a piece of memory, which lives as long as any of them or of their arrays.
+
     Attributes:
         generation: which incarnation of the service it belongs to.
         period_ns: the writer's nominal period, 0 if it has none.
@@ -38,17 +40,19 @@ class Frame:
         context: what the reader knows of the service (for a driver: its structure).
     """
 
-    __slots__ = ("_columns", "_data", "_header", "_in_ring", "context", "generation", "period_ns", "stale")
+    __slots__ = ("_columns", "_data", "_header", "_in_ring", "_start", "context", "generation", "period_ns", "stale")
 
     def __init__(
         self,
         ring: RingReader[Any],
         data: bytearray | memoryview,
         in_ring: memoryview | None = None,
+        start: int = 0,
     ) -> None:
         self._data = data
+        self._start = start
         self._in_ring = in_ring
-        self._header = memoryview(data).cast("Q") if in_ring is None else in_ring.tolist()
+        self._header = memoryview(data)[start:].cast("Q") if in_ring is None else in_ring.tolist()
         self._columns = ring.columns
         self.context: object = ring.context
         self.generation: int = ring.generation
@@ -103,7 +107,7 @@ class Frame:
             shape, dtype, offset = self._columns[name]
         except KeyError:
             raise KeyError(f"no column {name!r}; there are {', '.join(self._columns)}") from None
-        return np.ndarray(shape, dtype, self._data, offset)
+        return np.ndarray(shape, dtype, self._data, self._start + offset)
 
     def __repr__(self) -> str:
         age_ms = self.age_ns / 1e6
@@ -180,6 +184,15 @@ class RingReader(Generic[FrameT]):
     def latest(self) -> int:
         """Sequence of the newest frame, 0 before the first."""
         return self._words[LATEST]
+
+    @property
+    def frame_size(self) -> int:
+        """Bytes of a copied frame."""
+        return self.segment.layout.slot_stride
+
+    def frame_in(self, data: bytearray, start: int) -> FrameT:
+        """A frame in memory of which it takes ``frame_size`` bytes, a multiple of 64, from ``start`` on."""
+        return self._frame_class(self, data, start=start)
 
     @property
     def slot_count(self) -> int:

@@ -286,10 +286,10 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     return segment
 
 
-def current_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
-    """(device, inode) of a service's present file, None if there is none."""
+def current_inode(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """(device, inode) of the present file of a service, which has that path; None if there is none."""
     try:
-        info = os.lstat(namespace.ring_path(name))
+        info = os.lstat(path)
     except OSError:
         return None
     return info.st_dev, info.st_ino

@@ -21,7 +21,7 @@ typedef struct wait_entry {
 
 typedef struct seen_ring {
     skinware_native_turns *turns;
-    unsigned char *to; /* where its newest frame goes */
+    uint64_t start; /* of its frame, in the memory of all */
 } seen_ring;
 
 /* skinware/memory/native_look.py has the same words. */
@@ -34,7 +34,7 @@ typedef struct skinware_native_look {
     wait_entry words[MOST_RINGS];
 } skinware_native_look;
 
-SKINWARE_EXPORT int skinware_native_newest(skinware_native_look *look);
+SKINWARE_EXPORT int skinware_native_newest(skinware_native_look *look, unsigned char *to);
 
 /* Whether there is news; PYTHONS_TURN: something else is to be done. */
 static int look_for_news(const skinware_native_look *look) {
@@ -83,18 +83,18 @@ static int sleep_on_words(const skinware_native_look *look, int64_t until_ns) {
            errno == EAGAIN || errno == EINTR || errno == ETIMEDOUT;
 }
 
-static int take_all(const skinware_native_look *look) {
+static int take_all(const skinware_native_look *look, unsigned char *to) {
     int64_t taken_ns;
     uint64_t i;
     for (i = 0; i < look->count; i++) {
         const uint64_t sequence =
-            skinware__copy_newest(&look->rings[i].turns->ring, look->rings[i].to, SKINWARE__COPY_ATTEMPTS);
+            skinware__copy_newest(&look->rings[i].turns->ring, to + look->rings[i].start, SKINWARE__COPY_ATTEMPTS);
         if (sequence == 0 || sequence == UINT64_MAX)
             return PYTHONS_TURN;
     }
     taken_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     for (i = 0; i < look->count; i++) {
-        const skinware__slot *slot = (const skinware__slot *)(const void *)look->rings[i].to;
+        const skinware__slot *slot = (const skinware__slot *)(const void *)(to + look->rings[i].start);
         skinware__hand_out(look->rings[i].turns, slot->sequence);
         skinware__note_turn(look->rings[i].turns, slot->acquired_ns, taken_ns, taken_ns, 0);
     }
@@ -102,7 +102,7 @@ static int take_all(const skinware_native_look *look) {
 }
 
 /* Copies the newest frame of every ring, and counts them once all are there. */
-int skinware_native_newest(skinware_native_look *look) {
+int skinware_native_newest(skinware_native_look *look, unsigned char *to) {
     const int64_t now_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     int found;
     read_words(look);
@@ -112,5 +112,5 @@ int skinware_native_newest(skinware_native_look *look) {
             return PYTHONS_TURN;
         found = look_for_news(look);
     }
-    return found == NEWS ? take_all(look) : found;
+    return found == NEWS ? take_all(look, to) : found;
 }

@@ -203,7 +203,7 @@ class Attachment(Generic[FrameT]):
 
     def _follow(self) -> None:
         """Go over to a newer generation if there is one of the same structure; remember if it has another."""
-        inode = segments.current_inode(self.namespace, self.name)
+        inode = segments.current_inode(self._ring.segment.path)
         if inode is None or inode == self._ring.segment.inode:
             return
         try:

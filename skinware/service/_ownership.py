@@ -197,8 +197,9 @@ class Ownership:
         with self._changing:
             segment = self._ring.segment
             segments.note_published(self._name_lock, segment.published)
-            if segments.current_inode(self.namespace, self.name) == segment.inode:
-                self.namespace.ring_path(self.name).unlink()
+            path = self.namespace.ring_path(self.name)
+            if segments.current_inode(path) == segment.inode:
+                path.unlink()
             self._ring.set_state(file_layout.STATE_CLOSED)
             segment.descriptor.close()
             if self._server is not None:

@@ -41,6 +41,11 @@ class Tap(ServiceReader[FrameT]):
             self._go_round_in_c()
         return self._ring
 
+    def tell(self) -> None:
+        """Add up what was taken in C, and tell everybody now and then."""
+        self._settle()
+        self._accounts.end_turn(None)
+
     def newest(self) -> FrameT:
         """A copy of the newest frame of the generation at hand.
 

@@ -6,6 +6,7 @@
  */
 
 #include "../../skinware/native/library.c"
+#include "../../skinware/native/look.c"
 #include "../../skinware/native/turns.c"
 
 #include <inttypes.h>
@@ -14,7 +15,7 @@
 #include <stdlib.h>
 #include <sys/mman.h>
 
-enum { WORDS = 509, STRIDE = 64 + 8 * 512, SLOT_OFFSET = 4096, READERS = 4 };
+enum { WORDS = 509, STRIDE = 64 + 8 * 512, SLOT_OFFSET = 4096, READERS = 5 };
 
 static unsigned char *map;
 static uint64_t slots, frames;
@@ -67,6 +68,46 @@ static void compare(tally *mine, const unsigned char *frame) {
         whole &= words[k] == slot->sequence;
     mine->compared++;
     mine->torn += !whole;
+}
+
+/* Looks at the ring as if it were two. */
+static void *look_at_frames(void *argument) {
+    tally *mine = (tally *)argument;
+    unsigned char *to = (unsigned char *)malloc(2 * STRIDE);
+    skinware_native_look *look = (skinware_native_look *)calloc(1, sizeof *look);
+    int i, result;
+    if (to == NULL || look == NULL)
+        abort();
+    look->count = 2;
+    look->news_only = 1;
+    for (i = 0; i < 2; i++) {
+        look->rings[i].start = (uint64_t)i * STRIDE;
+        look->rings[i].turns = (skinware_native_turns *)calloc(1, sizeof(skinware_native_turns));
+        if (look->rings[i].turns == NULL)
+            abort();
+        look->rings[i].turns->ring = ring_of();
+        look->rings[i].turns->descriptor = descriptor;
+        look->rings[i].turns->process = getpid();
+    }
+    while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {
+        look->until_ns = skinware__clock_ns(CLOCK_MONOTONIC) + 1000000;
+        result = skinware_native_newest(look, to);
+        for (i = 0; i < 2; i++) {
+            skinware_native_turns *turns = look->rings[i].turns;
+            if (result == NEWS)
+                compare(mine, to + i * STRIDE);
+            if (result == PYTHONS_TURN) { /* as Python: begin with the newest again */
+                turns->last = skinware__latest(&turns->ring);
+                turns->noted = 0;
+            }
+        }
+        mine->overtaken += result == PYTHONS_TURN;
+    }
+    for (i = 0; i < 2; i++)
+        free(look->rings[i].turns);
+    free(look);
+    free(to);
+    return NULL;
 }
 
 static void *read_frames(void *argument) {
@@ -130,7 +171,7 @@ int main(int count, char **arguments) {
     skinware_native_fence();
     for (i = 0; i < READERS; i++) {
         tallies[i].way = i;
-        if (pthread_create(&readers[i], NULL, read_frames, &tallies[i]) != 0)
+        if (pthread_create(&readers[i], NULL, i == 4 ? look_at_frames : read_frames, &tallies[i]) != 0)
             return 5;
     }
     if (pthread_create(&writer, NULL, write_frames, NULL) != 0)
@@ -141,10 +182,12 @@ int main(int count, char **arguments) {
         torn += tallies[i].torn;
     }
     printf("{\"torn\": %" PRIu64 ", \"turns\": %" PRIu64 ", \"in_order\": %" PRIu64 ", \"copies\": %" PRIu64
-           ", \"waits\": %" PRIu64 ", \"timed\": %" PRIu64 ", \"ages\": %" PRIu64 ", \"sizes\": [%zu, %zu, %zu]}\n",
-           torn, tallies[0].compared, tallies[1].compared, tallies[2].compared, tallies[3].compared,
+           ", \"waits\": %" PRIu64 ", \"looks\": %" PRIu64 ", \"timed\": %" PRIu64 ", \"ages\": %" PRIu64
+           ", \"sizes\": [%zu, %zu, %zu, %zu]}\n",
+           torn, tallies[0].compared, tallies[1].compared, tallies[2].compared, tallies[3].compared, tallies[4].compared,
            skinware__load_64(map + 576), skinware__load_64(map + 640 + 8 * (SKINWARE__BUCKETS - 1)),
-           sizeof(skinware_native_request), sizeof(skinware_native_turns), sizeof(skinware_ring_writer));
+           sizeof(skinware_native_request), sizeof(skinware_native_turns), sizeof(skinware_ring_writer),
+           sizeof(skinware_native_look));
     munmap(map, size);
     close(descriptor);
     close(owner);

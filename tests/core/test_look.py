@@ -1,4 +1,4 @@
-"""A look at a whole skin in one call of C, beside the same in Python: whatever happens to drivers, both see the same."""
+"""A look at a whole skin in one call of C, beside the same in Python: both see the same, whatever happens."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAMES = "abc"
 
 @pytest.fixture
 def skins(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Skin]]:
-    """A skin of each path, made when the first driver runs; a ring is of the path of the moment at which it was made."""
+    """A skin of each path."""
     made = {path: OnItsPath(path, monkeypatch) for path in ("native", "python")}
     yield dict(made)
     for skin in made.values():
@@ -35,7 +35,7 @@ def skins(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, Skin]]:
 
 
 class OnItsPath(Skin):
-    """A skin whose readers are all of one path."""
+    """A skin whose readers are all of one path: they are made while it reads."""
 
     def __init__(self, path: str, monkeypatch: pytest.MonkeyPatch) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from paper_faults import measure_faults
 from paper_figures import draw
-from paper_run import COLUMNS, Trial, measure, row
+from paper_run import COLUMNS, Trial, has_compiler, measure, row
 from processes import RunFailed, own_namespace
 
 from skinware import Namespace
@@ -54,9 +54,10 @@ def grid(drivers: Iterable[int], buffers: Iterable[int], users: Iterable[int], r
 
 
 def beside_the_c_library(repetitions: int) -> list[Trial]:
-    """The configurations with figures of the C library, and the same read as one skin."""
+    """The configurations with figures of the C library; the same read as one skin, and by programs in C."""
     configurations = dict.fromkeys(line[:4] for line in C_LIBRARY)
-    configurations |= dict.fromkeys((*line[:3], "skin") for line in C_LIBRARY if line[3] == "asap")
+    for mode in ("skin", "c asap", "c skin") if has_compiler() else ("skin",):
+        configurations |= dict.fromkeys((*line[:3], mode) for line in C_LIBRARY if line[3] == "asap")
     return [Trial(repetition, *one) for repetition in range(repetitions) for one in configurations]
 
 
@@ -138,7 +139,7 @@ def effects(rows: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def comparison(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Ours / the C library's, medians over the repetitions; the skin rows have no counterpart."""
+    """Ours / the C library's, medians over the repetitions; rows of skins and of programs in C have no counterpart."""
     titles = (
         "drivers, buffers, users, readers",
         "reader CPU µs a turn, mean / C",
@@ -171,12 +172,7 @@ def verdicts(rows: Sequence[Mapping[str, str]]) -> list[str]:
     """What became of the targets for ASAP readers, in words."""
     lines = []
     for drivers, buffers, users, mode, mean, _, _, _, age, _ in C_LIBRARY:
-        these = [
-            one
-            for one in rows
-            if (one["drivers"], one["buffers"], one["users"], one["readers"])
-            == (str(drivers), str(buffers), str(users), mode)
-        ]
+        these = [one for one in rows if _key(one) == (str(drivers), str(buffers), str(users), mode)]
         if mode != "asap" or not these:
             continue
         for title, ours, theirs in (
@@ -186,6 +182,34 @@ def verdicts(rows: Sequence[Mapping[str, str]]) -> list[str]:
             word = "met   " if ours <= theirs else "MISSED"
             lines.append(f"{word} {title}, {drivers} drivers, {users} users: {ours:.0f} us, C library {theirs:.0f} us")
     return lines
+
+
+def looks(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """What a look at all sensors costs where the C library was measured with ASAP readers; the largest skin comes last.
+
+    A program in C with a thread for each driver does what the C library's readers do, on the same machine at the same
+    time: where it takes longer or shorter than theirs, the machine is another, and the target moves with it.
+    """
+    lines = []
+    for drivers, buffers, users, _, mean, *_ in sorted(line for line in C_LIBRARY if line[3] == "asap"):
+        cpu_us = {}
+        for readers in ("skin", "c skin", "c asap"):
+            key = (str(drivers), str(buffers), str(users), readers)
+            these = [one for one in rows if _key(one) == key]
+            cpu_us[readers] = [float(one["skin_cpu_us"]) for one in these]
+        if not all(cpu_us.values()):
+            continue
+        ours, c_skin, c_asap = (statistics.median(times) for times in cpu_us.values())
+        ratio = statistics.median(a / b for a, b in zip(cpu_us["skin"], cpu_us["c skin"], strict=True))
+        lines.append(
+            f"a look at {drivers} drivers, {users} users: {ours:.0f} us, C program {c_skin:.0f} us, ratio {ratio:.1f};"
+            f" a thread a driver in C {c_asap:.0f} us, C library {mean * drivers:.0f} us"
+        )
+    return lines
+
+
+def _key(one: Mapping[str, str]) -> tuple[str, str, str, str]:
+    return one["drivers"], one["buffers"], one["users"], one["readers"]
 
 
 def _say(text: str) -> None:
@@ -198,6 +222,7 @@ def main() -> None:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the article's 3360 trials of 60 s (58 hours)")
     size.add_argument("--quick", action="store_true", help="about 2 minutes")
+    size.add_argument("--compared", action="store_true", help="only what is compared with C, without kills; 3 minutes")
     parser.add_argument("--seconds", type=float, help="measured time of each trial (default: 60, 2 or 5)")
     parser.add_argument("--output", type=Path, help="folder of the results (default: build/paper-...)")
     parser.add_argument("--fifo", action="store_true", help="SCHED_FIFO: writers 50, readers 40")
@@ -208,6 +233,8 @@ def main() -> None:
     elif arguments.quick:
         name, seconds, repetitions = "quick", 1.5, 1
         trials = grid((1, 4, 8), (2, 8), (1, 8, 15), repetitions)
+    elif arguments.compared:
+        name, seconds, repetitions, trials = "compared", 3.0, 3, []
     else:
         name, seconds, repetitions = "default", 5.0, 3
         trials = grid((1, 2, 4, 8), (2, 4, 8), (1, 4, 8, 15), 1)
@@ -222,20 +249,25 @@ def main() -> None:
     try:
         with own_namespace() as namespace:
             run(trials, folder / "results.csv", seconds, namespace, fifo=arguments.fifo, say=_say)
-            _say("kills ...")
-            faults = measure_faults(namespace, _QUICK_FAULT_ROUNDS if arguments.quick else _FAULT_ROUNDS)
+            faults = []
+            if not arguments.compared:
+                _say("kills ...")
+                rounds = _QUICK_FAULT_ROUNDS if arguments.quick else _FAULT_ROUNDS
+                faults = measure_faults(namespace, rounds).lines()
     except KeyboardInterrupt:
         sys.exit("\ninterrupted; the same command goes on from here")
     except (RunFailed, ValueError) as error:
         sys.exit(f"\n{error}")
     _say("")
     rows = load(folder / "results.csv")
-    for lines in (effects(rows), comparison(rows), faults.lines(), verdicts(rows)):
+    if not arguments.compared:
+        print("\n" + "\n".join(effects(rows)))
+        try:
+            print("\n" + "\n".join(f"{path}" for path in draw(rows, folder)))
+        except ImportError as error:
+            print(f"\n{error}; no figures drawn. Install the extra: pip install 'skinware[bench]'")
+    for lines in (faults, comparison(rows), verdicts(rows), looks(rows)):
         print("\n" + "\n".join(lines))
-    try:
-        print("\n" + "\n".join(f"{path}" for path in draw(rows, folder)))
-    except ImportError as error:
-        sys.exit(f"{error}; no figures drawn. Install the extra: pip install 'skinware[bench]'")
 
 
 if __name__ == "__main__":

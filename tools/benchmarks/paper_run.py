@@ -3,29 +3,36 @@
 Every driver and every user is a process. A user has one thread with one reader per driver, as the C library does
 (``periodic``, ``asap``), or one thread that reads the whole skin at once (``skin``). Execution time is the thread's
 CPU time of one turn of its loop, sleep and wake-up included; age is from publication to the user holding its copy.
+Programs of ``skinware.h`` (paper_reader.c) do the same as ``asap`` and ``skin``: ``c asap``, ``c skin``.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import random
 import secrets
+import shutil
+import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from processes import READY, CpuShare, Processes, answer, use_fifo
 
+import skinware
 from skinware import BusState, DriverFrame, DriverReader, DriverWriter, Namespace, PatchState, Skin, Structure
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.sensor_types import PRESSURE
 
 SENSORS = 30_848  # 1 square metre of ROBOSKIN, by the article
-MODES = ("periodic", "asap", "skin")
+MODES = ("periodic", "asap", "skin", "c asap", "c skin")
 _PER_MODULE = 16
 _WRITER_HZ, _READER_HZ = (30.0, 50.0), (10.0, 100.0)
 _SETTLE_NS, _LINGER_NS = 3 * NS_PER_S // 10, NS_PER_S // 10
@@ -92,12 +99,13 @@ class Readings:
 
 
 def measure(trial: Trial, namespace: Namespace, seconds: float, *, seed: int = 0, fifo: bool = False) -> Figures:
-    """Run a trial. Rates are random, the same for the same trial and seed.
+    """Run a trial. Rates are random, the same for the same trial and seed, whoever reads.
 
     Raises:
         RunFailed: a process died, failed or hung.
     """
-    chance = random.Random(f"{seed} {trial}")
+    chance = random.Random(f"{seed} {replace(trial, readers='')}")
+    program = c_program() if trial.readers.startswith("c ") else None
     prefix = f"paper-{os.getpid()}-{secrets.token_hex(3)}"
     names = [f"{prefix}-{driver}" for driver in range(trial.drivers)]
     with Processes() as processes:
@@ -111,7 +119,11 @@ def measure(trial: Trial, namespace: Namespace, seconds: float, *, seed: int = 0
         users = []
         for _ in range(trial.users):
             rates_hz = [chance.uniform(*_READER_HZ) for _ in names]
-            users.append(processes.start(_use, namespace, names, trial.readers, rates_hz, fifo))
+            if program is None:
+                users.append(processes.start(_use, namespace, names, trial.readers, rates_hz, fifo))
+            else:
+                rate_hz = rates_hz[0] if trial.readers == "c skin" else 0.0
+                users.append(processes.start(_use_c, program, namespace, names, rate_hz, fifo))
         for user in users:
             answer(user, 30)
         begin_ns = now_ns() + _SETTLE_NS
@@ -222,6 +234,44 @@ def _use(
     pipe.send((found, share.so_far()))
 
 
+def has_compiler() -> bool:
+    """Whether programs in C can be made here."""
+    return shutil.which("cc") is not None
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory()
+
+
+@functools.cache
+def c_program() -> Path:
+    """paper_reader.c, compiled."""
+    program = Path(_folder().name) / "paper_reader"
+    source = Path(__file__).with_name("paper_reader.c")
+    subprocess.run(["cc", "-O2", "-pthread", f"-I{skinware.get_include()}", "-o", program, source], check=True)
+    return program
+
+
+def _use_c(pipe: Connection, program: Path, namespace: Namespace, names: list[str], rate_hz: float, fifo: bool) -> None:
+    use_fifo(_READER_PRIORITY if fifo else None)
+    command = [str(program), namespace.name, f"{rate_hz}", *names]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        pipe.send(READY)
+        begin_ns, end_ns = pipe.recv()
+        told, _ = process.communicate(f"{begin_ns} {end_ns}\n")
+    numbers = iter([[int(word) for word in line.split()] for line in told.splitlines()])
+    found = []
+    for turns, torn in numbers:
+        times = [next(numbers) for _ in range(turns)]
+        found.append(Readings([age_ns for age_ns, _ in times], [cpu_ns for _, cpu_ns in times], torn=torn))
+    cpu_s = sum(sum(readings.cpu_ns) for readings in found) / NS_PER_S
+    pipe.send((found, cpu_s * NS_PER_S / (end_ns - begin_ns)))
+
+
 def _attend(turns: Iterator[tuple[DriverFrame, ...]], begin_ns: int, end_ns: int) -> Readings:
     """Take what comes until the end; ``turns`` yields the frames of one turn of the loop."""
     found = Readings([], [])
@@ -258,7 +308,7 @@ def _figures(
         reader_mean_us=reader_mean_us,
         reader_worst_us=float(all_read.max()),
         reader_worst_median_us=float(np.median([one.max() for one in read])),
-        skin_cpu_us=reader_mean_us * (1 if trial.readers == "skin" else trial.drivers),
+        skin_cpu_us=reader_mean_us * (1 if trial.readers.endswith("skin") else trial.drivers),
         age_mean_us=float(all_ages.mean()),
         age_p50_us=float(np.median([np.median(one) for one in ages])),
         age_p99_us=float(max(np.percentile(one, 99) for one in ages)),

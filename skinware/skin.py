@@ -75,6 +75,7 @@ class Skin:
         self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
         self._in_c: Look[DriverFrame] | None = None
+        self._inodes_in_c: dict[str, int] = {}
         self._latest: Snapshot | None = None  # what C looks for news of
         self._next_discovery_ns = self._next_look_ns = 0
         self._closed = False
@@ -162,7 +163,10 @@ class Skin:
         """Whether C had a look for anything newer and waited for it, and a snapshot if it found it."""
         time_ns = now_ns()
         if self._in_c is not None and time_ns >= self._next_discovery_ns:
-            self._discover()
+            if self.namespace.service_inodes() == self._inodes_in_c:  # and C asks whether their writers live
+                self._next_discovery_ns = time_ns + _DISCOVERY_NS
+            else:
+                self._discover()
             for reader in self._readers.values():
                 reader.tell()
         if self._in_c is None or self._closed or (known is not None and known is not self._latest):
@@ -182,6 +186,7 @@ class Skin:
         rings = [reader.ring_in_c() for reader in self._readers.values()]
         if self._in_c is None or self._in_c.rings != rings:
             self._in_c = look_at(rings)
+            self._inodes_in_c = {name: reader.inode[1] for name, reader in self._readers.items()}
         self._latest = snapshot
 
     def _look(self, known: Snapshot | None, align: bool) -> tuple[list[tuple[futex.Word, int]], Snapshot | None]:

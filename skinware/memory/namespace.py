@@ -123,11 +123,15 @@ class Namespace:
 
     def services(self) -> list[str]:
         """Names of the services that have published here, living or dead, sorted; [] if there is no folder."""
+        return sorted(self.service_inodes())
+
+    def service_inodes(self) -> dict[str, int]:
+        """The number of the file of every service that has published here, living or dead."""
         try:
             with os.scandir(self.path) as entries:
-                return sorted(entry.name[:-5] for entry in entries if entry.name.endswith(".ring"))
+                return {entry.name[:-5]: entry.inode() for entry in entries if entry.name.endswith(".ring")}
         except FileNotFoundError:
-            return []
+            return {}
         except PermissionError:
             raise NamespaceError(
                 f"{self.path} may not be read by {_user_name(os.geteuid())}; ask its owner"

@@ -7,6 +7,7 @@ from typing import Any
 from skinware.errors import Overrun
 from skinware.memory.futex import Word
 from skinware.memory.ring import FrameT, RingReader
+from skinware.realtime import now_ns
 from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._reader import ServiceReader
 
@@ -42,9 +43,10 @@ class Tap(ServiceReader[FrameT]):
         return self._ring
 
     def tell(self) -> None:
-        """Add up what was taken in C, and tell everybody now and then."""
-        self._settle()
-        self._accounts.end_turn(None)
+        """Add up what was taken in C and tell everybody, if that is due."""
+        if now_ns() >= self._accounts.due_ns:
+            self._settle()
+            self._accounts.end_turn(None)
 
     def newest(self) -> FrameT:
         """A copy of the newest frame of the generation at hand.

@@ -1,0 +1,197 @@
+"""How well a rule tells touches from drift: many worlds of ``bench_world`` at once, judged against their truth.
+
+The worlds are the patches of one: each with its own draws of noise, drift, wave and phase, and the same gestures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.testing import BENCH_S, Gesture, Push, Stroke, World, bench_world, grid
+from tests.tactile.peers import Judged, Rule
+
+Drift = Literal["slow", "fast"]
+Floats = npt.NDArray[np.float64]
+
+TAXELS = 120
+"""Of a world."""
+MODULE = {"covered": 0, "hold": 1, "tap": 2, "slow": 3, "weak": 4, "firm": 5}
+CENTRE = {"hold": 1 * 12 + 5, "slow": 3 * 12 + 6, "weak": 4 * 12 + 5}
+SAGGING = tuple(5 * 12 + taxel for taxel in (0, 2, 3, 7, 8, 10, 11))
+"""More than 9 mm from the firm press, which pulls the cover away from them."""
+_START_S = 6.0
+_UNSEEN = 0.5
+"""A load below half a step is none."""
+_GOOD_WITHIN = 6.0
+"""Counts: so near its values a baseline is good: a load of 12 is seen."""
+
+
+class Ours:
+    """The rule of :class:`Baseline`, where each world is a patch."""
+
+    def __init__(self, world: World, settings: BaselineSettings | None = None) -> None:
+        self.baseline = Baseline(world.surface.module, world.surface.patch, settings)
+
+    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
+        calm = self.baseline.update(time_ns, values)
+        return calm.touched, values.astype(np.float32) - np.nan_to_num(calm.baseline)
+
+
+@dataclass
+class Marks:
+    """What a rule is worth in each of s worlds.
+
+    Attributes:
+        false: (s,) share of the time in which idle taxels were shown as touched.
+        taps: (s,) share of the taps that were seen.
+        hold_on: (s,) share of the ten minutes in which the held taxel was shown as touched.
+        hold_value: (s,) what was shown of it at the end, as a share of the truth.
+        off_s: (s,) how long after the release anything in the module was shown as touched.
+        slow: (s,) share of the slow press, once it is whole, in which it was shown.
+        weak: (s,) share of the weak touch in which it was shown.
+        covered_s: (s,) how long the baselines of the covered module were wrong after it was uncovered.
+        sag_s: (s,) how long taxels that only sagged were shown as touched.
+    """
+
+    false: Floats
+    taps: Floats
+    hold_on: Floats
+    hold_value: Floats
+    off_s: Floats
+    slow: Floats
+    weak: Floats
+    covered_s: Floats
+    sag_s: Floats
+
+    def worst(self) -> Marks:
+        """Of each the mark of the worst world; of what was shown of the hold, that which is furthest from 1."""
+        most = {"false", "off_s", "covered_s", "sag_s"}
+        found = {f.name: getattr(self, f.name).max() if f.name in most else getattr(self, f.name).min() for f in fields(self)}
+        found["hold_value"] = self.hold_value[np.argmax(np.abs(self.hold_value - 1))]
+        return Marks(**found)
+
+
+def worlds(drift: Drift, rate_hz: float, count: int, seed: int = 1) -> World:
+    """Many bench worlds as the patches of one."""
+    one = bench_world(drift, rate_hz)
+    many = World(
+        grid(modules=10 * count, patches=count),
+        seed=seed,
+        rate_hz=rate_hz,
+        drift_per_min=one.drift_per_min,
+        wave=one.wave,
+        response=one.response,
+    )
+    for number in range(count):
+        way = many.surface.position_m[number * TAXELS] - one.surface.position_m[0]
+        many.gestures += [_moved(gesture, way, number * TAXELS) for gesture in one.gestures]
+    return many
+
+
+def judge(rules: Mapping[str, Rule], world: World, until_s: float = BENCH_S) -> dict[str, Marks]:
+    """Let rules see the same worlds.
+
+    Args:
+        rules: by name; each sees every frame once.
+        world: of ``worlds``.
+        until_s: how long.
+    """
+    judges = {name: _Judge(world) for name in rules}
+    for block in world.blocks(until_s):
+        time_s = (block.time_ns - block.time_ns[0]) / 1e9 + (0.0 if not judges else next(iter(judges.values())).time_s)
+        for name, rule in rules.items():
+            touched = np.zeros(block.values.shape, bool)
+            above = np.zeros(block.values.shape, np.float32)
+            for row, values in enumerate(block.values):
+                touched[row], above[row] = rule(int(block.time_ns[row]), values)
+            judges[name].see(time_s, touched, above, block.truth)
+    return {name: judge.marks() for name, judge in judges.items()}
+
+
+class _Judge:
+    """Follows one rule through all worlds."""
+
+    def __init__(self, world: World) -> None:
+        self._count = len(world.surface) // TAXELS
+        self._period_s = 1 / world.rate_hz
+        taps = [gesture for gesture in world.gestures if gesture.name == "tap"][: 30]
+        self._taps = np.array([tap.begin_s for tap in taps])
+        self._tap_taxel = [int(np.argmin(tap.least_distances_m(world.surface))) for tap in taps]
+        self._seen = np.zeros((len(taps), self._count), bool)
+        self._false, self._idle = np.zeros(self._count), np.zeros(self._count)
+        self._shown = {name: np.zeros((2, self._count)) for name in CENTRE}
+        self._end_value: list[npt.NDArray[np.float32]] = []
+        self._off_s, self._covered_s, self._sag_s = (np.zeros(self._count) for _ in range(3))
+        self.time_s = 0.0
+
+    def see(
+        self,
+        time_s: Floats,
+        touched: npt.NDArray[np.bool_],
+        above: npt.NDArray[np.float32],
+        truth: npt.NDArray[np.float32],
+    ) -> None:
+        """A block of frames: (m,) and (m, s x 120)."""
+        self.time_s = float(time_s[-1]) + self._period_s
+        shape = len(time_s), self._count, TAXELS
+        touched, above, truth = touched.reshape(shape), above.reshape(shape), truth.reshape(shape)
+        begun = time_s >= _START_S
+        idle = (truth < _UNSEEN) & begun[:, np.newaxis, np.newaxis]
+        self._idle += idle.sum(axis=(0, 2))
+        self._false += (touched & idle).sum(axis=(0, 2))
+        for number, (begin_s, taxel) in enumerate(zip(self._taps, self._tap_taxel, strict=True)):
+            self._seen[number] |= touched[_between(time_s, begin_s, begin_s + 0.4), :, taxel].any(axis=0)
+        for name, begin_s, end_s in (("hold", 121, 720), ("slow", 360, 420), ("weak", 801, 1100)):
+            rows = _between(time_s, begin_s, end_s)
+            self._shown[name] += touched[rows, :, CENTRE[name]].sum(axis=0), np.full(self._count, rows.sum())
+        rows = _between(time_s, 700, 719)
+        self._end_value += list((above * touched)[rows, :, CENTRE["hold"]])
+        after = touched[:, :, 12:24].any(axis=2) & (time_s >= 720)[:, np.newaxis]
+        self._off_s = np.maximum(self._off_s, _last(time_s - 720, after))
+        wrong = (np.abs(above[:, :, :12]) > _GOOD_WITHIN) | touched[:, :, :12]
+        wrong = wrong.any(axis=2) & _between(time_s, 60, 160)[:, np.newaxis]
+        self._covered_s = np.maximum(self._covered_s, _last(time_s - 60, wrong))
+        self._sag_s += touched[:, :, SAGGING][begun].any(axis=2).sum(axis=0) * self._period_s
+
+    def marks(self) -> Marks:
+        """What it is worth."""
+        shown = {name: of / np.maximum(total, 1) for name, (of, total) in self._shown.items()}
+        return Marks(
+            false=self._false / self._idle,
+            taps=self._seen.mean(axis=0),
+            hold_on=shown["hold"],
+            hold_value=np.mean(self._end_value, axis=0) / 25,
+            off_s=self._off_s,
+            slow=shown["slow"],
+            weak=shown["weak"],
+            covered_s=self._covered_s,
+            sag_s=self._sag_s,
+        )
+
+
+def _between(time_s: Floats, begin_s: float, end_s: float) -> npt.NDArray[np.bool_]:
+    inside: npt.NDArray[np.bool_] = (time_s >= begin_s) & (time_s < end_s)
+    return inside
+
+
+def _last(time_s: Floats, of: npt.NDArray[np.bool_]) -> Floats:
+    """(s,) the last time of (m,) at which (m, s) was true; 0 if never."""
+    latest: Floats = np.where(of, time_s[:, np.newaxis], 0).max(axis=0)
+    return latest
+
+
+def _moved(gesture: Gesture, way_m: Floats, taxels: int) -> Gesture:
+    """The same in another world."""
+    if isinstance(gesture, Push):
+        x, y, z = (np.array(gesture.at_m) + way_m).tolist()
+        return replace(gesture, at_m=(x, y, z))
+    if isinstance(gesture, Stroke):
+        return replace(gesture, path_m=tuple((x, y, z) for x, y, z in (np.array(gesture.path_m) + way_m).tolist()))
+    return replace(gesture, taxels=tuple(taxel + taxels for taxel in gesture.taxels))

@@ -147,7 +147,8 @@ class Baseline:
         Args:
             structure: of the driver.
             type_name: which sensors.
-            settings, neighbours: as for the constructor.
+            settings: as for the constructor.
+            neighbours: as for the constructor.
 
         Raises:
             StructureError: no such type here.
@@ -216,9 +217,7 @@ class Baseline:
         suspect = (status & Status.SUSPECT) != 0
         jumped = suspect & ~self._suspect
         self._suspect = suspect
-        return self.update(
-            frame.acquired_ns, frame.physical(self.type_name), (status & UNUSABLE) == 0, jumped=jumped
-        )
+        return self.update(frame.acquired_ns, frame.physical(self.type_name), (status & UNUSABLE) == 0, jumped=jumped)
 
     def update(
         self,

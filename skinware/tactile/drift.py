@@ -69,7 +69,8 @@ class Drift:
             usable: (n,) which taxels have values.
             free: (n,) which of them are away from contacts.
             passed_s: the time.
-            tau_s, common_tau_s: time constants of own and of common drift.
+            tau_s: time constant of own drift.
+            common_tau_s: of common drift.
             limit: (n,) threshold of touch, above 0: no common drift reaches it within a time constant.
         """
         own_share, common_share = (np.float32(-math.expm1(-passed_s / tau)) for tau in (tau_s, common_tau_s))

@@ -28,9 +28,7 @@ class Touches:
         fading_s: (n_modules,) float64, for how long most of the load of each module has been gone.
     """
 
-    def __init__(
-        self, module: npt.NDArray[np.intp], neighbours: npt.NDArray[np.integer] | None = None
-    ) -> None:
+    def __init__(self, module: npt.NDArray[np.intp], neighbours: npt.NDArray[np.integer] | None = None) -> None:
         n = len(module)
         self._module = module
         self._neighbours = neighbours

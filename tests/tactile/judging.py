@@ -1,28 +1,27 @@
 """How well a rule tells touches from drift: many worlds of ``bench_world`` at once, judged against their truth.
 
-The worlds are the patches of one: each with its own draws of noise, drift, wave and phase, and the same gestures.
+All rules see the same frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.baseline_settings import BaselineSettings
-from skinware.tactile.testing import BENCH_S, Gesture, Push, Stroke, World, bench_world, grid
-from tests.tactile.peers import Judged, Rule
+from skinware.tactile.testing import BENCH_S, Cover, Gesture, Push, Stroke, World, bench_world, grid
+from tests.tactile.peers import CapSense, ICub, Judged, QTouch, Rule, TareOnce
 
 Drift = Literal["slow", "fast"]
 Floats = npt.NDArray[np.float64]
 
 TAXELS = 120
 """Of a world."""
-MODULE = {"covered": 0, "hold": 1, "tap": 2, "slow": 3, "weak": 4, "firm": 5}
 CENTRE = {"hold": 1 * 12 + 5, "slow": 3 * 12 + 6, "weak": 4 * 12 + 5}
 SAGGING = tuple(5 * 12 + taxel for taxel in (0, 2, 3, 7, 8, 10, 11))
 """More than 9 mm from the firm press, which pulls the cover away from them."""
@@ -33,15 +32,52 @@ _GOOD_WITHIN = 6.0
 """Counts: so near its values a baseline is good: a load of 12 is seen."""
 
 
+class Worlds:
+    """Many bench worlds at once, each a patch with its own draws of noise, drift, wave and phase.
+
+    Args:
+        rate_hz: of the frames.
+        count: of each drift.
+        drifts: which; the worlds of one stand together.
+        seed: of all.
+    """
+
+    def __init__(self, rate_hz: float, count: int, drifts: Sequence[Drift] = ("slow", "fast"), seed: int = 1) -> None:
+        self.rate_hz, self.count, self.drifts = rate_hz, count, tuple(drifts)
+        self._worlds = [_many(drift, rate_hz, count, seed) for drift in drifts]
+        n_worlds = count * len(drifts)
+        self.module = np.arange(n_worlds * TAXELS) // 12
+        self.patch = np.arange(n_worlds * TAXELS) // TAXELS
+        self.taps = [gesture for gesture in bench_world("slow", rate_hz).gestures if gesture.name == "tap"]
+        self.surface = bench_world("slow", rate_hz).surface
+
+    def blocks(self, until_s: float) -> Iterator[tuple[npt.NDArray[np.int64], npt.NDArray[Any], npt.NDArray[Any]]]:
+        """Times (m,), values and truth (m, n) of some frames after the other."""
+        for blocks in zip(*(world.blocks(until_s) for world in self._worlds), strict=True):
+            values, truth = (np.concatenate([getattr(b, name) for b in blocks], axis=1) for name in ("values", "truth"))
+            yield blocks[0].time_ns, values, truth
+
+
 class Ours:
     """The rule of :class:`Baseline`, where each world is a patch."""
 
-    def __init__(self, world: World, settings: BaselineSettings | None = None) -> None:
-        self.baseline = Baseline(world.surface.module, world.surface.patch, settings)
+    def __init__(self, worlds: Worlds, settings: BaselineSettings | None = None) -> None:
+        self.baseline = Baseline(worlds.module, worlds.patch, settings)
 
     def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
         calm = self.baseline.update(time_ns, values)
         return calm.touched, values.astype(np.float32) - np.nan_to_num(calm.baseline)
+
+
+def peers(rate_hz: float) -> dict[str, Rule]:
+    """The rules of others; those of the iCub at the rate of its frames."""
+    return {
+        "tare once": TareOnce(rate_hz),
+        "iCub, code": ICub.by_default(rate_hz),
+        "iCub, shipped": ICub.as_shipped(rate_hz),
+        "CapSense": CapSense(),
+        "QTouch": QTouch(rate_hz),
+    }
 
 
 @dataclass
@@ -70,16 +106,36 @@ class Marks:
     covered_s: Floats
     sag_s: Floats
 
-    def worst(self) -> Marks:
-        """Of each the mark of the worst world; of what was shown of the hold, that which is furthest from 1."""
-        most = {"false", "off_s", "covered_s", "sag_s"}
-        found = {f.name: getattr(self, f.name).max() if f.name in most else getattr(self, f.name).min() for f in fields(self)}
-        found["hold_value"] = self.hold_value[np.argmax(np.abs(self.hold_value - 1))]
-        return Marks(**found)
+    def of(self, worlds: slice) -> Marks:
+        """Those of some worlds."""
+        return Marks(**{field.name: getattr(self, field.name)[worlds] for field in fields(self)})
 
 
-def worlds(drift: Drift, rate_hz: float, count: int, seed: int = 1) -> World:
-    """Many bench worlds as the patches of one."""
+def judge(rules: Mapping[str, Rule], worlds: Worlds, until_s: float = BENCH_S) -> dict[tuple[str, Drift], Marks]:
+    """Let rules see the same worlds, and judge them: by rule and drift.
+
+    Args:
+        rules: by name; each sees every frame once.
+        worlds: what they see.
+        until_s: how long.
+    """
+    judges = {name: _Judge(worlds) for name in rules}
+    begin_ns: int | None = None
+    for time_ns, values, truth in worlds.blocks(until_s):
+        begin_ns = int(time_ns[0]) if begin_ns is None else begin_ns
+        for name, rule in rules.items():
+            touched = np.zeros(values.shape, bool)
+            above = np.zeros(values.shape, np.float32)
+            for row, frame in enumerate(values):
+                touched[row], above[row] = rule(int(time_ns[row]), frame)
+            judges[name].see((time_ns - begin_ns) / 1e9, touched, above, truth)
+    count = worlds.count
+    parts = {drift: slice(number * count, (number + 1) * count) for number, drift in enumerate(worlds.drifts)}
+    return {(name, drift): judges[name].marks().of(part) for name in rules for drift, part in parts.items()}
+
+
+def _many(drift: Drift, rate_hz: float, count: int, seed: int) -> World:
+    """Bench worlds as the patches of one."""
     one = bench_world(drift, rate_hz)
     many = World(
         grid(modules=10 * count, patches=count),
@@ -95,41 +151,19 @@ def worlds(drift: Drift, rate_hz: float, count: int, seed: int = 1) -> World:
     return many
 
 
-def judge(rules: Mapping[str, Rule], world: World, until_s: float = BENCH_S) -> dict[str, Marks]:
-    """Let rules see the same worlds.
-
-    Args:
-        rules: by name; each sees every frame once.
-        world: of ``worlds``.
-        until_s: how long.
-    """
-    judges = {name: _Judge(world) for name in rules}
-    for block in world.blocks(until_s):
-        time_s = (block.time_ns - block.time_ns[0]) / 1e9 + (0.0 if not judges else next(iter(judges.values())).time_s)
-        for name, rule in rules.items():
-            touched = np.zeros(block.values.shape, bool)
-            above = np.zeros(block.values.shape, np.float32)
-            for row, values in enumerate(block.values):
-                touched[row], above[row] = rule(int(block.time_ns[row]), values)
-            judges[name].see(time_s, touched, above, block.truth)
-    return {name: judge.marks() for name, judge in judges.items()}
-
-
 class _Judge:
     """Follows one rule through all worlds."""
 
-    def __init__(self, world: World) -> None:
-        self._count = len(world.surface) // TAXELS
-        self._period_s = 1 / world.rate_hz
-        taps = [gesture for gesture in world.gestures if gesture.name == "tap"][: 30]
-        self._taps = np.array([tap.begin_s for tap in taps])
-        self._tap_taxel = [int(np.argmin(tap.least_distances_m(world.surface))) for tap in taps]
-        self._seen = np.zeros((len(taps), self._count), bool)
+    def __init__(self, worlds: Worlds) -> None:
+        self._count = worlds.count * len(worlds.drifts)
+        self._period_s = 1 / worlds.rate_hz
+        self._taps = [tap.begin_s for tap in worlds.taps]
+        self._tap_taxel = [int(np.argmin(tap.least_distances_m(worlds.surface))) for tap in worlds.taps]
+        self._seen = np.zeros((len(self._taps), self._count), bool)
         self._false, self._idle = np.zeros(self._count), np.zeros(self._count)
         self._shown = {name: np.zeros((2, self._count)) for name in CENTRE}
         self._end_value: list[npt.NDArray[np.float32]] = []
         self._off_s, self._covered_s, self._sag_s = (np.zeros(self._count) for _ in range(3))
-        self.time_s = 0.0
 
     def see(
         self,
@@ -138,8 +172,7 @@ class _Judge:
         above: npt.NDArray[np.float32],
         truth: npt.NDArray[np.float32],
     ) -> None:
-        """A block of frames: (m,) and (m, s x 120)."""
-        self.time_s = float(time_s[-1]) + self._period_s
+        """A block of frames: (m,) times and (m, s x 120) of the rest."""
         shape = len(time_s), self._count, TAXELS
         touched, above, truth = touched.reshape(shape), above.reshape(shape), truth.reshape(shape)
         begun = time_s >= _START_S
@@ -194,4 +227,5 @@ def _moved(gesture: Gesture, way_m: Floats, taxels: int) -> Gesture:
         return replace(gesture, at_m=(x, y, z))
     if isinstance(gesture, Stroke):
         return replace(gesture, path_m=tuple((x, y, z) for x, y, z in (np.array(gesture.path_m) + way_m).tolist()))
+    assert isinstance(gesture, Cover)
     return replace(gesture, taxels=tuple(taxel + taxels for taxel in gesture.taxels))

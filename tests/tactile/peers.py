@@ -36,15 +36,15 @@ class TareOnce:
 
     def __init__(self, rate_hz: float) -> None:
         self._left = round(5 * rate_hz)
-        self._frames: list[npt.NDArray[np.generic]] = []
+        self._frames: list[Floats] = []
         self._base: Floats | None = None
 
-    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:  # noqa: D102 - inherited
+    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
         del time_ns
         if self._base is None:
-            self._frames.append(values.copy())
+            self._frames.append(values.astype(np.float32))
             if len(self._frames) == self._left:
-                self._base = np.mean(self._frames, axis=0, dtype=np.float32)
+                self._base = np.mean(np.array(self._frames), axis=0)
             return _nothing(len(values))
         above = values.astype(np.float32) - self._base
         return above > 8, above
@@ -63,7 +63,7 @@ class ICub:
     def __init__(self, rate_hz: float, *, add: float, gain: float, contact_gain: float) -> None:
         self._left = round(5 * rate_hz)
         self._add, self._gain, self._contact_gain = add, gain, contact_gain
-        self._frames: list[npt.NDArray[np.generic]] = []
+        self._frames: list[Floats] = []
         self._base: Floats | None = None
         self._threshold: Floats = np.ones(0, np.float32)
         self._shown: Floats = np.zeros(0, np.float32)
@@ -78,13 +78,13 @@ class ICub:
         """With the values of the robots' files."""
         return cls(rate_hz, add=8, gain=0.2, contact_gain=0.05)
 
-    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:  # noqa: D102 - inherited
+    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
         del time_ns
         if self._base is None:
-            self._frames.append(values.copy())
+            self._frames.append(values.astype(np.float32))
             if len(self._frames) == self._left:
-                self._base = np.mean(self._frames, axis=0, dtype=np.float32)
-                above = np.percentile(self._frames, 95, axis=0).astype(np.float32) - self._base
+                self._base = np.mean(np.array(self._frames), axis=0)
+                above = np.percentile(np.array(self._frames), 95, axis=0).astype(np.float32) - self._base
                 self._threshold, self._shown = np.maximum(above, 1), np.zeros_like(self._base)
             return _nothing(len(values))
         above = np.minimum(values.astype(np.float32) - self._base, 255)
@@ -111,7 +111,7 @@ class CapSense:
         self._below = np.zeros(0, np.int64)
         self._touched = np.zeros(0, bool)
 
-    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:  # noqa: D102 - inherited
+    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
         del time_ns
         now = values.astype(np.float32)
         if self._base is None:
@@ -144,7 +144,7 @@ class QTouch:
         self._touched = np.zeros(0, bool)
         self._counts: dict[str, npt.NDArray[np.int64]] = {}
 
-    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:  # noqa: D102 - inherited
+    def __call__(self, time_ns: int, values: npt.NDArray[np.generic]) -> Judged:
         del time_ns
         now = values.astype(np.float32)
         if self._base is None:

@@ -1,0 +1,337 @@
+"""Baselines, one property at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from skinware import DriverReader, Status
+from skinware.errors import ConfigurationError, StructureError
+from skinware.tactile.baseline import Baseline, Calm
+from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.testing import World, grid
+from tests.cli.fake_skin import FakeSkin
+
+RATE_HZ = 50
+STEP_NS = 1_000_000_000 // RATE_HZ
+N = 48
+MODULE, PATCH = np.arange(N) // 12, np.arange(N) // 24
+
+
+class Bench:
+    """A baseline that is fed with noise around a level, and whatever is put on top."""
+
+    def __init__(self, settings: BaselineSettings | None = None, noise: float = 0.8, **how: Any) -> None:
+        self.baseline = Baseline(MODULE, PATCH, settings, **how)
+        self.random = np.random.default_rng(1)
+        self.noise = noise
+        self.level = np.full(N, 15.0)
+        self.time_ns = 0
+        self.calm: Calm
+
+    def run(
+        self,
+        seconds: float,
+        load: float | npt.NDArray[np.float64] = 0.0,
+        usable: npt.NDArray[np.bool_] | None = None,
+        each: Callable[[Calm], object] = lambda _calm: None,
+        per_s: float = 0.0,
+        **more: Any,
+    ) -> Calm:
+        """The last of so many seconds of frames."""
+        for _ in range(round(seconds * RATE_HZ)):
+            self.time_ns += STEP_NS
+            self.level += per_s / RATE_HZ
+            values = np.round(self.level + load + self.noise * self.random.standard_normal(N))
+            self.calm = self.baseline.update(self.time_ns, values, usable, **more)
+            each(self.calm)
+        return self.calm
+
+
+def on(*taxels: int, load: float = 25.0) -> npt.NDArray[np.float64]:
+    """(n,) a load on some taxels."""
+    loads = np.zeros(N)
+    loads[list(taxels)] = load
+    return loads
+
+
+def test_before_the_rest_is_known_nothing_is_touched() -> None:
+    bench = Bench()
+    calm = bench.run(4.9, on(3))
+    assert not calm.touched.any()
+    assert not calm.usable.any()
+    assert np.isnan(calm.baseline).all()
+    assert not calm.value.any()
+    calm = bench.run(0.3)
+    assert calm.usable.all()
+    assert np.abs(calm.baseline[4:] - 15).max() < 0.5
+    assert np.abs(calm.noise - 0.85).max() < 0.25  # that of the sensor, and that of its steps
+
+
+def test_the_rest_is_known_though_somebody_brushed_over_it_for_a_third_of_the_time() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    bench.run(1.5, on(7))
+    calm = bench.run(2.2)
+    assert abs(calm.baseline[7] - 15) < 0.5
+    assert calm.noise[7] < 1.5
+
+
+def test_the_rest_is_not_taken_while_many_taxels_move() -> None:
+    bench = Bench()
+    strokes = [on(*range(first, first + 12)) for first in range(0, N, 12)]
+    for round_of in range(8):
+        calm = bench.run(1.0, strokes[round_of % 4])
+    assert not calm.usable.any()
+    assert bench.baseline.refused_share > 0.05
+    calm = bench.run(10.0)
+    assert calm.usable.all()
+    assert bench.baseline.refused_share == 0
+    assert np.abs(calm.baseline - 15).max() < 0.5
+
+
+def test_a_touch_has_its_value_without_delay_and_nothing_else_has_one() -> None:
+    bench = Bench()
+    bench.run(6)
+    calm = bench.run(0.1, on(3, 30))
+    assert np.flatnonzero(calm.touched).tolist() == [3, 30]
+    assert np.abs(calm.value[[3, 30]] - 25).max() < 4
+    assert not np.delete(calm.value, [3, 30]).any()
+    assert calm.held[:12].all()
+    assert not calm.held[12:24].any()
+    calm = bench.run(1.0)
+    assert not calm.touched.any()
+    assert calm.held[:12].all(), "what was near a contact settles for a while"
+    assert not bench.run(3.0).held.any()
+
+
+def test_a_light_touch_stays_for_as_long_as_it_lasts() -> None:
+    bench = Bench()
+    bench.run(6)
+    seen: list[bool] = []
+    bench.run(300, on(5, load=6), each=lambda calm: seen.append(bool(calm.touched[5])))
+    assert np.mean(seen[25:]) > 0.99
+
+
+def test_a_longest_hold_ends_a_touch() -> None:
+    bench = Bench(BaselineSettings(maximum_hold_s=4))
+    bench.run(6)
+    assert bench.run(3.5, on(3)).touched[3]
+    forced: list[int] = []
+    calm = bench.run(1.5, on(3), each=lambda calm: forced.extend(np.flatnonzero(calm.forced).tolist()))
+    assert not calm.touched[3]
+    assert forced == [3]
+
+
+def test_tare_takes_what_is_there_for_the_rest() -> None:
+    bench = Bench()
+    bench.run(6)
+    load = on(3, 30)
+    bench.run(1, load)
+    assert bench.baseline.tare(patch=0) == 24
+    calm = bench.run(1 / RATE_HZ, load)
+    assert calm.forced[:24].all()
+    assert not calm.forced[24:].any()
+    assert np.flatnonzero(calm.touched).tolist() == [30]
+    assert bench.baseline.tare() == N
+    assert not bench.run(1, load).touched.any()
+
+
+def test_tare_needs_a_frame_and_ends_the_measurement_of_the_rest() -> None:
+    bench = Bench()
+    with pytest.raises(ConfigurationError, match="no value has come"):
+        bench.baseline.tare()
+    bench.run(0.2)
+    bench.baseline.tare()
+    calm = bench.run(0.2, on(3))
+    assert calm.usable.all()
+    assert np.flatnonzero(calm.touched).tolist() == [3]
+
+
+def test_values_without_steps_need_their_noise_measured_before_a_tare() -> None:
+    bench = Bench(resolution=0.0)
+    bench.run(1)
+    with pytest.raises(ConfigurationError, match="noise"):
+        bench.baseline.tare()
+    bench.run(5)
+    assert bench.baseline.tare() == N
+
+
+def test_hold_keeps_baselines_where_they_are_but_for_common_drift() -> None:
+    bench = Bench(BaselineSettings(tau_s=1))
+    bench.run(6)
+    bench.baseline.hold(True)
+    calm = bench.run(10, on(3, load=2.5))
+    assert calm.held.all()
+    assert abs(calm.baseline[3] - 15) < 0.5
+    bench.baseline.hold(False)
+    calm = bench.run(10, on(3, load=2.5))
+    assert not calm.held.any()
+    assert abs(calm.baseline[3] - 17.5) < 0.5
+
+
+@pytest.mark.parametrize("what", ["nan", "stale", "huge"])
+def test_a_patch_without_data_touches_nobody_else(what: str) -> None:
+    """Not by one bit, and its own state is kept."""
+    plain, disturbed = Bench(), Bench()
+    gone = np.ones(N, bool)
+    for bench in (plain, disturbed):
+        bench.run(6, per_s=0.05)
+        bench.run(2, on(3, 30), per_s=0.05)
+    before = disturbed.calm
+    bad = np.zeros(N)
+    bad[24:] = {"nan": np.nan, "stale": -15.0, "huge": np.inf}[what]
+    if what == "stale":
+        gone[24:] = False
+    for load in (on(3), on(), on(7, load=12)):
+        one = plain.run(20, load, per_s=0.05)
+        other = disturbed.run(20, load + bad, gone, per_s=0.05)
+        for name in ("value", "touched", "held", "baseline", "noise", "forced"):
+            assert np.array_equal(getattr(one, name)[:24], getattr(other, name)[:24], equal_nan=True), name
+        assert not other.usable[24:].any()
+        assert np.array_equal(other.baseline[24:], before.baseline[24:])
+        assert np.array_equal(other.touched[24:], before.touched[24:])
+
+
+def test_a_taxel_that_comes_later_is_measured_when_it_comes() -> None:
+    bench = Bench()
+    present = np.arange(N) != 40
+    assert not bench.run(8, usable=present).usable[40]
+    assert not bench.run(4).usable[40]
+    assert bench.run(2).usable[40]
+    assert bench.run(0.2, on(40)).touched[40]
+
+
+def test_after_ten_minutes_without_data_a_baseline_is_worth_nothing() -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.time_ns += 599_000_000_000
+    bench.level += 40
+    assert bench.run(0.5).usable.all()
+    bench.run(2)
+    bench.time_ns += 601_000_000_000
+    assert not bench.run(0.5).usable.any()
+    assert bench.run(6).usable.all()
+
+
+def test_a_jump_that_the_hardware_tells_is_no_touch() -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.level[:12] += 30
+    jumped = np.arange(N) < 12
+    calm = bench.run(1 / RATE_HZ, jumped=jumped)
+    assert calm.forced[:12].any()
+    assert not calm.forced[12:].any()
+    seen: list[bool] = []
+    bench.run(2, each=lambda calm: seen.append(bool(calm.touched.any())))
+    assert not any(seen)
+
+
+def test_what_was_covered_at_the_start_is_good_a_second_after() -> None:
+    bench = Bench()
+    bench.run(8, on(*range(12)))
+    bench.run(1.5)
+    assert np.abs(bench.calm.baseline[:12] - 15).max() < 1.5
+    assert bench.run(0.2, on(4)).touched[4]
+
+
+def test_types_that_a_touch_moves_to_both_sides() -> None:
+    bench = Bench(signed=True)
+    bench.run(6)
+    calm = bench.run(0.5, on(3) - on(20))
+    assert np.flatnonzero(calm.touched).tolist() == [3, 20]
+    assert calm.value[20] < -20
+    assert not bench.run(1.5).touched.any()
+
+
+def test_neighbours_are_held_in_place_of_modules() -> None:
+    table = np.full((N, 2), -1, np.int32)
+    table[3] = (4, 20)
+    bench = Bench(neighbours=table)
+    bench.run(6)
+    assert np.flatnonzero(bench.run(0.5, on(3)).held).tolist() == [3, 4, 20]
+
+
+def test_the_same_frame_twice_changes_nothing() -> None:
+    bench = Bench()
+    bench.run(6)
+    values = np.round(bench.level + on(3))
+    once = [bench.baseline.update(bench.time_ns + STEP_NS, values) for _ in range(3)]
+    assert np.array_equal(once[0].baseline, once[2].baseline)
+    back = bench.baseline.update(bench.time_ns - 10 * STEP_NS, values)
+    assert np.array_equal(once[0].baseline, back.baseline), "nor one from before"
+
+
+def test_bumps_do_not_make_a_held_load_look_released() -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.run(120, on(3), per_s=0.02)
+    bench.run(0.3, on(3, load=120), per_s=0.02)
+    seen: list[bool] = []
+    bench.run(10, on(3), each=lambda calm: seen.append(bool(calm.touched[3])), per_s=0.02)
+    assert all(seen)
+
+
+def test_settings_can_change_while_it_runs() -> None:
+    bench = Bench()
+    bench.run(6)
+    assert bench.run(1, on(3, load=8)).touched[3]
+    bench.baseline.settings = bench.baseline.settings.changed({"minimum_on": 20})
+    assert not bench.run(1, on(3, load=8)).touched.any()
+    with pytest.raises(ConfigurationError, match="no setting 'tau'; there are: tau_s"):
+        bench.baseline.settings.changed({"tau": 3})
+    for name, value in (
+        ("tau_s", 0),
+        ("tau_s", None),
+        ("tau_s", "3"),
+        ("on_sigma", 2),
+        ("release", 1),
+        ("settle_s", -1),
+    ):
+        with pytest.raises(ConfigurationError, match=name):
+            bench.baseline.settings.changed({name: value})
+
+
+def test_a_drivers_frames_with_their_status() -> None:
+    with FakeSkin() as skin:
+        baseline = Baseline.of(skin.structure, "pressure")
+        assert len(baseline.ready) == 640
+        with pytest.raises(StructureError, match="no sensor type"):
+            Baseline.of(skin.structure, "proximity")
+        skin.values = np.full(skin.structure.n_sensors, 200.0)
+        skin.status[24] = Status.NEVER_SEEN
+        skin.publish()
+        with DriverReader("fake") as reader:
+            baseline.take(reader.read())
+            baseline.tare()
+            skin.values[12] = 100  # of module 1: raw counts fall with pressure
+            skin.values[24] = 100
+            skin.status[36:46] |= np.uint8(Status.SUSPECT)
+            skin.values[36:46] = 150
+            for _ in range(3):
+                skin.publish()
+                calm = baseline.take(reader.read())
+    assert not calm.usable[20]
+    assert calm.usable.sum() == 639
+    assert np.flatnonzero(calm.value > 90).tolist() == [10]
+    assert calm.value[10] == 100
+    assert not calm.touched[30:40].any(), "a jump that the hardware tells of"
+
+
+def test_worlds_with_everything_that_goes_wrong_raise_nothing() -> None:
+    world = World(grid(modules=4, patches=2), seed=3, drift_per_min=2, rate_hz=20, dtype=np.float32)
+    world.push(world.surface.position_m[5], 200, 8, 20)
+    world.stuck([1], 255)
+    world.noisy([2], 20)
+    world.missing(np.arange(24, 48), 3, 10, status=Status(0), value=np.nan)
+    world.missing(np.arange(24), 12, 14)
+    world.jump(np.arange(24, 48), 30, 16, suspect_s=1)
+    baseline = Baseline(world.surface.module, world.surface.patch)
+    for sample in world.frames(30):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        assert np.isfinite(calm.value).all()
+        assert np.isfinite(calm.baseline[calm.usable]).all()

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Self
+
+import msgspec
 
 from skinware.errors import ConfigurationError
 
 _MAY_BE_NONE = ("minimum_on", "drift_max_per_min", "maximum_hold_s")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BaselineSettings:
+class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Parameters of a baseline. Times are in seconds, whatever the rate; levels in the unit of the type.
 
     Attributes:
@@ -69,11 +69,10 @@ class BaselineSettings:
         Raises:
             ConfigurationError: an unknown name, or a value that makes no sense.
         """
-        known = {name: getattr(self, name) for name in self.__slots__}
         for name, value in changes.items():
-            if name not in known:
-                raise ConfigurationError(f"no setting {name!r}; there are: {', '.join(known)}")
+            if name not in self.__struct_fields__:
+                raise ConfigurationError(f"no setting {name!r}; there are: {', '.join(self.__struct_fields__)}")
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
             if not is_number and not (value is None and name in _MAY_BE_NONE):
                 raise ConfigurationError(f"{name} = {value!r}: give a number")
-        return replace(self, **changes)
+        return msgspec.structs.replace(self, **changes)

@@ -1,0 +1,285 @@
+"""Chains of stages, from a file: what happens to each sensor type of a driver, in the order in which it stands there.
+
+The file is TOML; every key of a stage but ``stage`` may be left out::
+
+    format = "skinware-chain"
+    version = 1
+
+    [[stage]]
+    stage = "baseline"          # 0 = no touch: see BaselineSettings
+    tau_s = 30.0
+
+    [[stage]]
+    stage = "curve"             # counts to a unit: see skinware.tactile.curves
+    file = "curves.toml"
+
+    [[stage]]
+    stage = "filter"            # lowpass, mean or median
+    types = ["pressure"]        # default: all for which the stage can be made
+    method = "median"
+
+    [[stage]]
+    stage = "scaler"            # each taxel to one range
+
+    [[stage]]
+    stage = "amplifier"         # gain * value ** exponent + offset
+    exponent = 0.5
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_frame import DriverFrame
+from skinware.errors import ConfigurationError
+from skinware.status import Status
+from skinware.structure import Structure
+from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE, Baseline
+from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.curves import CurveTable, read_curves
+from skinware.tactile.stages import (
+    AmplifierSettings,
+    FilterSettings,
+    ScalerSettings,
+    Signal,
+    Stage,
+    StageSettings,
+    Taxels,
+)
+from skinware.toml_text import TomlText, wrong_value
+
+FORMAT, VERSION = "skinware-chain", 1
+
+_RESTLESS = ("temperature", "acceleration_", "angular_rate_")
+"""Beginnings of the names of types that have no rest to go back to."""
+
+
+class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
+    """A baseline as a stage: 0 = no touch; the unit stays.
+
+    Attributes:
+        types: the sensor types that it is for; None: all for which it can be made.
+    """
+
+    types: tuple[str, ...] | None = None
+
+    def stage(self, taxels: Taxels) -> BaselineStage:
+        """The stage for some taxels.
+
+        Raises:
+            ConfigurationError: the type has no rest to go back to.
+        """
+        name, unit = taxels.type.name, taxels.type.unit
+        if name.startswith(_RESTLESS):
+            raise ConfigurationError(f"a {name} has no rest that it goes back to when nothing touches")
+        if name == "proximity" and unit == "m":
+            raise ConfigurationError("a proximity in m falls when something comes near; a baseline is for what rises")
+        given = {field: getattr(self, field) for field in BaselineSettings.__struct_fields__}
+        return BaselineStage(taxels, BaselineSettings(**given))
+
+
+class BaselineStage(Stage):
+    """A baseline.
+
+    Attributes:
+        baseline: it.
+    """
+
+    def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
+        before = taxels.type
+        signed = before.name.startswith(SIGNED_TYPES)
+        span = before.maximum - before.minimum
+        self.taxels = replace(
+            taxels, type=replace(before, minimum=-span if signed else 0.0, maximum=span), resolution=0.0
+        )
+        self.baseline = Baseline(taxels.module, taxels.patch, settings, resolution=taxels.resolution, signed=signed)
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
+        signal.values = calm.value
+        signal.forced |= calm.forced
+        signal.unknown |= np.isnan(calm.baseline)
+
+
+class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
+    """Curves from values to a unit of force or pressure.
+
+    Attributes:
+        file: of the curves; from the folder of the chain's file, if it is not absolute.
+    """
+
+    file: str
+
+    def stage(self, taxels: Taxels) -> CurveStage:
+        """The stage for some taxels.
+
+        Raises:
+            ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
+        """
+        table = CurveTable(read_curves(self.file), taxels.type.name, taxels.uid)
+        if table.from_unit != taxels.type.unit:
+            raise ConfigurationError(f"the curves are for {table.from_unit}, and the values are in {taxels.type.unit}")
+        return CurveStage(taxels, table)
+
+
+class CurveStage(Stage):
+    """Curves."""
+
+    def __init__(self, taxels: Taxels, table: CurveTable) -> None:
+        meant = replace(
+            taxels.type, unit=table.unit, minimum=float(table.minimum.min()), maximum=float(table.maximum.max())
+        )
+        self.taxels = replace(taxels, type=meant, resolution=0.0)
+        self._table = table
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        signal.values = self._table(signal.values)
+
+
+AnySettings = BaselineStageSettings | CurveSettings | FilterSettings | ScalerSettings | AmplifierSettings
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    version: int
+    stage: tuple[AnySettings, ...] = ()
+
+
+class ChainSettings:
+    """What a chain's file says.
+
+    Args:
+        stages: in their order.
+        place: file and line of a stage, for messages.
+    """
+
+    def __init__(
+        self, stages: Sequence[AnySettings], place: Callable[[int], str] = lambda number: f"stage {number + 1}"
+    ) -> None:
+        self.stages = tuple(stages)
+        self._place = place
+
+    @classmethod
+    def calm(cls) -> Self:
+        """A baseline and nothing else."""
+        return cls([BaselineStageSettings()])
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Those of a file.
+
+        Raises:
+            ConfigurationError: not there, not TOML, not of this format, or a wrong value; the message says where.
+        """
+        path = Path(path)
+        text = TomlText(path)
+        if text.data.get("format") != FORMAT or text.data.get("version") != VERSION:
+            raise ConfigurationError(f'{path}: no chain: give format = "{FORMAT}" and version = {VERSION}')
+        try:
+            stages = msgspec.convert(text.data, _File).stage
+        except msgspec.ValidationError as error:
+            why, keys = wrong_value(error)
+            raise ConfigurationError(f"{text.place(keys)}: {why}") from None
+        if not stages:
+            raise ConfigurationError(f"{path}: no [[stage]] in it")
+        beside = [
+            msgspec.structs.replace(stage, file=str(path.parent / stage.file))
+            if isinstance(stage, CurveSettings)
+            else stage
+            for stage in stages
+        ]
+        return cls(beside, lambda number: text.place(("stage", number)))
+
+    def chain(self, structure: Structure) -> Chain:
+        """The chain for a driver.
+
+        Raises:
+            ConfigurationError: a stage cannot be made for a type that it names, or for none; the message says why.
+        """
+        stages: dict[str, list[Stage]] = {sensor_type.name: [] for sensor_type in structure.types}
+        taxels = {name: Taxels.of(structure, name) for name in stages}
+        for number, settings in enumerate(self.stages):
+            refused: list[str] = []
+            for name in stages if settings.types is None else settings.types:
+                if name not in stages:
+                    raise ConfigurationError(
+                        f"{self._place(number)}: no sensor type {name!r}; there are: {', '.join(stages)}"
+                    )
+                try:
+                    stage = settings.stage(taxels[name])
+                except ConfigurationError as error:
+                    refused.append(f"{settings.__struct_config__.tag}: {error}")
+                    if settings.types is not None:
+                        raise ConfigurationError(f"{self._place(number)}: {refused[-1]}") from None
+                else:
+                    stages[name].append(stage)
+                    taxels[name] = stage.taxels
+            if len(refused) == len(stages):
+                raise ConfigurationError(f"{self._place(number)}: {'; '.join(refused)}")
+        return Chain(structure, stages, taxels)
+
+
+class Chain:
+    """All stages of a driver.
+
+    Args:
+        structure: of the driver.
+        stages: by type, in their order.
+        taxels: by type, as they come out.
+
+    Attributes:
+        structure: of what comes out: the same sensors, float32, with the units of the last stages.
+        stages: by type.
+    """
+
+    def __init__(self, structure: Structure, stages: dict[str, list[Stage]], taxels: dict[str, Taxels]) -> None:
+        self.stages = stages
+        self._before = structure
+        self._suspect: dict[str, npt.NDArray[np.bool_]] = {}
+        types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
+        self.structure: Structure = structure.replace(types=types, dtype=np.float32)
+
+    @property
+    def baselines(self) -> dict[str, Baseline]:
+        """By type, the first baseline of each."""
+        found: dict[str, Baseline] = {}
+        for name, stages in self.stages.items():
+            for stage in stages:
+                if isinstance(stage, BaselineStage):
+                    found.setdefault(name, stage.baseline)
+        return found
+
+    def step(self, frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
+        """Take the next frame through all stages.
+
+        Args:
+            frame: of the driver.
+            values: (n_sensors,) float32, filled with what comes out.
+            status: (n_sensors,) uint8, filled with the frame's, ``SUSPECT`` where a baseline was moved by force, and
+                ``NEVER_SEEN`` where a stage does not know yet what to say.
+        """
+        status[:] = frame.status
+        for name, stages in self.stages.items():
+            index = self._before.index(name)
+            of_type = status[index]
+            suspect = (of_type & Status.SUSPECT) != 0
+            signal = Signal.of(frame.acquired_ns, frame.physical(name), (of_type & UNUSABLE) == 0)
+            signal.jumped = suspect & ~self._suspect.get(name, suspect)
+            self._suspect[name] = suspect
+            for stage in stages:
+                stage.step(signal)
+            values[index] = signal.values
+            of_type = of_type | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
+            status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
+
+
+__all__ = ["BaselineStageSettings", "Chain", "ChainSettings", "CurveSettings"]

@@ -1,0 +1,308 @@
+"""Stages of a chain: each takes the values of n taxels of one type, frame by frame, and changes them.
+
+Each can be used alone::
+
+    stage = FilterSettings(method="median", frames=3).stage(taxels)
+    signal = Signal.of(time_ns, values)
+    stage.step(signal)
+    signal.values
+
+What a stage is told stands in its settings, which are also what a chain's file says of it.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Self
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
+from skinware.sensor_types import SensorType
+from skinware.structure import Structure
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+NO_UNIT = "1"
+"""Of what is no quantity any more."""
+
+
+@dataclass(eq=False)
+class Signal:
+    """One frame of n taxels on its way through stages, which change it in place.
+
+    Attributes:
+        time_ns: of the frame.
+        values: (n,) float32.
+        usable: (n,) bool, which values are of this frame.
+        jumped: (n,) bool, where the hardware moved its own baseline just before it.
+        forced: (n,) bool, where a stage moved a baseline by force.
+        unknown: (n,) bool, where a stage cannot tell yet what the value is; it is 0.
+    """
+
+    time_ns: int
+    values: Floats
+    usable: Flags
+    jumped: Flags
+    forced: Flags
+    unknown: Flags
+
+    @classmethod
+    def of(cls, time_ns: int, values: npt.ArrayLike, usable: npt.ArrayLike | None = None) -> Self:
+        """A frame: (n,) values, and which of them are usable; default: all that are finite."""
+        taken = np.array(values, np.float32)
+        known = np.isfinite(taken) if usable is None else np.isfinite(taken) & usable
+        none = np.zeros(len(taken), bool)
+        return cls(time_ns, taken, known, none, none.copy(), none.copy())
+
+
+@dataclass(frozen=True, eq=False)
+class Taxels:
+    """The n taxels of one type that a stage is made for.
+
+    Attributes:
+        type: as the stage gets it: its unit, and what its values can be.
+        uid: (n,) of them.
+        module: (n,) of them.
+        patch: (n,) of them.
+        resolution: step of the values; 0 if they have none.
+    """
+
+    type: SensorType
+    uid: npt.NDArray[np.uint64]
+    module: npt.NDArray[np.int64]
+    patch: npt.NDArray[np.int64]
+    resolution: float = 0.0
+
+    @classmethod
+    def of(cls, structure: Structure, type_name: str) -> Taxels:
+        """Those of a driver.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        sensor_type = structure.type(type_name)
+        return cls(
+            sensor_type,
+            structure.sensor_uid[structure.index(type_name)],
+            structure.module_of(type_name),
+            structure.patch_of(type_name),
+            0.0 if structure.dtype.kind == "f" else abs(sensor_type.scale),
+        )
+
+    def __len__(self) -> int:
+        return len(self.uid)
+
+
+class Stage(ABC):
+    """What a signal goes through.
+
+    Attributes:
+        taxels: of what comes out.
+    """
+
+    taxels: Taxels
+
+    @abstractmethod
+    def step(self, signal: Signal) -> None:
+        """Change one frame in place; frames come in the order of time."""
+
+
+class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):
+    """What is said of a stage. Each has a method ``stage`` that makes it.
+
+    Attributes:
+        types: the sensor types that it is for; None: all for which it can be made.
+    """
+
+    types: tuple[str, ...] | None = None
+
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
+    """Smooths each taxel over time; the unit stays.
+
+    Attributes:
+        method: ``lowpass`` of first order, ``mean`` or ``median`` of the last frames.
+        tau_s: time constant of ``lowpass``, s.
+        frames: of ``mean`` and ``median``, 2 to 99.
+    """
+
+    method: Literal["lowpass", "mean", "median"] = "lowpass"
+    tau_s: Positive = 0.1
+    frames: Annotated[int, msgspec.Meta(ge=2, le=99)] = 3
+
+    def stage(self, taxels: Taxels) -> Stage:
+        """The stage for some taxels."""
+        return Lowpass(taxels, self.tau_s) if self.method == "lowpass" else LastFrames(taxels, self.frames, self.method)
+
+
+class Lowpass(Stage):
+    """A first-order low-pass of n taxels, by the time that passes."""
+
+    def __init__(self, taxels: Taxels, tau_s: float) -> None:
+        self.taxels = replace(taxels, resolution=0.0)
+        self._tau_s = tau_s
+        self._time_ns: int | None = None
+        self._smooth: Floats = np.full(len(taxels), np.nan, np.float32)
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        passed_s = 0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
+        self._time_ns = signal.time_ns
+        share = np.float32(-math.expm1(-passed_s / self._tau_s))
+        np.copyto(self._smooth, signal.values, where=signal.usable & np.isnan(self._smooth))
+        self._smooth += np.where(signal.usable, signal.values - self._smooth, np.float32(0)) * share
+        signal.values = np.where(np.isnan(self._smooth), signal.values, self._smooth)
+
+
+class LastFrames(Stage):
+    """Mean or median of the last usable values of n taxels, one row of a ring after the other."""
+
+    def __init__(self, taxels: Taxels, frames: int, method: Literal["mean", "median"]) -> None:
+        self.taxels = replace(taxels, resolution=0.0)
+        self._median = method == "median"
+        self._last: Floats = np.full((frames, len(taxels)), np.nan, np.float32)
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        new = signal.usable & np.isnan(self._last[0])
+        self._last[:, new] = signal.values[new]
+        self._last = np.roll(self._last, -1, axis=0)
+        self._last[-1] = np.where(signal.usable, signal.values, self._last[-2])
+        ordered = np.sort(self._last, axis=0) if self._median else self._last
+        if self._median:
+            middle = len(ordered) // 2
+            found = ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2
+        else:
+            found = ordered.mean(axis=0)
+        signal.values = np.where(np.isnan(found), signal.values, found)
+
+
+class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
+    """Brings each taxel to the same range; the result has no unit.
+
+    Attributes:
+        source: ``range``: the range that the type says; ``seen``: what each taxel has shown so far.
+        low: of what comes out.
+        high: of what comes out.
+        shrink_s: the seen range shrinks towards the present value with this time constant, s; None: never.
+    """
+
+    source: Literal["range", "seen"] = "range"
+    low: float = 0.0
+    high: float = 1.0
+    shrink_s: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.high - self.low) or self.low >= self.high:
+            raise ConfigurationError(f"low = {self.low}, high = {self.high}: give a range")
+
+    def stage(self, taxels: Taxels) -> Stage:
+        """The stage for some taxels.
+
+        Raises:
+            ConfigurationError: the type has no range; the message says what to do.
+        """
+        span = taxels.type.maximum - taxels.type.minimum
+        if self.source == "range" and not 0 < span < math.inf:
+            least, most = taxels.type.minimum, taxels.type.maximum
+            raise ConfigurationError(f'{taxels.type.name} has no range ({least} to {most}): give source = "seen"')
+        return Scaler(taxels, self)
+
+
+class Scaler(Stage):
+    """Scales n taxels."""
+
+    def __init__(self, taxels: Taxels, settings: ScalerSettings) -> None:
+        before = taxels.type
+        scaled = replace(before, unit=NO_UNIT, minimum=settings.low, maximum=settings.high)
+        self.taxels = replace(taxels, type=scaled, resolution=0.0)
+        self._settings = settings
+        self._time_ns: int | None = None
+        is_range = settings.source == "range"
+        self._least: Floats = np.full(len(taxels), before.minimum if is_range else np.nan, np.float32)
+        self._most: Floats = np.full(len(taxels), before.maximum if is_range else np.nan, np.float32)
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        settings = self._settings
+        if settings.source == "seen":
+            seen = np.where(signal.usable, signal.values, np.float32(np.nan))
+            if settings.shrink_s is not None and self._time_ns is not None:
+                share = np.float32(-math.expm1(-max(0, signal.time_ns - self._time_ns) / NS_PER_S / settings.shrink_s))
+                here = np.where(signal.usable, share, np.float32(0))
+                self._least += np.where(signal.usable, seen - self._least, np.float32(0)) * here
+                self._most += np.where(signal.usable, seen - self._most, np.float32(0)) * here
+            self._least, self._most = np.fmin(self._least, seen), np.fmax(self._most, seen)
+            self._time_ns = signal.time_ns
+        span = self._most - self._least
+        share = np.divide(signal.values - self._least, span, out=np.zeros_like(span), where=span > 0)
+        signal.values = (settings.low + (settings.high - settings.low) * np.clip(share, 0, 1)).astype(np.float32)
+
+
+class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier"):
+    """gain * value ** exponent + offset, with the sign of the value; the result has no unit, unless one is given.
+
+    Attributes:
+        gain: factor.
+        exponent: below 1, weak touches are amplified more than strong ones.
+        offset: added at the end.
+        unit: of the result, at most 16 bytes.
+    """
+
+    gain: float = 1.0
+    exponent: Positive = 1.0
+    offset: float = 0.0
+    unit: str = NO_UNIT
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.gain) or not math.isfinite(self.offset) or self.gain == 0:
+            raise ConfigurationError(
+                f"gain = {self.gain}, offset = {self.offset}: give finite numbers, and a gain that is not 0"
+            )
+
+    def stage(self, taxels: Taxels) -> Stage:
+        """The stage for some taxels."""
+        return Amplifier(taxels, self)
+
+
+class Amplifier(Stage):
+    """Amplifies n taxels."""
+
+    def __init__(self, taxels: Taxels, settings: AmplifierSettings) -> None:
+        self._settings = settings
+        ends = self._of(np.array([taxels.type.minimum, taxels.type.maximum]))
+        amplified = replace(taxels.type, unit=settings.unit, minimum=float(ends.min()), maximum=float(ends.max()))
+        step = taxels.resolution * abs(settings.gain) if settings.exponent == 1 else 0.0
+        self.taxels = replace(taxels, type=amplified, resolution=step)
+
+    def step(self, signal: Signal) -> None:
+        """See :class:`Stage`."""
+        signal.values = self._of(signal.values).astype(np.float32)
+
+    def _of(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        settings = self._settings
+        bent = values if settings.exponent == 1 else np.sign(values) * np.abs(values) ** settings.exponent
+        amplified: npt.NDArray[np.floating] = settings.gain * bent + settings.offset
+        return amplified
+
+
+__all__ = [
+    "NO_UNIT",
+    "AmplifierSettings",
+    "FilterSettings",
+    "ScalerSettings",
+    "Signal",
+    "Stage",
+    "StageSettings",
+    "Taxels",
+]

@@ -16,8 +16,9 @@ most of a contact's load goes at once, it is over, and what is left is taken for
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -262,6 +263,45 @@ class Baseline:
         value = np.where(self._touches.touched, above if self._signed else np.maximum(above, 0), np.float32(0))
         forced, self._forced = self._forced, np.zeros(len(live), bool)
         return Calm(value, self._touches.touched.copy(), held, self._base.copy(), self._noise.copy(), forced, live)
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """All that was learned, by name: arrays (n,), copies."""
+        return {name: array.copy() for name, array in self._learned().items()}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> int:
+        """Go on with what another baseline had learned, contacts included.
+
+        Args:
+            state: of ``state``, of m taxels.
+            rows: (n,) where each taxel stands there; -1: nowhere.
+
+        Returns:
+            How many taxels are ready now.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        here = rows >= 0
+        m = int(rows.max(initial=-1)) + 1
+        learned = self._learned()
+        for name, array in learned.items():
+            given = state.get(name)
+            if given is None or given.dtype != array.dtype or given.ndim != 1 or len(given) < m:
+                raise ConfigurationError(f"no state of a baseline: {name} is missing or has a wrong shape or dtype")
+        here[here] = state["ready"][rows[here]]
+        for name in ("base", "factor"):
+            here[here] = np.isfinite(state[name][rows[here]])
+        for name, array in learned.items():
+            array[here] = state[name][rows[here]]
+        self._set_thresholds()
+        return int(here.sum())
+
+    def _learned(self) -> dict[str, npt.NDArray[Any]]:
+        own = {"ready": self._ready, "base": self._base, "noise": self._noise}
+        touches, drift = self._touches, self._drift
+        of_touches = {name: getattr(touches, name) for name in ("touched", "level", "contact_s", "settling_s")}
+        of_drift = {name: getattr(drift, name) for name in ("factor", "own", "common", "product", "square", "lag")}
+        return own | of_touches | of_drift
 
     # -- steps of one frame -------------------------------------------------------------------------------------
 

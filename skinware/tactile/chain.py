@@ -29,7 +29,7 @@ The file is TOML; every key of a stage but ``stage`` may be left out::
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -92,6 +92,8 @@ class BaselineStage(Stage):
         baseline: it.
     """
 
+    name = "baseline"
+
     def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
         before = taxels.type
         signed = before.name.startswith(SIGNED_TYPES)
@@ -132,6 +134,8 @@ class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
 
 class CurveStage(Stage):
     """Curves."""
+
+    name = "curve"
 
     def __init__(self, taxels: Taxels, table: CurveTable) -> None:
         meant = replace(
@@ -228,6 +232,19 @@ class ChainSettings:
         return Chain(structure, stages, taxels)
 
 
+@dataclass(frozen=True, eq=False)
+class ChainState:
+    """What a chain has learned.
+
+    Attributes:
+        fingerprint: of what its baselines saw.
+        arrays: by type, what the baseline has learned by name, and ``uid``: arrays of as many taxels as it had.
+    """
+
+    fingerprint: str
+    arrays: dict[str, dict[str, npt.NDArray[Any]]]
+
+
 class Chain:
     """All stages of a driver.
 
@@ -247,6 +264,45 @@ class Chain:
         self._suspect: dict[str, npt.NDArray[np.bool_]] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
+
+    def state(self) -> ChainState:
+        """What its baselines have learned."""
+        found = {
+            name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
+            for name, baseline in self.baselines.items()
+        }
+        return ChainState(self._fingerprint, found)
+
+    def restore(self, state: ChainState) -> int:
+        """Go on with what the baselines of another chain had learned, taxel by taxel, if they saw the same values.
+
+        Returns:
+            How many taxels that are; 0 if there were other stages before the baselines, or other units.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        if state.fingerprint != self._fingerprint:
+            return 0
+        restored = 0
+        for name, baseline in self.baselines.items():
+            if name in state.arrays:
+                uid, learned = self.structure.sensor_uid[self.structure.index(name)], state.arrays[name]
+                row_of = {one: row for row, one in enumerate(learned["uid"].tolist())}
+                restored += baseline.restore(learned, np.array([row_of.get(one, -1) for one in uid.tolist()]))
+        return restored
+
+    @property
+    def _fingerprint(self) -> str:
+        """What the values that baselines see depend on."""
+        before: list[object] = []
+        for name, stages in self.stages.items():
+            kinds = [stage.name for stage in stages]
+            end = kinds.index(BaselineStage.name) if BaselineStage.name in kinds else 0
+            of_driver = self._before.type(name)
+            unit = stages[end - 1].taxels.type.unit if end else of_driver.unit
+            before.append([name, unit, of_driver.scale, of_driver.offset, kinds[:end]])
+        return repr(before)
 
     @property
     def baselines(self) -> dict[str, Baseline]:
@@ -282,4 +338,4 @@ class Chain:
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
 
 
-__all__ = ["BaselineStageSettings", "Chain", "ChainSettings", "CurveSettings"]
+__all__ = ["BaselineStageSettings", "Chain", "ChainSettings", "ChainState", "CurveSettings"]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import msgspec
 import numpy as np
@@ -104,9 +104,11 @@ class Stage(ABC):
     """What a signal goes through.
 
     Attributes:
+        name: as a file calls it.
         taxels: of what comes out.
     """
 
+    name: ClassVar[str]
     taxels: Taxels
 
     @abstractmethod
@@ -148,6 +150,8 @@ class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
 class Lowpass(Stage):
     """A first-order low-pass of n taxels, by the time that passes."""
 
+    name = "filter"
+
     def __init__(self, taxels: Taxels, tau_s: float) -> None:
         self.taxels = replace(taxels, resolution=0.0)
         self._tau_s = tau_s
@@ -166,6 +170,8 @@ class Lowpass(Stage):
 
 class LastFrames(Stage):
     """Mean or median of the last usable values of n taxels, one row of a ring after the other."""
+
+    name = "filter"
 
     def __init__(self, taxels: Taxels, frames: int, method: Literal["mean", "median"]) -> None:
         self.taxels = replace(taxels, resolution=0.0)
@@ -222,6 +228,8 @@ class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
 class Scaler(Stage):
     """Scales n taxels."""
 
+    name = "scaler"
+
     def __init__(self, taxels: Taxels, settings: ScalerSettings) -> None:
         before = taxels.type
         scaled = replace(before, unit=NO_UNIT, minimum=settings.low, maximum=settings.high)
@@ -277,6 +285,8 @@ class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier
 
 class Amplifier(Stage):
     """Amplifies n taxels."""
+
+    name = "amplifier"
 
     def __init__(self, taxels: Taxels, settings: AmplifierSettings) -> None:
         self._settings = settings

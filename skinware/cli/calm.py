@@ -1,0 +1,151 @@
+"""``skin-calm``: publish a driver with baselines that hold."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    version_option,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from skinware.tactile.calm_service import CalmService
+
+
+@click.command(
+    "skin-calm",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-calm torso                        skin-top --namespace calm shows it",
+        "skin-calm torso --config chain.toml    with a filter, or in N",
+        "skin-calm torso --into quiet           into another namespace",
+    ),
+)
+@click.argument("name")
+@click.option("--into", metavar="NAMESPACE", default="calm", show_default=True, help="Where the calmed driver is.")
+@click.option(
+    "--config",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="TOML file with the stages: baseline, curve, filter, scaler, amplifier.  [default: a baseline]",
+)
+@click.option(
+    "--state",
+    "state_path",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Where baselines are kept over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
+)
+@click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
+@namespace_option
+@json_option
+@version_option
+@click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
+def command(
+    name: str,
+    into: str,
+    config: Path | None,
+    state_path: Path | None,
+    group: str | None,
+    namespace: str | None,
+    as_json: bool,
+    verbose: bool,
+) -> None:
+    """Calm driver NAME: 0 = no touch, whatever drifts, under the same name in namespace calm.
+
+    The first seconds it measures what untouched sensors read. It goes on when the driver restarts or changes; what it
+    learned is kept for 10 minutes over a restart of its own. Programs may ask it to tare, hold and change settings.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
+    """
+    from skinware.memory.namespace import Namespace, check_name
+    from skinware.tactile.calm_service import CalmService
+    from skinware.tactile.chain import ChainSettings
+    from skinware.tactile.chain_state import default_path
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="skin-calm: %(message)s", stream=sys.stderr
+    )
+    check_name(name, "driver")
+    settings = ChainSettings.calm() if config is None else ChainSettings.read(config)
+    source, target = Namespace(namespace), Namespace(into)
+    service = CalmService(
+        name,
+        settings,
+        namespace=source,
+        into=target,
+        group=group,
+        state_path=state_path or default_path(target.name, name),
+        on_ready=lambda: _tell_ready(service, as_json),
+    )
+    if name not in source.services():
+        there_are = ", ".join(source.services()) or "none"
+        click.echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
+    with _signals_end(service):
+        service.run({1.0: lambda: _tell_status(service)} if as_json else {})
+    if as_json:
+        with contextlib.suppress(BrokenPipeError):
+            print_json({"event": "stopped", "name": service.name, **service.status()})
+
+
+@contextlib.contextmanager
+def _signals_end(service: CalmService) -> Iterator[None]:
+    """SIGINT and SIGTERM end it in good order, whatever it is doing."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: service.stop()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _tell_ready(service: CalmService, as_json: bool) -> None:
+    chain = service.chain
+    if chain is None:
+        return
+    structure = chain.structure
+    units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
+    if as_json:
+        ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
+        counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
+        types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
+        where = {"namespace": service.namespace.name, "into": service.into.name}
+        stages = {name: [stage.name for stage in stages] for name, stages in chain.stages.items()}
+        print_json(
+            {**ready, **counts, "types": types, "units": units, **where, "stages": stages, "restored": service.restored}
+        )
+    else:
+        through = [
+            f"{name} [{units[name]}] through {', '.join(s.name for s in st)}" for name, st in chain.stages.items() if st
+        ]
+        restored = f"; goes on with {service.restored} baselines" if service.restored else ""
+        click.echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
+        click.echo(f"publishing (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+
+
+def _tell_status(service: CalmService) -> None:
+    try:
+        print_json({"event": "status", "name": service.name, **service.status()})
+    except BrokenPipeError:
+        service.stop()
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from skinware.memory.namespace import Namespace
+from skinware_drivers.testing.leaks import files_left
 
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -22,3 +25,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @pytest.fixture(autouse=True)
 def everywhere(namespace: Namespace) -> None:
     """Also where no test asks for it."""
+
+
+@pytest.fixture
+def calm_namespace(namespace: Namespace) -> Iterator[Namespace]:
+    """A second namespace of this test, for what a service makes of the first; nothing may be left in it either."""
+    place = Namespace(f"{namespace.name}-calm")
+    yield place
+    left = files_left(place.path)
+    shutil.rmtree(place.path, ignore_errors=True)
+    assert not left

@@ -97,7 +97,7 @@ def command(
         there_are = ", ".join(source.services()) or "none"
         click.echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
     with _signals_end(service):
-        service.run({1.0: lambda: _tell_status(service)} if as_json else {})
+        service.run((lambda: _tell_status(service)) if as_json else lambda: None)
     if as_json:
         with contextlib.suppress(BrokenPipeError):
             print_json({"event": "stopped", "name": service.name, **service.status()})
@@ -126,7 +126,7 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
         where = {"namespace": service.namespace.name, "into": service.into.name}
-        stages = {name: [stage.name for stage in stages] for name, stages in chain.stages.items()}
+        stages = [{"type": name, "stage": stage.name} for name, of_type in chain.stages.items() for stage in of_type]
         print_json(
             {**ready, **counts, "types": types, "units": units, **where, "stages": stages, "restored": service.restored}
         )

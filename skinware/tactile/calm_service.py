@@ -6,7 +6,7 @@ import inspect
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -136,17 +136,18 @@ class CalmService:
 
     # -- running ------------------------------------------------------------------------------------------------
 
-    def run(self, every_s: Mapping[float, Callable[[], object]] | None = None) -> None:
+    def run(self, report: Callable[[], object] = lambda: None, every_s: float = 1.0) -> None:
         """Calm the driver until ``stop``.
 
         Args:
-            every_s: functions that are called each so many seconds, besides.
+            report: called besides, again and again.
+            every_s: how often.
 
         Raises:
             NameInUse, NamespaceError: as a writer.
             ConfigurationError: a stage cannot be made for the driver.
         """
-        due = {interval_s: now_ns() for interval_s in every_s or {}}
+        next_report_ns = now_ns() + round(every_s * NS_PER_S)
         try:
             while not self._stopping:
                 frame = self._next_frame()
@@ -154,10 +155,9 @@ class CalmService:
                 if frame is not None:
                     self._publish(frame)
                 self._keep_state()
-                for interval_s, function in (every_s or {}).items():
-                    if now_ns() >= due[interval_s] + interval_s * NS_PER_S:
-                        due[interval_s] = now_ns()
-                        function()
+                if now_ns() >= next_report_ns:
+                    next_report_ns = now_ns() + round(every_s * NS_PER_S)
+                    report()
         finally:
             self._end_saving()
             self._save()

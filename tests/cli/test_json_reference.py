@@ -140,7 +140,9 @@ def printing(capsys: pytest.CaptureFixture[str]) -> Print:
     return run
 
 
-def test_a_driver_and_those_that_look_at_it(printing: Print, namespace: Namespace) -> None:
+def test_a_driver_and_those_that_look_at_it(
+    printing: Print, namespace: Namespace, calm_namespace: Namespace, tmp_path: Path
+) -> None:
     with (
         running("skin-driver", "--bus", f"{VIRTUAL}&foreign_hz=200") as driver,
         ServiceWriter("pose", {"angle": ("f4", (2,)), "at": ([("x", "i4")], ())}, namespace=namespace) as service,
@@ -162,6 +164,12 @@ def test_a_driver_and_those_that_look_at_it(printing: Print, namespace: Namespac
             *printing(dump, "roboskin", "-n", "1", "--type", "pressure", "--counts"),
             *printing(dump, "roboskin", "-n", "1"),
         )
+        with running(
+            "skin-calm", "roboskin", "--into", calm_namespace.name, "--state", str(tmp_path / "state.npz")
+        ) as calm:
+            check("`ready` of a calmed driver", calm.wait_for("ready"))
+            status = calm.wait_for("status", lambda status: bool(status["touched"]))
+            check("`status`, `stopped` of a calmed driver", status, calm.stop())
         check("`skin-top`", *printing(top, "--plain", "-T", "2"))
         check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
         status = driver.wait_for("status")

@@ -25,26 +25,22 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, run, running
 
-INTO = "calm-of-tests"
-
 
 @pytest.fixture(autouse=True)
-def own_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, namespace: Namespace) -> Iterator[Namespace]:
-    """A namespace to publish into, and a place for states, of this test alone."""
+def own_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, calm_namespace: Namespace) -> None:
+    """States are kept in a folder of this test."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    into = Namespace(f"{namespace.name[:30]}-calm")
-    monkeypatch.setattr("tests.tactile.test_calm_service.INTO", into.name)
-    yield into
-    for path in sorted(into.path.glob("**/*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    if into.path.exists():
-        into.path.rmdir()
+
+
+def into() -> str:
+    """The name of the ``calm_namespace`` of this test."""
+    return f"{Namespace().name}-calm"
 
 
 @contextmanager
 def calming(name: str = "fake", *, frames: int = 1, **how: Any) -> Iterator[CalmService]:
     """A service that runs in a thread, and has taken some frames."""
-    service = CalmService(name, into=INTO, **how)
+    service = CalmService(name, into=into(), **how)
     failure: list[SkinwareError] = []
 
     def work() -> None:
@@ -89,7 +85,7 @@ def read_until(reader: DriverReader, condition: Callable[[DriverFrame], bool]) -
 def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None:
     with publishing(idle(FakeSkin())) as skin, calming():
         skin.status[30] = Status.STALE
-        with DriverReader("fake", namespace=INTO) as reader:
+        with DriverReader("fake", namespace=into()) as reader:
             assert np.array_equal(reader.structure.sensor_uid, skin.structure.sensor_uid)
             assert reader.structure.dtype == np.float32
             assert reader.structure.type("pressure").unit == "counts"
@@ -115,7 +111,7 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
 
 
 def test_operations_and_what_they_refuse() -> None:
-    with publishing(idle(FakeSkin())) as skin, calming(), DriverReader("fake", namespace=INTO) as reader:
+    with publishing(idle(FakeSkin())) as skin, calming(), DriverReader("fake", namespace=into()) as reader:
         assert sorted(reader.operations()) == ["hold", "settings", "tare"]
         assert reader.call("tare", patch="board 8") == {"pressure": 160}
         assert reader.call("hold", on=True) == {"pressure": True}
@@ -144,7 +140,7 @@ def test_it_survives_the_driver_and_tells_that_it_is_gone(namespace: Namespace) 
     with calming_process() as calm:
         with fake_process("fake", "--rate", "50") as process:
             calm.wait_for("ready")
-            reader = DriverReader("fake", namespace=INTO)
+            reader = DriverReader("fake", namespace=into())
             assert reader.call("tare")["pressure"] > 0
             read_until(reader, lambda frame: not frame.status[0] & Status.NEVER_SEEN)
             kill(process)
@@ -164,12 +160,12 @@ def test_it_survives_the_driver_and_tells_that_it_is_gone(namespace: Namespace) 
         reader.close()
         assert calm.stop(signal.SIGTERM)["event"] == "stopped"
         assert calm.process.returncode == 0
-    assert not Namespace(INTO).services()
+    assert not Namespace(into()).services()
 
 
 @contextmanager
 def calming_process(*options: str) -> Iterator[Any]:
-    with running("skin-calm", "fake", "--into", INTO, *options) as calm:
+    with running("skin-calm", "fake", "--into", into(), *options) as calm:
         yield calm
 
 
@@ -178,9 +174,9 @@ def test_it_waits_for_a_driver_that_is_not_there_and_says_so() -> None:
         wait_until(lambda: "waiting for driver 'fake'" in calm.errors)
         with publishing(idle(FakeSkin())):
             ready = calm.wait_for("ready")
-            assert (ready["name"], ready["driver"], ready["into"]) == ("fake", "calm", INTO)
+            assert (ready["name"], ready["driver"], ready["into"]) == ("fake", "calm", into())
             assert ready["types"] == {"pressure": 640, "temperature": 128}
-            assert ready["stages"] == {"pressure": ["baseline"], "temperature": []}
+            assert ready["stages"] == [{"type": "pressure", "stage": "baseline"}]
             status = calm.wait_for("status", lambda status: status["frames"] > 0)
             assert status["ready"] == {"pressure": 0}
         assert calm.stop()["event"] == "stopped"
@@ -190,12 +186,12 @@ def test_it_waits_for_a_driver_that_is_not_there_and_says_so() -> None:
 def test_what_was_learned_is_there_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "state" / "skin.npz"
     with publishing(idle(FakeSkin())) as skin:
-        with calming(state_path=path), DriverReader("fake", namespace=INTO) as reader:
+        with calming(state_path=path), DriverReader("fake", namespace=into()) as reader:
             reader.call("tare")
             assert skin.values is not None
             skin.values[12] = 150
             read_until(reader, lambda frame: frame.values[12] > 0)
-        with calming(state_path=path) as service, DriverReader("fake", namespace=INTO) as reader:
+        with calming(state_path=path) as service, DriverReader("fake", namespace=into()) as reader:
             assert service.restored == 640
             assert read_until(reader, lambda frame: frame.values[12] > 0).values[12] == 50, "the load is still there"
     with publishing(idle(FakeSkin(structure=fake_structure(4, 16).replace(types=counts_of_another_scale())))):
@@ -259,7 +255,7 @@ def test_states_are_kept_where_the_account_may_write(monkeypatch: pytest.MonkeyP
 def test_a_state_that_cannot_be_kept_ends_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("")
     with publishing(idle(FakeSkin())), calming(state_path=tmp_path / "file" / "skin.npz"):
-        with DriverReader("fake", namespace=INTO) as reader:
+        with DriverReader("fake", namespace=into()) as reader:
             reader.call("tare")
     assert "cannot be kept" in caplog.text
 
@@ -275,7 +271,7 @@ def test_two_of_a_name_and_one_into_itself(namespace: Namespace) -> None:
 def test_a_driver_that_is_paused_or_has_no_period_is_no_trouble() -> None:
     with publishing(idle(FakeSkin())) as skin, calming() as service:
         skin.is_hung = True
-        with DriverReader("fake", namespace=INTO) as reader:
+        with DriverReader("fake", namespace=into()) as reader:
             taken = service.frames
             skin.writer.pause()
             time.sleep(0.2)
@@ -306,7 +302,7 @@ def test_a_stage_that_cannot_be_made_for_the_driver_ends_it(tmp_path: Path) -> N
     path = tmp_path / "chain.toml"
     path.write_text('format = "skinware-chain"\nversion = 1\n[[stage]]\nstage = "baseline"\ntypes = ["temperature"]\n')
     with publishing(idle(FakeSkin())):
-        done = run("skin-calm", "fake", "--into", INTO, "--config", str(path))
+        done = run("skin-calm", "fake", "--into", into(), "--config", str(path))
     assert done.returncode == 2
     assert f"{path}:3: baseline: a temperature has no rest" in done.stderr
 
@@ -330,16 +326,16 @@ def test_text_for_people(tmp_path: Path) -> None:
         'format = "skinware-chain"\nversion = 1\n[[stage]]\nstage = "baseline"\n[[stage]]\nstage = "filter"\n'
     )
     with publishing(FakeSkin()):
-        with running_text("fake", "--into", INTO, "--config", str(path)) as lines:
+        with running_text("fake", "--into", into(), "--config", str(path)) as lines:
             assert next(lines) == "fake: pressure [counts] through baseline, filter; temperature [degC] through filter"
-            assert INTO in next(lines)
+            assert into() in next(lines)
 
 
 def test_the_calmed_driver_is_a_driver_for_every_command() -> None:
     with publishing(idle(FakeSkin())), calming():
-        shown = json.loads(run("skin-info", "--namespace", INTO, "--json").stdout)
+        shown = json.loads(run("skin-info", "--namespace", into(), "--json").stdout)
         assert shown["drivers"][0]["driver_type"] == "calm"
-        dumped = run("skin-dump", "fake", "-n", "1", "--json", "--namespace", INTO)
+        dumped = run("skin-dump", "fake", "-n", "1", "--json", "--namespace", into())
         assert len(json.loads(dumped.stdout)["values"]) == 768
 
 
@@ -347,4 +343,4 @@ def test_no_driver_is_found_once_it_was_closed() -> None:
     with publishing(idle(FakeSkin())), calming():
         pass
     with pytest.raises(ServiceError):
-        DriverReader("fake", namespace=INTO)
+        DriverReader("fake", namespace=into())

@@ -8,15 +8,24 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import fields
+from multiprocessing.connection import Connection
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from processes import Processes, answer
 
+from skinware import DriverReader, DriverWriter, Namespace, Structure
+from skinware.sensor_types import PRESSURE
 from skinware.tactile.baseline import Baseline
+from skinware.tactile.calm_service import CalmService
 from tests.tactile.judging import Marks, Ours, Worlds, judge, peers
 from tests.tactile.peers import ICub
 
@@ -69,6 +78,80 @@ def speed() -> None:
         print(f"  {'':<16} the rest taken, once: {max(taken[0][:WARM_UP]):.1f}")
 
 
+def service(seconds: float) -> None:
+    """Processor time of a service, while 20 contacts come and go."""
+    source, into = (Namespace(f"bench-{os.getpid()}-{what}") for what in ("source", "calm"))
+    try:
+        with tempfile.TemporaryDirectory() as folder, Processes() as processes:
+            writer = processes.start(write, source)
+            answer(writer, 30)
+            calm = processes.start(calm_down, source, into, Path(folder) / "state.npz", seconds)
+            answer(calm, 30)
+            time.sleep(0.5)
+            with DriverReader("skin", namespace=into, timeout_s=10) as reader:
+                before = reader.read()
+                busy_s, passed_s, frames = answer(calm, seconds + 60)
+                after = reader.read(timeout_s=1)
+            writer.send("stop")
+        share, rate_hz = 100 * busy_s / passed_s, frames / passed_s
+        print(f"skin-calm of {TAXELS} taxels at {rate_hz:.1f} Hz: {share:.1f} % of a core, its start left out")
+        print(f"  {after.sequence - before.sequence} frames seen by a reader, {frames} taken")
+    finally:
+        for namespace in (source, into):
+            shutil.rmtree(namespace.path, ignore_errors=True)
+
+
+def write(pipe: Connection, namespace: Namespace) -> None:
+    """A driver at 50 Hz, until something comes through the pipe."""
+    random = np.random.default_rng(1)
+    modules = TAXELS // 12 + (TAXELS % 12 > 0)
+    structure = Structure(
+        types=[PRESSURE.measured(unit="counts", scale=-1.0, offset=255.0, minimum=0.0, maximum=255.0)],
+        buses=["bench"],
+        patch_name=[f"board {number}" for number in range(modules // 16 + 1)],
+        patch_bus=np.zeros(modules // 16 + 1, int),
+        module_patch=np.arange(modules) // 16,
+        module_kind=["triangle"] * modules,
+        sensor_uid=np.arange(TAXELS),
+        sensor_type=np.full(TAXELS, PRESSURE.id),
+        sensor_module=MODULE,
+        dtype="u1",
+    )
+    idle = np.round(240 - 0.8 * random.standard_normal((50, TAXELS))).astype(np.uint8)
+    touched = 60 * blobs(random).astype(np.uint8)
+    with DriverWriter("skin", structure, namespace=namespace, rate_hz=RATE_HZ) as writer:
+        next_s, number = time.monotonic(), 0
+        while not pipe.poll():
+            columns = writer.begin()
+            for column in columns.values():
+                column[:] = 0
+            columns["values"][:] = idle[number % 50] - touched * (number > 400 and number % 100 < 50)
+            columns["module_time_ns"][:] = time.monotonic_ns()
+            columns["patch_state"][:] = columns["bus_state"][:] = 1
+            writer.commit(time.monotonic_ns())
+            if number == 0:
+                pipe.send("published")
+            number += 1
+            next_s += 1 / RATE_HZ
+            time.sleep(max(0.0, next_s - time.monotonic()))
+
+
+def calm_down(pipe: Connection, source: Namespace, into: Namespace, state_path: Path, seconds: float) -> None:
+    """The service, measured from the moment at which the rest is known."""
+    begun: list[float] = []
+
+    def look() -> None:
+        ready = calm.status()["ready"].get("pressure", 0) == TAXELS
+        if ready and not begun:
+            begun.extend((time.monotonic(), time.process_time(), calm.frames))
+        elif begun and time.monotonic() - begun[0] > seconds:
+            calm.stop()
+
+    calm = CalmService("skin", namespace=source, into=into, state_path=state_path, on_ready=lambda: pipe.send("ready"))
+    calm.run(look, every_s=0.2)
+    pipe.send((time.process_time() - begun[1], time.monotonic() - begun[0], calm.frames - begun[2]))
+
+
 def worlds(count: int, rates: list[float]) -> None:
     """The marks of all rules."""
     for rate_hz in rates:
@@ -92,13 +175,16 @@ def line(marks: Marks) -> str:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=["speed", "worlds"], help="default: all")
+    parser.add_argument("part", nargs="*", choices=["speed", "service", "worlds"], help="default: all")
     parser.add_argument("--worlds", type=int, default=20, help="of each drift, at each rate")
     parser.add_argument("--rates", default="20,50,100", help="Hz")
+    parser.add_argument("--seconds", type=float, default=20.0, help="how long the service is measured")
     arguments = parser.parse_args()
-    parts = arguments.part or ["speed", "worlds"]
+    parts = arguments.part or ["speed", "service", "worlds"]
     if "speed" in parts:
         speed()
+    if "service" in parts:
+        service(arguments.seconds)
     if "worlds" in parts:
         worlds(arguments.worlds, [float(rate) for rate in arguments.rates.split(",")])
 

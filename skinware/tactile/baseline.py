@@ -239,8 +239,9 @@ class Baseline:
         """
         given = np.asarray(values, np.float32)
         usable = np.isfinite(given) if usable is None else np.isfinite(given) & usable
-        passed_s = 0.0 if self._time_ns is None else max(0, time_ns - self._time_ns) / NS_PER_S
-        self._time_ns = time_ns
+        before_ns = time_ns if self._time_ns is None else self._time_ns
+        self._time_ns = max(time_ns, before_ns)
+        passed_s = (self._time_ns - before_ns) / NS_PER_S
         self._note_absence(usable, passed_s)
         now = self._smoothed(given, usable, passed_s, None if jumped is None else np.asarray(jumped, bool))
         if not self._ready.all() and (usable & ~self._ready).any():
@@ -289,7 +290,7 @@ class Baseline:
             if given is None or given.dtype != array.dtype or given.ndim != 1 or len(given) < m:
                 raise ConfigurationError(f"no state of a baseline: {name} is missing or has a wrong shape or dtype")
         here[here] = state["ready"][rows[here]]
-        for name in ("base", "factor"):
+        for name in learned.keys() - {"noise"}:
             here[here] = np.isfinite(state[name][rows[here]])
         for name, array in learned.items():
             array[here] = state[name][rows[here]]
@@ -379,6 +380,8 @@ class Baseline:
         self._base[taxels] = level[taxels]
         self._noise[taxels] = noise[taxels]
         self._ready |= taxels
+        if self._ready.all():
+            self._measurement = None
         self._set_thresholds()
 
     def _set_thresholds(self) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
@@ -320,6 +324,36 @@ def test_a_drivers_frames_with_their_status() -> None:
     assert np.flatnonzero(calm.value > 90).tolist() == [10]
     assert calm.value[10] == 100
     assert not calm.touched[30:40].any(), "a jump that the hardware tells of"
+
+
+@settings(max_examples=40)
+@given(st.data())
+def test_whatever_comes_nothing_is_raised_and_nothing_is_said_of_the_unknown(data: st.DataObject) -> None:
+    n = data.draw(st.integers(1, 9))
+    module = data.draw(hnp.arrays(np.int64, n, elements=st.integers(0, 2)))
+    patch = data.draw(hnp.arrays(np.int64, n, elements=st.integers(0, 1)))
+    chosen = BaselineSettings(calibrate_s=data.draw(st.sampled_from([0.1, 1])), maximum_hold_s=1)
+    baseline = Baseline(
+        module, patch, chosen, signed=data.draw(st.booleans()), resolution=data.draw(st.sampled_from([0, 1]))
+    )
+    time_ns, ever = 0, np.zeros(n, bool)
+    any_float = st.floats(width=32, allow_infinity=True, allow_nan=True) | st.integers(-300, 300).map(float)
+    with np.errstate(over="ignore", invalid="ignore"):  # of the largest numbers there are
+        for _ in range(data.draw(st.integers(1, 30))):
+            time_ns += data.draw(st.sampled_from([0, 1, 10**7, 10**9, 10**12, -(10**8)]))
+            values = data.draw(hnp.arrays(np.float32, n, elements=any_float))
+            usable = data.draw(hnp.arrays(np.bool_, n))
+            calm = baseline.update(time_ns, values, usable, jumped=data.draw(hnp.arrays(np.bool_, n)))
+            ever |= usable & np.isfinite(values)
+            assert not (calm.touched & ~ever).any()
+            assert not (calm.usable & ~(usable & np.isfinite(values))).any()
+            assert not calm.value[~calm.touched].any()
+            assert len(calm.value) == len(calm.held) == len(calm.baseline) == len(calm.noise) == n
+            if data.draw(st.booleans()):
+                with contextlib.suppress(ConfigurationError):
+                    baseline.tare()
+            if data.draw(st.booleans()):
+                baseline.hold(data.draw(st.booleans()))
 
 
 def test_worlds_with_everything_that_goes_wrong_raise_nothing() -> None:

@@ -300,7 +300,7 @@ class Baseline:
     def _learned(self) -> dict[str, npt.NDArray[Any]]:
         own = {"ready": self._ready, "base": self._base, "noise": self._noise}
         touches, drift = self._touches, self._drift
-        of_touches = {name: getattr(touches, name) for name in ("touched", "level", "contact_s", "settling_s")}
+        of_touches = {name: getattr(touches, name) for name in ("touched", "level", "contact_s", "sunk", "settling_s")}
         of_drift = {name: getattr(drift, name) for name in ("factor", "own", "common", "product", "square", "lag")}
         return own | of_touches | of_drift
 

@@ -9,8 +9,10 @@ import numpy.typing as npt
 
 from skinware.tactile.baseline_settings import BaselineSettings
 
-_LEVEL_RISES_S, _LEVEL_FALLS_S = 0.3, 20.0
+_LEVEL_RISES_S, _LEVEL_FALLS_S = 2.0, 20.0
 """Of the level that a contact is held at: a bump of a moment must not raise it, a weaker grip may become the rule."""
+_JUST_TOUCHED = np.float32(1.5)
+"""Times the threshold: so much a taxel that drifted beyond it a moment ago may show."""
 
 
 class Touches:
@@ -24,6 +26,8 @@ class Touches:
         touched: (n,) bool.
         level: (n,) float32, what the load of each taxel has been in the contact that its module has.
         contact_s: (n,) float32, how long each has been touched.
+        sunk: (n,) float32, how far below its baseline each has been during the contact of its module: what sags comes
+            back.
         settling_s: (n,) float32, for how long each is still held.
         fading_s: (n_modules,) float64, for how long most of the load of each module has been gone.
     """
@@ -36,6 +40,7 @@ class Touches:
         self.touched: npt.NDArray[np.bool_] = np.zeros(n, bool)
         self.level: npt.NDArray[np.float32] = np.zeros(n, np.float32)
         self.contact_s: npt.NDArray[np.float32] = np.zeros(n, np.float32)
+        self.sunk: npt.NDArray[np.float32] = np.zeros(n, np.float32)
         self.settling_s: npt.NDArray[np.float32] = np.zeros(n, np.float32)
         self.fading_s: npt.NDArray[np.float64] = np.zeros(self._n_modules)
 
@@ -101,9 +106,9 @@ class Touches:
         rise, fall = (np.float32(-math.expm1(-passed_s / tau)) for tau in (_LEVEL_RISES_S, _LEVEL_FALLS_S))
         level = (level + (now - level) * np.where(now > level, rise, fall)) * in_contact[module]
         self.level[active] = level
-        fading = np.bincount(module, now, self._n_modules) < settings.release * np.bincount(
-            module, level, self._n_modules
-        )
+        self.sunk = np.maximum(self.sunk, -load) * in_contact[self._module]
+        left, whole = (np.bincount(module, level * of, self._n_modules) for of in (now, level))
+        fading = left < settings.release * whole
         self.fading_s = np.where(fading, self.fading_s + passed_s, 0)
         released = self.fading_s >= settings.release_s
         too_long = self.touched & (self.contact_s > (settings.maximum_hold_s or math.inf))
@@ -111,7 +116,7 @@ class Touches:
             return active[:0]
         self.fading_s[released] = 0
         per_min = on if settings.drift_max_per_min is None else np.float32(settings.drift_max_per_min)
-        is_drift = load < on + per_min * (self.contact_s / 60)
+        is_drift = load < _JUST_TOUCHED * on + per_min * (self.contact_s / 60) + self.sunk
         let_go = (released[self._module] & usable & is_drift) | (too_long & usable)
         self._end(let_go)
         return np.flatnonzero(let_go)
@@ -123,5 +128,5 @@ class Touches:
 
     def _end(self, taxels: npt.NDArray[np.bool_]) -> None:
         self.touched[taxels] = False
-        self.level[taxels] = 0
-        self.contact_s[taxels] = 0
+        for of_contact in (self.level, self.contact_s, self.sunk):
+            of_contact[taxels] = 0

@@ -280,6 +280,28 @@ def test_bumps_do_not_make_a_held_load_look_released() -> None:
     assert all(seen)
 
 
+def test_what_sagged_and_drifted_under_a_long_hold_is_no_contact_afterwards() -> None:
+    bench = Bench()
+    bench.run(6)
+    for _ in range(80):  # taxel 5 drifts by 8 counts on its own, hidden by a sag of 6
+        bench.level[5] += 0.1
+        bench.run(1, on(3) - on(5, load=6))
+    assert not bench.calm.touched[5]
+    bench.run(2)
+    assert not bench.calm.touched.any()
+    assert bench.run(0.3, on(5, load=8)).touched[5], "and it feels as before"
+
+
+def test_a_second_contact_in_the_module_outlives_the_first() -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.run(60, on(3))
+    bench.run(20, on(3, 9))
+    seen: list[bool] = []
+    bench.run(10, on(9), each=lambda calm: seen.append(bool(calm.touched[9])))
+    assert all(seen)
+
+
 def test_settings_can_change_while_it_runs() -> None:
     bench = Bench()
     bench.run(6)

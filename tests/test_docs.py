@@ -20,6 +20,8 @@ import pytest
 
 import skinware
 from skinware import realtime, threads
+from skinware.tactile.chain import ChainSettings
+from skinware.tactile.curves import read_curves
 from skinware.tactile.testing import read_stage
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
@@ -128,13 +130,19 @@ def fenced(page: Path, language: str) -> list[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if fenced(page, "toml")], ids=lambda page: page.stem)
 def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
-    """Geometry, stages and packages are TOML too; their tables tell."""
+    """Geometry, stages, chains, curves and packages are TOML too; their tables tell."""
     file = tmp_path / "page.toml"
     for text in fenced(page, "toml"):
         found = tomllib.loads(text)
         if found.get("format") == "skinware-stage":
             file.write_text(text)
             read_stage(file)
+        elif found.get("format") == "skinware-chain":
+            file.write_text(text)
+            ChainSettings.read(file)
+        elif found.get("format") == "skinware-curves":
+            file.write_text(text)
+            read_curves(file)
         elif not {"project", "group"} & found.keys():
             file.write_text(re.sub(r"^cpus = .*", "", text, flags=re.MULTILINE))  # that this machine may not have
             read = ConfigFile(file)

@@ -1,0 +1,217 @@
+"""Which taxels lie beside each other: from their places, or from pairs that somebody found.
+
+A table of neighbours is (n, k) int32: row i has the taxels beside taxel i in ascending order, then -1 up to the longest
+row. It is symmetric, and no taxel is its own neighbour.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry
+
+NONE = -1
+"""Fills the rows of a table."""
+
+_REACH = 1.8
+"""Of neighbours, in pitches: two rings of a lattice of squares or triangles."""
+_OPPOSITE = -0.2
+"""Taxels whose normals' scalar product is below this lie on different sides of a thin part."""
+_MOST_AT_ONE_PLACE = 32
+"""A place with more taxels is one that a file gives to those whose places it does not know."""
+_MOST_CANDIDATES = 10_000_000
+_MOST_CELLS = 1 << 62
+_PITCH_SAMPLE = 128
+
+Table = npt.NDArray[np.int32]
+
+
+def neighbours(geometry: Geometry, radius_m: float | None = None) -> Table:
+    """(n, k) int32: the taxels within a radius of each other, of one frame, and not on opposite sides of a part.
+
+    Taxels at one place are neighbours. One whose place is not known has none, nor has one of more than 32 that share
+    a place: no skin has that, but files do where nobody knew better.
+
+    Args:
+        geometry: places of the n taxels, in their order.
+        radius_m: m; default: in each frame 1.8 times its pitch (:func:`pitch_m`).
+
+    Raises:
+        ConfigurationError: a radius that is not above 0, or so large that nearly all taxels are neighbours; places too
+            far apart for it.
+    """
+    n = len(geometry)
+    if radius_m is None:
+        radius = pitch_m(geometry) * _REACH
+        radius[np.isnan(radius)] = 1.0  # one place in the frame, or none
+    elif 0 < radius_m < np.inf:
+        radius = np.full(n, float(radius_m))
+    else:
+        raise ConfigurationError(f"neighbours within {radius_m} m: give a radius above 0")
+    rows, frame = _placed(geometry)
+    one, other = _pairs_within_1(frame, geometry.position_m[rows] / radius[rows, None])
+    return _table(*_on_one_side(geometry.normal, rows[one], rows[other]), n)
+
+
+def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:
+    """(n, k) int32: a table of neighbours from a topology.
+
+    Args:
+        pairs: (m, 2) integers, taxels that lie beside each other, in any order and any number of times.
+        n: number of taxels.
+
+    Raises:
+        ConfigurationError: not pairs of integers from 0 to n - 1.
+    """
+    given = np.asarray(pairs)
+    if not given.size:
+        given = np.zeros((0, 2), np.int64)
+    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iu":
+        raise ConfigurationError(f"pairs of neighbours: give (m, 2) integers, not {given.shape} of {given.dtype}")
+    outside = ((given < 0) | (given >= n)).any(axis=1)
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise ConfigurationError(f"pair {row} of neighbours, {given[row].tolist()}: there are only {n} taxels")
+    one, other = given.astype(np.int64).T
+    return _table(one[one != other], other[one != other], n)
+
+
+def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
+    """(n,) m: the pitch of each taxel's frame, the median distance from a place to the nearest other on its side.
+
+    NaN where the place is not known, or is the only one of its frame.
+    """
+    pitch = np.full(len(geometry), np.nan)
+    rows, frame = _placed(geometry)
+    for number in np.unique(frame):
+        of_frame = rows[frame == number]
+        places, first = np.unique(geometry.position_m[of_frame], axis=0, return_index=True)
+        pitch[of_frame] = _median_distance(places, geometry.normal[of_frame[first]])
+    return pitch
+
+
+def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
+    """(n,) m2: the area of skin that each taxel stands for, an estimate from the pitch of its frame.
+
+    A frame is taken for a lattice of triangles where enough places have five or more others at the pitch, else for one
+    of squares. Taxels at one place share its area. NaN where :func:`pitch_m` is.
+    """
+    area = np.full(len(geometry), np.nan)
+    rows, frame = _placed(geometry)
+    if not len(rows):
+        return area
+    pitch = pitch_m(geometry)[rows]
+    places, first, place, sharing = np.unique(
+        np.column_stack([frame, geometry.position_m[rows]]),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
+    )
+    at_pitch = places[:, 1:] / np.where(np.isnan(pitch), 1.0, 1.2 * pitch)[first, None]
+    one, other = _on_one_side(geometry.normal[rows[first]], *_pairs_within_1(frame[first], at_pitch))
+    beside = np.bincount(np.concatenate([one, other]), minlength=len(places))
+    for number in np.unique(frame):
+        is_triangles = np.percentile(beside[frame[first] == number], 90, method="higher") >= 5
+        of_frame = frame == number
+        area[rows[of_frame]] = pitch[of_frame] ** 2 * (np.sqrt(0.75) if is_triangles else 1.0)
+    area[rows] /= sharing[place.reshape(-1)]
+    return area
+
+
+def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The rows of taxels with a place of their own, and the number of the frame of each."""
+    rows = np.flatnonzero(np.isfinite(geometry.position_m).all(axis=1))
+    _, frame = np.unique(geometry.frame[rows].astype(str), return_inverse=True)
+    if not len(rows):
+        return rows, frame
+    _, place, sharing = np.unique(
+        np.column_stack([frame, geometry.position_m[rows]]), axis=0, return_inverse=True, return_counts=True
+    )
+    own = sharing[place.reshape(-1)] <= _MOST_AT_ONE_PLACE
+    return rows[own], frame[own]
+
+
+def _on_one_side(
+    normal: npt.NDArray[np.float64], one: npt.NDArray[np.int64], other: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The pairs that do not lie on opposite sides of a part; where a normal is not known, nobody can tell."""
+    opposite = np.einsum("ij,ij->i", normal[one], normal[other]) < _OPPOSITE
+    return one[~opposite], other[~opposite]
+
+
+def _median_distance(places: npt.NDArray[np.float64], normal: npt.NDArray[np.float64]) -> float:
+    """From a place to the nearest other one on its side, m, judged by a sample; NaN if there is none."""
+    sample = np.unique(np.linspace(0, len(places) - 1, _PITCH_SAMPLE).astype(np.int64))
+    squares = np.zeros((len(sample), len(places)))
+    for axis in range(3):
+        squares += (places[sample, axis, None] - places[None, :, axis]) ** 2
+    squares[np.arange(len(sample)), sample] = np.inf
+    squares[normal[sample] @ normal.T < _OPPOSITE] = np.inf
+    nearest = squares.min(axis=1)
+    return float(np.sqrt(np.median(nearest[np.isfinite(nearest)]))) if np.isfinite(nearest).any() else np.nan
+
+
+def _pairs_within_1(
+    frame: npt.NDArray[np.int64], places: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """All pairs of rows of one frame whose places are at most 1 apart, each pair once.
+
+    The places are sorted into cells of side 1; the cells of a column along z follow each other in the order of their
+    keys, so that one search finds three of them.
+    """
+    nothing = np.zeros(0, np.int64)
+    if not len(places):
+        return nothing, nothing
+    corner = places - places.min(axis=0)
+    sizes = [int(size) + 4 for size in corner.max(axis=0)]
+    if (int(frame.max()) + 1) * sizes[0] * sizes[1] * sizes[2] > _MOST_CELLS:
+        raise ConfigurationError("places too far apart for the radius of neighbours: is one of them not in metres?")
+    x, y, z = corner.astype(np.int64).T + 1
+    key = ((frame * sizes[0] + x) * sizes[1] + y) * sizes[2] + z
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    ones, others, count = [], [], 0
+    for column in (0, sizes[2], sizes[1] * sizes[2], (sizes[1] - 1) * sizes[2], (sizes[1] + 1) * sizes[2]):
+        first = np.searchsorted(key, key + column - 1) if column else np.arange(1, len(key) + 1)
+        last = np.searchsorted(key, key + column + 1, side="right")
+        length = last - first
+        count += int(length.sum())
+        if count > _MOST_CANDIDATES:
+            raise ConfigurationError("nearly all taxels are neighbours: give a smaller radius")
+        ones.append(np.repeat(np.arange(len(key)), length))
+        others.append(np.arange(len(ones[-1])) + np.repeat(first - (np.cumsum(length) - length), length))
+    one, other = order[np.concatenate(ones)], order[np.concatenate(others)]
+    near = ((places[one] - places[other]) ** 2).sum(axis=1) <= 1.0
+    return one[near], other[near]
+
+
+def _table(one: npt.NDArray[np.int64], other: npt.NDArray[np.int64], n: int) -> Table:
+    """The table of pairs, each given at least once in one direction."""
+    pairs = np.unique(np.concatenate([one * n + other, other * n + one]))
+    row, neighbour = pairs // max(n, 1), pairs % max(n, 1)
+    count = np.bincount(row, minlength=n)
+    table = np.full((n, int(count.max(initial=0))), NONE, np.int32)
+    table[row, np.arange(len(row)) - (np.cumsum(count) - count)[row]] = neighbour
+    return table
+
+
+def checked(table: npt.NDArray[Any], n: int) -> Table:
+    """A table of neighbours of n taxels, made symmetric.
+
+    Raises:
+        ConfigurationError: it is none: another number of rows, or numbers outside -1 to n - 1.
+    """
+    if table.ndim != 2 or len(table) != n or table.dtype.kind not in "iu":
+        raise ConfigurationError(
+            f"neighbours of {n} taxels: give ({n}, k) integers, not {table.shape} of {table.dtype}"
+        )
+    row, column = np.nonzero(table != NONE)
+    return neighbours_of_pairs(np.column_stack([row, table[row, column].astype(np.int64)]), n)
+
+
+__all__ = ["NONE", "Table", "area_m2", "checked", "neighbours", "neighbours_of_pairs", "pitch_m"]

@@ -1,0 +1,274 @@
+"""Contacts: touched taxels that hang together, what they measure, and which they were in the frames before.
+
+From values and a table of neighbours to contacts::
+
+    contacts = Contacts(len(geometry), neighbours(geometry), geometry)
+    for time_ns, value, touched in ...:
+        for contact in contacts.update(value, touched, time_ns):
+            print(contact.id, contact.cop_m, contact.load, contact.taxels)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry
+from skinware.tactile.components import Components
+from skinware.tactile.neighbours import area_m2, pitch_m
+from skinware.tactile.tracking import Places, Tracker, TrackingSettings
+
+MOST = 64
+"""Contacts that one frame has at most; of more the ones with the largest loads are kept."""
+NO_CONTACT, BEYOND = -1, -2
+"""In ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
+
+_FORCE_UNIT = "Pa"
+_REACH_PITCHES = 2.3
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """One contact.
+
+    Attributes:
+        id: the same as long as it lasts, and over gaps of 60 ms.
+        age_s: since it began, s.
+        load: sum of the values of its taxels, in the unit of the values.
+        peak: the largest of them.
+        n: number of its taxels.
+        area_m2: that they stand for, m2; NaN without places.
+        cop_m: (3,) m, its centre: the mean of the places, weighted by the values; NaN without places.
+        normal: (3,) of length 1, outwards, likewise; NaN if it is not known.
+        force_n: pressure by area, along the normal, N; NaN unless the values are pressures in Pa at known places.
+        frame: name of the coordinate frame, empty if it is not known.
+        velocity_m_s: (3,) m/s, of the centre; NaN without places.
+        taxels: (n,) int64, positions among the n taxels, ascending.
+    """
+
+    id: int
+    age_s: float
+    load: float
+    peak: float
+    n: int
+    area_m2: float
+    cop_m: npt.NDArray[np.float32]
+    normal: npt.NDArray[np.float32]
+    force_n: float
+    frame: str
+    velocity_m_s: npt.NDArray[np.float32]
+    taxels: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSet:
+    """All m contacts of one frame, the oldest first; a sequence of :class:`Contact`.
+
+    Attributes:
+        id: (m,) uint32.
+        age_s, load, peak, area_m2, force_n: (m,) float32.
+        n: (m,) uint32.
+        cop_m, normal, velocity_m_s: (m, 3) float32.
+        frame: (m,) int16, index into ``frames``; -1 if it is not known.
+        contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one of those for which there was no
+            room.
+        beyond: number of contacts for which there was no room.
+        frames: names of the coordinate frames.
+    """
+
+    id: npt.NDArray[np.uint32]
+    age_s: npt.NDArray[np.float32]
+    load: npt.NDArray[np.float32]
+    peak: npt.NDArray[np.float32]
+    n: npt.NDArray[np.uint32]
+    area_m2: npt.NDArray[np.float32]
+    cop_m: npt.NDArray[np.float32]
+    normal: npt.NDArray[np.float32]
+    force_n: npt.NDArray[np.float32]
+    frame: npt.NDArray[np.int16]
+    velocity_m_s: npt.NDArray[np.float32]
+    contact_of: npt.NDArray[np.int16]
+    beyond: int
+    frames: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def __getitem__(self, row: int) -> Contact:
+        row = range(len(self))[row]
+        frame = int(self.frame[row])
+        return Contact(
+            frame=self.frames[frame] if frame >= 0 else "",
+            taxels=np.flatnonzero(self.contact_of == row),
+            **{name: getattr(self, name)[row].item() for name in ("id", "n", *_SCALARS)},
+            **{name: getattr(self, name)[row] for name in _VECTORS},
+        )
+
+    def __iter__(self) -> Iterator[Contact]:
+        return (self[row] for row in range(len(self)))
+
+
+_SCALARS = ("age_s", "load", "peak", "area_m2", "force_n")
+_VECTORS = ("cop_m", "normal", "velocity_m_s")
+COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "id": ("<u4", ()),
+    **dict.fromkeys(_SCALARS, ("<f4", ())),
+    "n": ("<u4", ()),
+    **dict.fromkeys(_VECTORS, ("<f4", (3,))),
+    "frame": ("<i2", ()),
+}
+"""Per contact: dtype and shape of each array of a :class:`ContactSet`."""
+
+
+class Contacts:
+    """Finds and follows the contacts of n taxels.
+
+    Args:
+        n: number of taxels.
+        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows; None: nobody knows.
+        geometry: places of the n taxels; None, or NaN in it: not known. Contacts then have no centre.
+        module: (n,) int, module of each taxel; touched taxels that have no neighbours are one contact by module.
+        unit: of the values; a force is told where it is ``Pa``.
+        tracking: how contacts are followed; default: by the pitch of the geometry.
+
+    Raises:
+        ConfigurationError: something is not of n taxels.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        neighbours: npt.NDArray[Any] | None = None,
+        geometry: Geometry | None = None,
+        *,
+        module: npt.NDArray[Any] | None = None,
+        unit: str = "",
+        tracking: TrackingSettings | None = None,
+    ) -> None:
+        for what, given in (("places", geometry), ("modules", module)):
+            if given is not None and len(given) != n:
+                raise ConfigurationError(f"contacts of {n} taxels: the {what} are of {len(given)}")
+        self._n = n
+        self._components = Components(n, neighbours, module)
+        geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
+        self._position_m, self._normal = np.nan_to_num(geometry.position_m), np.nan_to_num(geometry.normal)
+        self._area_m2 = area_m2(geometry)
+        self._is_pressure = unit == _FORCE_UNIT
+        known = np.isfinite(geometry.position_m).all(axis=1)
+        names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
+        self.frames: tuple[str, ...] = tuple(names.tolist())
+        self._frame = np.full(n, -1, np.int64)
+        self._frame[known] = number
+        self._tracker = Tracker(n, tracking or _tracking(geometry))
+
+    def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
+        """The contacts of the next frame.
+
+        Args:
+            value: (n,) calmed values: 0 = no touch. What is below 0 or not finite counts as 0.
+            touched: (n,) bool, which taxels are touched.
+            time_ns: when the frame was acquired, CLOCK_MONOTONIC ns.
+
+        Raises:
+            ConfigurationError: not of n taxels.
+        """
+        if np.shape(value) != (self._n,) or np.shape(touched) != (self._n,):
+            shapes = f"values of {np.shape(value)}, touched of {np.shape(touched)}"
+            raise ConfigurationError(f"contacts of {self._n} taxels: {shapes}")
+        taxels = np.flatnonzero(touched)
+        contact, count = self._components.of(taxels)
+        load = _load(value[taxels])
+        contact_of = np.full(self._n, NO_CONTACT, np.int16)
+        beyond = max(0, count - MOST)
+        if beyond:
+            contact_of[taxels] = BEYOND
+            taxels, contact, load = _largest(taxels, contact, load, count)
+            count = MOST
+        found = self._measure(taxels, contact, load, count)
+        places = Places(taxels, contact, found["load"], found["frame"], found["cop_m"])
+        found["id"], found["age_s"], found["velocity_m_s"] = self._tracker.follow(places, time_ns)
+        order = np.lexsort([found["id"], -found["age_s"]])
+        row = np.empty(count, np.int64)
+        row[order] = np.arange(count)
+        contact_of[taxels] = row[contact]
+        columns = {name: found[name][order].astype(dtype) for name, (dtype, _) in COLUMNS.items()}
+        return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
+
+    def _measure(
+        self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
+    ) -> dict[str, npt.NDArray[Any]]:
+        """What each of ``count`` contacts measures, from its taxels with a place and a value."""
+
+        def total(of_taxel: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+            return np.bincount(contact, of_taxel, count).astype(np.float64)  # of nothing it is integers
+
+        peak = np.zeros(count)
+        np.maximum.at(peak, contact, load)
+        frame = self._frame_of(taxels, contact, load, count)
+        counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0)
+        weight = np.where(counts, load, 0.0)
+        weight += counts * (total(weight) == 0)[contact]  # no load at all: each taxel alike
+        weights = total(weight)
+        weights[weights == 0] = np.nan
+        cop_m = np.column_stack([total(weight * self._position_m[taxels, axis]) / weights for axis in range(3)])
+        normal = np.column_stack([total(weight * self._normal[taxels, axis]) for axis in range(3)])
+        length = np.linalg.norm(normal, axis=1)
+        area = self._area_m2[taxels]
+        has_area = total(np.isfinite(area).astype(float)) > 0
+        area = np.nan_to_num(area)
+        return {
+            "load": total(load),
+            "peak": peak,
+            "n": np.bincount(contact, minlength=count),
+            "area_m2": np.where(has_area, total(area), np.nan),
+            "force_n": np.where(has_area & self._is_pressure, total(load * area), np.nan),
+            "cop_m": cop_m,
+            "normal": normal / np.where(length > 0, length, np.nan)[:, None],
+            "frame": frame,
+        }
+
+    def _frame_of(
+        self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
+    ) -> npt.NDArray[np.int64]:
+        """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
+        placed = np.flatnonzero(self._frame[taxels] >= 0)
+        order = placed[np.argsort(load[placed], kind="stable")]
+        frame = np.full(count, -1)
+        frame[contact[order]] = self._frame[taxels[order]]  # the largest comes last, and stays
+        return frame
+
+
+def _load(value: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    load = value.astype(np.float64)
+    return np.where(np.isfinite(load) & (load > 0), load, 0.0)
+
+
+def _largest(
+    taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """The taxels of the ``MOST`` contacts with the largest loads, which are counted anew."""
+    loads = np.bincount(contact, load, count)
+    kept = np.sort(np.argsort(-loads, kind="stable")[:MOST])
+    number = np.full(count, -1)
+    number[kept] = np.arange(MOST)
+    number = number[contact]
+    is_kept = number >= 0
+    return taxels[is_kept], number[is_kept], load[is_kept]
+
+
+def _tracking(geometry: Geometry) -> TrackingSettings:
+    """Distances that fit the skin's pitch."""
+    pitch = pitch_m(geometry)
+    if np.isnan(pitch).all():
+        return TrackingSettings()
+    median_m = float(np.nanmedian(pitch))
+    return dataclasses.replace(TrackingSettings(), reach_m=_REACH_PITCHES * median_m, fast_m=median_m)
+
+
+__all__ = ["BEYOND", "COLUMNS", "MOST", "NO_CONTACT", "Contact", "ContactSet", "Contacts"]

@@ -1,0 +1,221 @@
+"""Which contact of a frame is which of the frames before: identities that last through gaps, splits and crossings."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.realtime import NS_PER_S
+from skinware.tactile.assignment import Gains, assign
+
+Floats = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.int64]
+
+_STRONG, _WEAK, _NEAR = 5.0, 1.5, 0.1
+"""What a pair gains for sharing half of the smaller one's taxels, for sharing any, and for being near: so that one of a
+higher kind outweighs two of the next."""
+_PREFERENCE = 0.2
+"""For the oldest track and for the largest contact. As they go to all pairs alike, they only decide who is left out:
+where contacts merge the younger identity, where one splits the smaller part."""
+_CLOSENESS = 0.001
+"""For sharing all taxels: decides between pairs of the same kind, never against a preference."""
+_NEARNESS, _PRESENCE = 0.4, 0.2
+"""For being just where a contact was expected, and for one that was there in the last frame: where no taxels are
+shared, or the contact is so fast that they tell nothing."""
+_DOUBT = 0.5
+"""So much of the way that a contact should have gone it may be off."""
+_LONGEST_GUESS_S = 0.1
+_LAST_ID = (1 << 32) - 1
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How contacts are followed.
+
+    Attributes:
+        patience_s: so long an identity is kept while its contact is gone, s.
+        reach_m: so far a contact may jump from where it was expected without sharing a taxel, m.
+        fast_m: one that is expected to move farther in a frame is judged by its expected place first, m.
+        velocity_s: time constant of its velocity, s.
+    """
+
+    patience_s: float = 0.06
+    reach_m: float = 0.015
+    fast_m: float = 0.0065
+    velocity_s: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the m contacts of a frame are.
+
+    Attributes:
+        taxels: (a,) int64, the taxels of all of them.
+        contact: (a,) int64, which contact each belongs to.
+        load: (m,) of each contact.
+        frame: (m,) int64, number of its coordinate frame, -1 for none.
+        cop_m: (m, 3) m, its centre; NaN if it is not known.
+    """
+
+    taxels: Whole
+    contact: Whole
+    load: Floats
+    frame: Whole
+    cop_m: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """All identities, one row each: those of the newest frame in its order, then those whose contacts are gone."""
+
+    id: Whole
+    born_ns: Whole
+    gone_ns: Whole
+    """Since when the contact is gone; 0 if it is there."""
+    seen_ns: Whole
+    size: Whole
+    frame: Whole
+    cop_m: Floats
+    velocity_m_s: Floats
+    steps: Whole
+    """Number of moves in the velocity."""
+
+    def __getitem__(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> _Tracks:
+        return _Tracks(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
+
+    def and_then(self, others: _Tracks) -> _Tracks:
+        pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in dataclasses.fields(self))
+        return _Tracks(*(np.concatenate(pair) for pair in pairs))
+
+
+class Tracker:
+    """Gives contacts their identities, frame by frame.
+
+    Args:
+        n: number of taxels.
+        settings: how.
+    """
+
+    def __init__(self, n: int, settings: TrackingSettings | None = None) -> None:
+        self._settings = settings or TrackingSettings()
+        none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
+        self._tracks = _Tracks(none, none, none, none, none, none, nowhere, nowhere, none)
+        self._track_of = np.full(n, -1, np.int64)
+        self._last_id = 0
+        self._time_ns: int | None = None
+
+    def follow(self, places: Places, time_ns: int) -> tuple[Whole, Floats, Floats]:
+        """Identities of the contacts of the next frame.
+
+        Returns:
+            (m,) int64 id, from 1 on, never given again until 2**32 were; (m,) s, age; (m, 3) m/s, velocity, NaN where
+            the centre is not known.
+        """
+        self._forget(time_ns)
+        tracks, size = self._tracks, np.bincount(places.contact, minlength=len(places.load))
+        shared = self._shared(places)
+        overlap = shared / np.maximum(np.minimum(tracks.size[:, None], size), 1)
+        expected_m = self._expected_m(time_ns)
+        known, found = assign(self._gains(overlap, expected_m, places))
+        now = _Tracks(
+            id=np.zeros(len(size), np.int64),
+            born_ns=np.full(len(size), time_ns),
+            gone_ns=np.zeros(len(size), np.int64),
+            seen_ns=np.full(len(size), time_ns),
+            size=size,
+            frame=places.frame,
+            cop_m=places.cop_m,
+            velocity_m_s=np.where(np.isnan(places.cop_m), np.nan, 0.0),
+            steps=np.zeros(len(size), np.int64),
+        )
+        now.id[found], now.born_ns[found] = tracks.id[known], tracks.born_ns[known]
+        self._name(now.id)
+        is_joined = overlap >= 0.5
+        is_whole = (is_joined.sum(axis=1)[known] <= 1) & (is_joined.sum(axis=0)[found] <= 1)
+        self._move(now, found, known, is_whole)
+        self._keep(now, places, known, time_ns)
+        return now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s
+
+    def _forget(self, time_ns: int) -> None:
+        """Let go of the identities whose contacts have been gone for too long."""
+        tracks = self._tracks
+        period_ns = 0 if self._time_ns is None else max(0, time_ns - self._time_ns)
+        self._time_ns = time_ns
+        # half a period more: the frames of 60 ms at 50 Hz are three, whatever they vary in time
+        patience_ns = self._settings.patience_s * NS_PER_S + period_ns / 2
+        keep = (tracks.gone_ns == 0) | (time_ns - tracks.gone_ns <= patience_ns)
+        if not keep.all():
+            number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
+            self._tracks, self._track_of = tracks[keep], number[self._track_of]
+
+    def _shared(self, places: Places) -> Whole:
+        """(tracks, m): how many taxels each contact has of those that each track had last."""
+        count = len(places.load)
+        track = self._track_of[places.taxels]
+        is_known = track >= 0
+        pair = track[is_known] * count + places.contact[is_known]
+        return np.bincount(pair, minlength=len(self._tracks.id) * count).reshape(len(self._tracks.id), count)
+
+    def _expected_m(self, time_ns: int) -> Floats:
+        """(tracks, 3) m: how far each track has moved on since it was seen, if it went on as it did."""
+        passed_s = np.minimum((time_ns - self._tracks.seen_ns) / NS_PER_S, _LONGEST_GUESS_S)
+        return self._tracks.velocity_m_s * passed_s[:, None]
+
+    def _gains(self, overlap: Floats, expected_m: Floats, places: Places) -> Gains:
+        """(tracks, m): what each pair gains; 0: they cannot be the same."""
+        tracks, settings = self._tracks, self._settings
+        away_m = np.linalg.norm((tracks.cop_m + expected_m)[:, None] - places.cop_m, axis=2)
+        way_m = np.nan_to_num(np.linalg.norm(expected_m, axis=1))[:, None]
+        reach_m = settings.reach_m + _DOUBT * way_m
+        is_near = (away_m <= reach_m) & (tracks.frame[:, None] == places.frame)
+        is_fast = way_m > settings.fast_m
+        nearness = np.where(is_near, 1 - (away_m / reach_m) ** 2, 0.0)
+        is_sharing = (overlap > 0) & ~(is_fast & is_near)
+        sharing = np.where(overlap >= 0.5, _STRONG, _WEAK) + _CLOSENESS * overlap
+        sharing += _PREFERENCE * (1 - _rank(tracks.born_ns)[:, None] + _rank(places.load))
+        near = _NEAR + _NEARNESS * nearness + _PRESENCE * (tracks.gone_ns == 0)[:, None]
+        return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
+
+    def _name(self, identity: Whole) -> None:
+        """Give those that have the number 0 new ones."""
+        for row in np.flatnonzero(identity == 0).tolist():
+            self._last_id = self._last_id % _LAST_ID + 1
+            identity[row] = self._last_id
+
+    def _move(self, now: _Tracks, found: Whole, known: Whole, is_whole: npt.NDArray[np.bool_]) -> None:
+        """Velocities of contacts that go on. Where they merge or split, their centres jump: the velocity is kept."""
+        tracks = self._tracks
+        now.velocity_m_s[found], now.steps[found] = tracks.velocity_m_s[known], tracks.steps[known]
+        passed_s = (now.seen_ns[found] - tracks.seen_ns[known]) / NS_PER_S
+        moved = is_whole & (passed_s > 0) & (tracks.frame[known] == now.frame[found])
+        found, known, passed_s = found[moved], known[moved], passed_s[moved]
+        velocity = (now.cop_m[found] - tracks.cop_m[known]) / passed_s[:, None]
+        now.steps[found] += 1
+        weight = np.maximum(1 - np.exp(-passed_s / self._settings.velocity_s), 1 / now.steps[found])[:, None]
+        before = np.nan_to_num(now.velocity_m_s[found])
+        now.velocity_m_s[found] = before + weight * (velocity - before)
+
+    def _keep(self, now: _Tracks, places: Places, known: Whole, time_ns: int) -> None:
+        """Remember this frame, and those whose contacts are gone."""
+        tracks = self._tracks
+        is_gone = np.ones(len(tracks.id), bool)
+        is_gone[known] = False
+        gone = tracks[is_gone]
+        gone.gone_ns[gone.gone_ns == 0] = time_ns
+        number = np.append(np.where(is_gone, len(now.id) + np.cumsum(is_gone) - 1, -1), -1)
+        self._track_of = number[self._track_of]
+        self._track_of[places.taxels] = places.contact
+        self._tracks = now.and_then(gone)
+
+
+def _rank(numbers: Floats | Whole) -> Floats:
+    """From 0 for the smallest to 1 for the largest."""
+    rank = np.zeros(len(numbers))
+    rank[np.argsort(numbers, kind="stable")] = np.linspace(0, 1, len(numbers)) if len(numbers) else 0.0
+    return rank
+
+
+__all__ = ["Places", "Tracker", "TrackingSettings"]

@@ -1,0 +1,224 @@
+"""Identities of contacts: through gaps, past each other, when they merge and split."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skinware.tactile.contacts import Contacts, ContactSet
+from skinware.tactile.neighbours import neighbours
+from tests.tactile.skins import PITCH_M, placed, pressed, triangles
+
+FLAT = triangles(30, 40)
+NEIGHBOURS = neighbours(placed(FLAT))
+NARROW_M = 0.62 * PITCH_M
+"""A place touches one taxel or two; 3 pitches apart two places have no neighbours in common."""
+
+
+class Scene:
+    """Fingers on a flat skin, frame by frame."""
+
+    def __init__(self, rate_hz: float = 50.0, *, without_places: bool = False) -> None:
+        geometry = None if without_places else placed(FLAT)
+        self.contacts = Contacts(len(FLAT), NEIGHBOURS, geometry)
+        self.period_ns = round(1e9 / rate_hz)
+        self.time_ns = 1_000_000_000
+
+    def show(self, *at_m: npt.ArrayLike, radius_m: float = NARROW_M) -> ContactSet:
+        """The contacts of fingers at these places."""
+        self.time_ns += self.period_ns
+        value = pressed(FLAT, np.array(at_m, float).reshape(-1, 3), radius_m)
+        return self.contacts.update(value, value > 0, self.time_ns)
+
+
+def identity_at(found: ContactSet, at_m: npt.ArrayLike) -> int:
+    """Of the contact whose centre is at a place, to within a pitch."""
+    away_m = np.linalg.norm(found.cop_m - np.array(at_m), axis=1)
+    assert away_m.min() < PITCH_M
+    return int(found.id[away_m.argmin()])
+
+
+def beside(place_m: npt.NDArray[np.float64], x_m: float) -> npt.NDArray[np.float64]:
+    moved_m: npt.NDArray[np.float64] = place_m + np.array([x_m, 0.0, 0.0])
+    return moved_m
+
+
+HERE, THERE = np.array([0.05, 0.05, 0.0]), np.array([0.15, 0.1, 0.0])
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 100, 500])
+@pytest.mark.parametrize("without_places", [False, True])
+def test_an_identity_lasts_through_60_ms(rate_hz: float, without_places: bool) -> None:
+    scene = Scene(rate_hz, without_places=without_places)
+    first = scene.show(HERE).id.tolist()
+    for _ in range(round(0.06 * rate_hz)):
+        assert len(scene.show()) == 0
+    assert scene.show(HERE).id.tolist() == first
+    for _ in range(round(0.06 * rate_hz) + 2):
+        scene.show()
+    assert scene.show(HERE).id.tolist() != first
+
+
+def test_a_frame_that_comes_late_does_not_end_a_gap() -> None:
+    scene = Scene()
+    first = scene.show(HERE).id.tolist()
+    for _ in range(3):
+        scene.show()
+    scene.time_ns += 5_000_000
+    assert scene.show(HERE).id.tolist() == first
+
+
+def test_it_may_move_on_in_a_gap() -> None:
+    scene = Scene()
+    velocity_m = np.array([0.004, 0, 0])  # in a frame
+    for k in range(6):
+        first = scene.show(HERE + k * velocity_m).id.tolist()
+    for _ in range(3):
+        scene.show()
+    assert scene.show(HERE + 9 * velocity_m).id.tolist() == first
+
+
+def test_age_begins_with_the_contact() -> None:
+    scene = Scene()
+    assert scene.show(HERE).age_s.tolist() == [0]
+    scene.show(HERE)
+    scene.show()
+    assert scene.show(HERE, THERE).age_s.tolist() == pytest.approx([0.06, 0])
+
+
+lanes = st.lists(
+    st.tuples(
+        st.floats(0.05, 0.2),  # start, m
+        st.floats(-0.5, 0.5),  # speed, m/s
+        st.lists(st.tuples(st.integers(8, 40), st.integers(1, 3)), max_size=2),  # gaps: first frame and length
+    ),
+    min_size=2,
+    max_size=5,
+)
+
+
+@settings(max_examples=60)
+@given(lanes)
+def test_contacts_3_pitches_apart_are_never_swapped(lanes: list[tuple[float, float, list[tuple[int, int]]]]) -> None:
+    """They pass each other, in lanes 3 pitches apart; each may be gone for 3 frames at a time."""
+    scene = Scene()
+    x = np.array([start for start, _, _ in lanes])
+    y = 0.02 + 3 * PITCH_M * np.arange(len(lanes))
+    speed = np.array([speed for _, speed, _ in lanes])
+    identity: dict[int, int] = {}
+    last_seen = dict.fromkeys(range(len(lanes)), 0)
+    for frame in range(45):
+        x = x + np.minimum(frame / 10, 1) * speed * 0.02  # it takes 0.2 s to get going
+        speed = np.where(((x < 0.02) & (speed < 0)) | ((x > 0.23) & (speed > 0)), 0, speed)
+        is_there = [not any(first <= frame < first + length for first, length in gaps) for _, _, gaps in lanes]
+        shown = [lane for lane in range(len(lanes)) if is_there[lane]]
+        at_m = np.array([[x[lane], y[lane], 0] for lane in shown]).reshape(-1, 3)
+        found = scene.show(*at_m)
+        assert len(found) == len(shown)
+        for lane, place in zip(shown, at_m, strict=True):
+            now = identity_at(found, place)
+            if frame - last_seen[lane] <= 4:
+                assert identity.setdefault(lane, now) == now
+            identity[lane], last_seen[lane] = now, frame
+        assert len(set(identity.values())) == len(lanes)
+
+
+def test_two_fingers_in_one_line_do_not_take_each_others_places() -> None:
+    """One arrives in every frame where the other was."""
+    scene = Scene()
+    apart_m, x = 3 * PITCH_M, 0.02
+    first = scene.show([x, 0.05, 0], [x + apart_m, 0.05, 0]).id.tolist()
+    for step_m in [*np.linspace(0.001, apart_m, 12), apart_m, apart_m, apart_m]:
+        x += step_m
+        at_m = [x, 0.05, 0], [x + apart_m, 0.05, 0]
+        found = scene.show(*at_m)
+        assert [identity_at(found, place) for place in at_m] == first
+
+
+def test_where_contacts_merge_the_older_identity_stays() -> None:
+    scene = Scene()
+    right_m = beside(THERE, 0.03)
+    small = scene.show(THERE).id.tolist()
+    both = scene.show(THERE, *(right_m + [[0, 0.006 * k, 0] for k in range(4)]))
+    assert both.n[0] < both.n[1]
+    between = np.linspace(THERE, right_m, 8)
+    merged = scene.show(*between, *(right_m + [[0, 0.006 * k, 0] for k in range(4)]))
+    assert merged.id.tolist() == small
+
+
+def test_where_a_contact_splits_the_larger_part_keeps_its_identity() -> None:
+    scene = Scene()
+    line = np.linspace(THERE, beside(THERE, 0.06), 13)
+    whole = scene.show(*line)
+    assert len(whole) == 1
+    parts = scene.show(*line[:3], *line[7:])
+    assert len(parts) == 2
+    assert parts.id[0] == whole.id[0]
+    assert parts.n[0] > parts.n[1]
+
+
+def test_a_bridge_of_one_frame_changes_nothing() -> None:
+    scene = Scene()
+    right_m = beside(HERE, 4 * PITCH_M)
+    first = scene.show(HERE, right_m).id.tolist()
+    scene.show(HERE, right_m)
+    assert len(scene.show(*np.linspace(HERE, right_m, 9))) == 1
+    found = scene.show(HERE, right_m)
+    assert [identity_at(found, place) for place in (HERE, right_m)] == first
+
+
+def test_the_velocity_is_that_of_the_centre() -> None:
+    scene = Scene()
+    velocity = np.array([0.04, 0.02, 0])
+    for k in range(60):
+        found = scene.show(HERE + k * 0.02 * velocity, radius_m=3 * PITCH_M)
+    assert np.allclose(found.velocity_m_s[0], velocity, atol=0.006)
+    for _ in range(60):
+        found = scene.show(HERE + 59 * 0.02 * velocity, radius_m=3 * PITCH_M)
+    assert np.allclose(found.velocity_m_s[0], 0, atol=0.001)
+
+
+def test_a_contact_that_grows_at_once_does_not_fly() -> None:
+    """A merger moves the centre, and nothing has moved."""
+    scene = Scene()
+    right_m = beside(HERE, 0.05)
+    for _ in range(10):
+        scene.show(HERE, right_m, radius_m=2 * PITCH_M)
+    found = scene.show(*np.linspace(HERE, right_m, 9), radius_m=2 * PITCH_M)
+    assert len(found) == 1
+    assert np.linalg.norm(found.velocity_m_s[0]) < 0.01
+
+
+def test_time_that_stands_still_or_goes_back_is_borne() -> None:
+    scene = Scene()
+    first = scene.show(HERE).id.tolist()
+    scene.time_ns -= scene.period_ns
+    assert scene.show(HERE).id.tolist() == first
+    scene.time_ns -= 10 * scene.period_ns
+    assert scene.show(beside(HERE, 0.001)).id.tolist() == first
+    found = scene.show(HERE)
+    assert found.id.tolist() == first
+    assert np.isfinite(found.velocity_m_s).all()
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, share: float) -> None:
+    scene, random = Scene(), np.random.default_rng(seed)
+    known: set[int] = set()
+    before: set[int] = set()
+    for _ in range(6):
+        scene.time_ns += scene.period_ns
+        touched = random.random(len(FLAT)) < share
+        found = scene.contacts.update(random.random(len(FLAT)), touched, scene.time_ns)
+        now = found.id.tolist()
+        assert len(set(now)) == len(now)
+        assert (np.diff(found.age_s) <= 1e-6).all()
+        new = set(now) - known
+        assert not new or min(new) > max(known, default=0)
+        known |= set(now)
+        before = set(now)
+    assert len(before) <= 64

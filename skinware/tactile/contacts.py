@@ -13,15 +13,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
+from skinware.structure import Structure
 from skinware.tactile.components import Components
 from skinware.tactile.neighbours import area_m2, pitch_m
+from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import Places, Tracker, TrackingSettings
 
 MOST = 64
@@ -166,6 +168,25 @@ class Contacts:
         self._frame = np.full(n, -1, np.int64)
         self._frame[known] = number
         self._tracker = Tracker(n, tracking or _tracking(geometry))
+
+    @classmethod
+    def of(cls, structure: Structure, type_name: str, neighbours: npt.NDArray[Any] | None = None) -> Self:
+        """For the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
+
+        Args:
+            structure: of the driver.
+            type_name: which sensors.
+            neighbours: default: from their places, as far as they are known.
+
+        Raises:
+            StructureError: the driver has no such sensors.
+            ConfigurationError: the neighbours are not of these sensors, or cannot be found from their places.
+        """
+        module = structure.module_of(type_name)
+        geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
+        if neighbours is None and geometry is not None:
+            neighbours = neighbours_of(geometry)
+        return cls(len(module), neighbours, geometry, module=module, unit=structure.type(type_name).unit)
 
     def update(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], time_ns: int) -> ContactSet:
         """The contacts of the next frame.

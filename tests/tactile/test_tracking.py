@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -89,41 +91,53 @@ def test_age_begins_with_the_contact() -> None:
     assert scene.show(HERE, THERE).age_s.tolist() == pytest.approx([0.06, 0])
 
 
-lanes = st.lists(
-    st.tuples(
-        st.floats(0.05, 0.2),  # start, m
-        st.floats(-0.5, 0.5),  # speed, m/s
-        st.lists(st.tuples(st.integers(8, 40), st.integers(1, 3)), max_size=2),  # gaps: first frame and length
-    ),
-    min_size=2,
-    max_size=5,
-)
+Lane = tuple[float, float, list[tuple[int, int]]]
+"""Where a finger begins, m; its speed, m/s; and when it is away: first frames and numbers of frames."""
 
 
-@settings(max_examples=60)
-@given(lanes)
-def test_contacts_3_pitches_apart_are_never_swapped(lanes: list[tuple[float, float, list[tuple[int, int]]]]) -> None:
-    """They pass each other, in lanes 3 pitches apart; each may be gone for 3 frames at a time."""
+def lanes(fastest_m_s: float) -> st.SearchStrategy[list[Lane]]:
+    gaps = st.lists(st.tuples(st.integers(8, 40), st.integers(1, 3)), max_size=2)
+    speed = st.floats(-fastest_m_s, fastest_m_s)
+    return st.lists(st.tuples(st.floats(0.05, 0.2), speed, gaps), min_size=2, max_size=5)
+
+
+def identities(fingers: list[Lane]) -> Iterator[tuple[int, int, int]]:
+    """Finger, frame and identity of each contact: fingers pass each other, in lanes 3 pitches apart."""
     scene = Scene()
-    x = np.array([start for start, _, _ in lanes])
-    y = 0.02 + 3 * PITCH_M * np.arange(len(lanes))
-    speed = np.array([speed for _, speed, _ in lanes])
-    identity: dict[int, int] = {}
-    last_seen = dict.fromkeys(range(len(lanes)), 0)
+    x, speed = np.array([[start, speed] for start, speed, _ in fingers]).T
+    y = 0.02 + 3 * PITCH_M * np.arange(len(fingers))
     for frame in range(45):
         x = x + np.minimum(frame / 10, 1) * speed * 0.02  # it takes 0.2 s to get going
         speed = np.where(((x < 0.02) & (speed < 0)) | ((x > 0.23) & (speed > 0)), 0, speed)
-        is_there = [not any(first <= frame < first + length for first, length in gaps) for _, _, gaps in lanes]
-        shown = [lane for lane in range(len(lanes)) if is_there[lane]]
-        at_m = np.array([[x[lane], y[lane], 0] for lane in shown]).reshape(-1, 3)
-        found = scene.show(*at_m)
+        is_away = [any(first <= frame < first + length for first, length in gaps) for _, _, gaps in fingers]
+        shown = np.flatnonzero(~np.array(is_away))
+        at_m = np.column_stack([x, y, 0 * x])[shown]
+        found = scene.show(at_m)
         assert len(found) == len(shown)
-        for lane, place in zip(shown, at_m, strict=True):
-            now = identity_at(found, place)
-            if frame - last_seen[lane] <= 4:
-                assert identity.setdefault(lane, now) == now
-            identity[lane], last_seen[lane] = now, frame
-        assert len(set(identity.values())) == len(lanes)
+        for finger, place in zip(shown.tolist(), at_m, strict=True):
+            yield finger, frame, identity_at(found, place)
+
+
+@settings(max_examples=40)
+@given(lanes(fastest_m_s=0.6))
+def test_contacts_3_pitches_apart_are_never_swapped(fingers: list[Lane]) -> None:
+    owner: dict[int, int] = {}
+    newest: dict[int, tuple[int, int]] = {}
+    for finger, frame, identity in identities(fingers):
+        assert owner.setdefault(identity, finger) == finger
+        before, known = newest.get(finger, (frame, identity))
+        assert frame - before > 1 or identity == known
+        newest[finger] = frame, identity
+
+
+@settings(max_examples=40)
+@given(lanes(fastest_m_s=0.25))
+def test_they_keep_their_identities_through_gaps_too(fingers: list[Lane]) -> None:
+    newest: dict[int, tuple[int, int]] = {}
+    for finger, frame, identity in identities(fingers):
+        before, known = newest.get(finger, (frame, identity))
+        assert frame - before > 4 or identity == known
+        newest[finger] = frame, identity
 
 
 def test_two_fingers_in_one_line_do_not_take_each_others_places() -> None:
@@ -209,7 +223,6 @@ def test_time_that_stands_still_or_goes_back_is_borne() -> None:
 def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, share: float) -> None:
     scene, random = Scene(), np.random.default_rng(seed)
     known: set[int] = set()
-    before: set[int] = set()
     for _ in range(6):
         scene.time_ns += scene.period_ns
         touched = random.random(len(FLAT)) < share
@@ -220,5 +233,3 @@ def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, sha
         new = set(now) - known
         assert not new or min(new) > max(known, default=0)
         known |= set(now)
-        before = set(now)
-    assert len(before) <= 64

@@ -1,0 +1,31 @@
+"""Regions by hand: what was touched while somebody stroked a skin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.tactile.neighbours import NONE
+
+
+def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """(n,) bool: the touched taxels, and those most of whose neighbours are among them, until there are no more.
+
+    Args:
+        touched: (n,) bool.
+        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows.
+    """
+    is_neighbour = neighbours != NONE
+    count = is_neighbour.sum(axis=1)
+    found = touched.astype(bool)
+    while True:
+        inside = (found[neighbours] & is_neighbour).sum(axis=1)
+        holes = ~found & (2 * inside > count)
+        if not holes.any():
+            return found
+        found |= holes
+
+
+__all__ = ["without_holes"]

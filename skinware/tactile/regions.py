@@ -1,6 +1,6 @@
-"""Regions: named sets of taxels, from a file beside the skin, whatever drivers there are and in whatever order.
+"""Regions: named sets of taxels, whatever drivers there are and in whatever order.
 
-The file is TOML::
+Their file is TOML (:mod:`skinware.tactile.region_files`)::
 
     format = "skinware-regions"
     version = 1
@@ -29,12 +29,10 @@ A patch or a frame that the skin does not have (now) adds nothing to a region: i
 from __future__ import annotations
 
 import graphlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated
 
 import msgspec
-import msgspec.structs
 import numpy as np
 import numpy.typing as npt
 
@@ -43,9 +41,6 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Triple
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
-from skinware.toml_text import Keys, TomlText, wrong_value
-
-FORMAT, VERSION = "skinware-regions", 1
 
 _SELECTORS = ("uid", "patch", "module", "frame", "box", "regions")
 Flags = npt.NDArray[np.bool_]
@@ -105,12 +100,6 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"region {self.name!r}: uid {max(self.uid):#x} has more than 64 bits")
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    format: str
-    version: int
-    region: tuple[Region, ...] = ()
-
-
 class RegionIndex(dict[str, Index]):
     """By name of a region: where its m sensors are, a slice or (m,) int64, ascending. An unknown name is an error."""
 
@@ -163,72 +152,6 @@ class Regions:
             found = RegionIndex({name: as_index(np.flatnonzero(flags[name])) for name in of_type})
             self._known[type_name] = skin, found
         return found
-
-
-def read_regions(*paths: str | Path) -> Regions:
-    """Read files of regions, which together are one set.
-
-    Raises:
-        ConfigurationError: not there, not TOML, not of this format, a value that is wrong, or as for :class:`Regions`;
-            the message says where.
-    """
-    regions: list[Region] = []
-    places: list[str] = []
-    for path in paths:
-        text = TomlText(Path(path))
-        found = _from_data(text.data, text.place)
-        places += [text.place(("region", number)) for number in range(len(found))]
-        regions += found
-    return Regions(regions, places)
-
-
-def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
-    """The text of a file of regions.
-
-    Args:
-        regions: what is in it.
-        comment: lines for its head.
-    """
-    lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
-    return "\n".join(lines) + "\n" + "".join(f"\n{region_to_toml(region)}" for region in regions)
-
-
-def region_to_toml(region: Region) -> str:
-    """The part of a file that is one region, from its ``[[region]]`` on."""
-    lines = ["[[region]]"]
-    for field in msgspec.structs.fields(region):
-        value = getattr(region, field.name)
-        if value:
-            lines.append(f"{field.name} = {_value(value, field.name)}")
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: Any, name: str) -> str:
-    if isinstance(value, tuple):
-        rows = [_value(row, name) for row in value]
-        if len(rows) > 8 and name == "uid":
-            return "\n  ".join(["[", *(f"{', '.join(rows[i : i + 8])}," for i in range(0, len(rows), 8))]) + "\n]"
-        return f"[{', '.join(rows)}]"
-    if isinstance(value, Box):
-        pairs = ((key, getattr(value, key)) for key in value.__struct_fields__)
-        return f"{{ {', '.join(f'{key} = {_value(inner, key)}' for key, inner in pairs)} }}"
-    if isinstance(value, int | float):
-        return f"{value:#x}" if name == "uid" else repr(float(value))
-    return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
-
-
-def _from_data(data: dict[str, Any], place: Callable[[Keys], str]) -> tuple[Region, ...]:
-    """The regions of a file, each right in itself."""
-    if data.get("format") != FORMAT:
-        raise ConfigurationError(f'{place(("format",))}: no file of regions: it does not say format = "{FORMAT}"')
-    if data.get("version") != VERSION:
-        known = f"this Skinware reads version {VERSION}"
-        raise ConfigurationError(f"{place(('version',))}: version {data.get('version')}, {known}")
-    try:
-        return msgspec.convert(data, _File).region
-    except msgspec.ValidationError as error:
-        text, keys = wrong_value(error)
-        raise ConfigurationError(f"{place(keys)}: {text}") from None
 
 
 def _in_turn(regions: Sequence[Region], places: Sequence[str]) -> list[Region]:
@@ -306,4 +229,4 @@ def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:
     return np.array([not each.isdisjoint(wanted) for each in names], bool)
 
 
-__all__ = ["Box", "Region", "RegionIndex", "Regions", "read_regions", "region_to_toml", "regions_to_toml"]
+__all__ = ["Box", "Region", "RegionIndex", "Regions"]

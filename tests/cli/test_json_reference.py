@@ -16,6 +16,7 @@ from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWrite
 from skinware.cli._command import exit_status
 from skinware.cli.info import command as info
 from skinware.cli.press import command as press
+from skinware.cli.regions import command as regions
 from skinware.cli.top import command as top
 from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
@@ -30,6 +31,8 @@ from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from tests.cli.fake_skin import FakeSkin, publishing
+from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
 from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device
@@ -213,6 +216,19 @@ def test_robots_files(printing: Print, tmp_path: Path) -> None:
     (tmp_path / "torso.txt").write_text(positions([TRIANGLE] * 32))
     text = printing(import_, "icub", str(tmp_path))
     check("`skin-import icub`", *text, *printing(import_, "icub", str(tmp_path), "-o", str(tmp_path / "out")))
+
+
+def test_regions(printing: Print, tmp_path: Path) -> None:
+    file = tmp_path / "regions.toml"
+    skin = FakeSkin("torso", placed_structure())
+    skin.values = idle(skin.structure)
+    with publishing(skin), painting("palm", "-o", str(file)) as paint:
+        ready = paint.wait_for("ready")
+        skin.values = pressed(skin.structure, BLOCK)
+        going_on = paint.wait_for("painting")
+        paint.press_enter()
+        check("`skin-regions paint`", ready, going_on, paint.wait_for("done"))
+        check("`skin-regions list`", *printing(regions, "list", str(file)))
 
 
 class _Stop:

@@ -18,7 +18,8 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.painting import without_holes
-from skinware.tactile.regions import Box, Region, Regions, read_regions, regions_to_toml
+from skinware.tactile.region_files import put_region, read_regions, regions_to_toml
+from skinware.tactile.regions import Box, Region, Regions
 from tests.tactile.skins import placed, pressed, triangles
 
 HEAD = 'format = "skinware-regions"\nversion = 1\n'
@@ -244,6 +245,62 @@ def test_several_files_are_one_set(tmp_path: Path) -> None:
         read_regions(tmp_path / "none.toml")
 
 
+WRITTEN = (
+    HEAD
+    + """
+# mine
+[[region]]
+name = "palm"        # of the left hand
+patch = ["board 1"]
+
+[[region]]
+name = "box"
+[[region.box]]
+frame = "x"
+centre_m = [0, 0, 0]
+size_m = [1, 1, 1]
+
+# the last
+[[region]]
+name = "rest"
+without = ["palm"]
+regions = ["box"]
+"""
+)
+
+
+@pytest.mark.parametrize("name", ["palm", "box", "rest", "new"])
+def test_a_region_is_put_into_a_file_that_people_wrote(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "regions.toml"
+    path.write_text(WRITTEN)
+    before = {region.name: region for region in read_regions(path)}
+    put = Region(name, type="pressure", uid=tuple(range(20)))
+    put_region(path, put, replace=True)
+    after = {region.name: region for region in read_regions(path)}
+    assert after == before | {name: put}
+    text = path.read_text()
+    assert ("# mine" in text, "# the last" in text) == (True, True)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_region_of_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "regions.toml"
+    put_region(path, Region("palm", uid=(1,)))
+    with pytest.raises(ConfigurationError, match=r"there is a region 'palm' already"):
+        put_region(path, Region("palm", uid=(2,)))
+    with pytest.raises(ConfigurationError, match=rf"{re.escape(str(path))}:\d+: .*no region 'x'"):
+        put_region(path, Region("other", regions=("x",)))
+    assert list(read_regions(path)) == [Region("palm", uid=(1,))]
+    path.write_text(HEAD + 'region = [{ name = "palm", uid = [1] }, { name = "thumb", uid = [2] }]\n')
+    with pytest.raises(ConfigurationError, match=r":3: regions in one value: replace 'thumb' by hand"):
+        put_region(path, Region("thumb", uid=(3,)), replace=True)
+    path.write_text("not regions")
+    with pytest.raises(ConfigurationError, match="not TOML"):
+        put_region(path, Region("palm", uid=(2,)), replace=True)
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "not regions"
+
+
 def test_holes_of_a_painted_region_are_closed_and_its_edge_stays() -> None:
     flat = triangles(20, 20)
     table = neighbours(placed(flat))
@@ -253,6 +310,13 @@ def test_holes_of_a_painted_region_are_closed_and_its_edge_stays() -> None:
     closed = without_holes(painted, table)
     assert closed[disc].all()
     assert (closed & ~disc).sum() <= 6
+    edge = np.zeros(400, bool)
+    edge[[row * 20 + column for row in range(1, 19) for column in range(1, 19)]] = True
+    assert np.array_equal(without_holes(edge, table), edge)
+    edge = flat[:, 0] < 0.06
+    torn = edge.copy()
+    torn[[2 * 20, 100, 102]] = False
+    assert np.array_equal(without_holes(torn, table), edge)
     assert not without_holes(np.zeros(400, bool), table).any()
     one = np.zeros(400, bool)
     one[45] = True

@@ -1,0 +1,247 @@
+"""``skin-regions``: named parts of a skin, listed and painted by hand."""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    import numpy.typing as npt
+
+    from skinware.driver_service import DriverFrame, DriverReader
+    from skinware.memory.namespace import Namespace
+
+DEFAULT_FILE = "regions.toml"
+_TELL_EVERY_S = 1.0
+_WAIT_S = 0.1
+_SILENT_S = 5.0
+
+
+@click.group("skin-regions", context_settings=CONTEXT_SETTINGS)
+@version_option
+def command() -> None:
+    """Name parts of a skin: regions, which programs and skin-top find by name."""
+
+
+@command.command(
+    "list",
+    epilog=examples(
+        "skin-regions list                     of regions.toml, with what the running skin has of them",
+        "skin-regions list a.toml b.toml       of several files, which are one set",
+    ),
+)
+@click.argument("files", nargs=-1, metavar="[FILE...]", type=click.Path(path_type=Path))
+@namespace_option
+@json_option
+def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None:
+    """List regions, and how many sensors the running drivers have in each."""
+    from skinware.cli._format import plural
+    from skinware.skin import Skin
+    from skinware.tactile.region_files import read_regions
+
+    regions = read_regions(*(files or (Path(DEFAULT_FILE),)))
+    with Skin(namespace) as skin:
+        layout = skin.refresh()
+    counts: dict[str, dict[str, int]] = {region.name: {} for region in regions}
+    for type_name in layout.types:
+        n = len(layout.uids(type_name))
+        for name, index in regions.of(layout, type_name).items():
+            counts[name][type_name] = len(range(n)[index]) if isinstance(index, slice) else len(index)
+    for name, of_type in counts.items():
+        if as_json:
+            print_json({"region": name, "sensors": of_type})
+        else:
+            found = ", ".join(plural(count, f"{type_name} sensor") for type_name, count in of_type.items() if count)
+            click.echo(f"{name}: {found or 'nothing in the drivers that run'}")
+
+
+@command.command(
+    epilog=examples(
+        "skin-regions paint palm               stroke the palm, then press Enter",
+        "skin-regions paint palm --namespace calm --driver left_hand",
+        "skin-regions paint palm -T 20 --json  for programs: paint for 20 s",
+    ),
+)
+@click.argument("name")
+@click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")
+@click.option("--type", "type_name", metavar="TYPE", help="Sensors to paint.  [default: the driver's first type]")
+@click.option(
+    "-o",
+    "--output",
+    "file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    default=DEFAULT_FILE,
+    show_default=True,
+    help="Write the region into this file, new or not.",
+)
+@click.option("-f", "--force", is_flag=True, help="Replace a region of this name.")
+@click.option("-T", "duration_s", type=seconds, help="Paint for SECONDS, not until Enter.")
+@namespace_option
+@json_option
+def paint(
+    name: str,
+    driver: str | None,
+    type_name: str | None,
+    file: Path,
+    force: bool,
+    duration_s: float | None,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Make a region of the sensors that you stroke.
+
+    Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
+    """
+    from skinware.memory.namespace import Namespace
+    from skinware.tactile.region_files import put_region
+    from skinware.tactile.regions import Region
+
+    if duration_s is None and not sys.stdin.isatty():
+        raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
+    _refuse_early(file, name, force)
+    with _reader(Namespace(namespace), driver) as reader:
+        painter = _Painter(reader, type_name, as_json)
+        stroked, in_region = painter.paint(duration_s)
+        uid = reader.structure.sensor_uid[reader.structure.index(painter.type_name)][in_region]
+    if not len(uid):
+        raise click.ClickException("nothing was touched; nothing is written")
+    put_region(file, Region(name, painter.type_name, (reader.name,), tuple(uid.tolist())), replace=force)
+    if as_json:
+        told = {"region": name, "file": str(file), "touched": stroked, "sensors": len(uid)}
+        print_json({"event": "done", **told})
+    else:
+        holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
+        click.echo(f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
+
+
+def _refuse_early(file: Path, name: str, force: bool) -> None:
+    """What could not be written should not be painted."""
+    from skinware.errors import ConfigurationError
+    from skinware.tactile.region_files import read_regions
+
+    if file.exists() and not force and name in [region.name for region in read_regions(file)]:
+        raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
+
+
+def _reader(namespace: Namespace, driver: str | None) -> DriverReader:
+    """Of the driver, or of the only one that runs."""
+    from skinware.driver_service import DriverReader
+    from skinware.errors import ConfigurationError, ServiceNotFound
+    from skinware.skin import Skin
+
+    if driver is None:
+        with Skin(namespace) as skin:
+            drivers = skin.refresh().drivers
+        if not drivers:
+            raise ServiceNotFound(f"no driver runs in namespace {namespace.name!r}")
+        if len(drivers) > 1:
+            raise ConfigurationError(f"several drivers run: choose one with --driver: {', '.join(drivers)}")
+        driver = drivers[0]
+    return DriverReader(driver, namespace=namespace)
+
+
+class _Painter:
+    """Gathers what is touched.
+
+    Args:
+        reader: of the driver.
+        type_name: which sensors; None: of its first type.
+        as_json: how to tell.
+    """
+
+    def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
+        from skinware.cli._rest import Rest
+
+        self._reader, self._as_json = reader, as_json
+        self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
+        self._index = reader.structure.index(self.type_name)
+        self._rest = Rest(reader.structure)
+        self._newest: DriverFrame | None = None
+
+    def paint(self, duration_s: float | None) -> tuple[int, npt.NDArray[np.bool_]]:
+        """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
+        import numpy as np
+
+        from skinware.cli._rest import SETTLING_S
+        from skinware.tactile.neighbours import neighbours
+        from skinware.tactile.painting import without_holes
+
+        for frame in self._frames(SETTLING_S):
+            self._touched(frame)
+        stroked = np.zeros(len(self._reader.structure.module_of(self.type_name)), bool)
+        self._say("ready", f"stroke the region{' and press Enter' if duration_s is None else ''}", stroked)
+        tell_s = time.monotonic() + _TELL_EVERY_S
+        for frame in self._frames(duration_s):
+            stroked |= self._touched(frame)
+            if time.monotonic() >= tell_s:
+                tell_s += _TELL_EVERY_S
+                self._say("painting", f"{stroked.sum()} sensors", stroked)
+        geometry = self._reader.structure.geometry
+        if geometry is None:
+            return int(stroked.sum()), stroked
+        return int(stroked.sum()), without_holes(stroked, neighbours(geometry[self._index]))
+
+    def _touched(self, frame: DriverFrame) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which sensors of the type are far from rest."""
+        import numpy as np
+
+        from skinware.cli._wipe import threshold
+
+        physical = np.zeros(frame.structure.n_sensors, np.float32)
+        physical[self._index] = frame.physical(self.type_name)
+        fresh = frame.status == 0
+        self._rest.follow(physical, fresh, frame.published_ns)
+        change = self._rest.change(physical)[self._index]
+        touched: npt.NDArray[np.bool_] = fresh[self._index] & (change > threshold(self._rest.noise(self.type_name)))
+        return touched
+
+    def _frames(self, duration_s: float | None) -> Iterator[DriverFrame]:
+        """Frames until the end of the time, or Enter."""
+        from skinware.errors import ServiceTimeout
+
+        end_s = None if duration_s is None else time.monotonic() + duration_s
+        heard_s = time.monotonic()
+        while end_s is None or time.monotonic() < end_s:
+            if end_s is None and select.select([sys.stdin], [], [], 0)[0]:
+                sys.stdin.readline()
+                return
+            try:
+                self._newest = self._reader.read(newer_than=self._newest, timeout_s=_WAIT_S)
+            except ServiceTimeout:
+                if time.monotonic() - heard_s > _SILENT_S:
+                    raise
+                continue
+            heard_s = time.monotonic()
+            yield self._newest
+
+    def _say(self, event: str, text: str, stroked: npt.NDArray[np.bool_]) -> None:
+        if self._as_json:
+            told = {"driver": self._reader.name, "type": self.type_name}
+            print_json({"event": event, **(told if event == "ready" else {}), "touched": int(stroked.sum())})
+        else:
+            click.echo(text)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

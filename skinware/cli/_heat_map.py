@@ -125,6 +125,16 @@ class Arrangement:
         """(2 * lines, columns) uint8: the code of every pixel, from the codes of ``sensors``."""
         return np.append(codes, np.uint8(BACKGROUND))[self.pixels]  # pixel -1 is the last one
 
+    def limited(self, only: npt.NDArray[np.bool_]) -> Arrangement:
+        """The same, with nothing in the places of other sensors.
+
+        Args:
+            only: (n_sensors,) bool, which sensors of a frame stay.
+        """
+        stays = only[self.sensors]
+        number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)  # pixel -1 is the last one
+        return Arrangement(self.sensors[stays], number[self.pixels], self.labels, self.zoom)
+
     def sensor_at(self, line: int, column: int) -> int | None:
         """Position in a frame of the sensor at a place of the terminal, None between sensors."""
         if not (0 <= line < self.lines and 0 <= column < self.columns):
@@ -135,7 +145,14 @@ class Arrangement:
 
 
 def arrange(
-    structure: Structure, patches: Sequence[int], type_name: str, width: int, height: int, *, smallest: int = 1
+    structure: Structure,
+    patches: Sequence[int],
+    type_name: str,
+    width: int,
+    height: int,
+    *,
+    smallest: int = 1,
+    only: npt.NDArray[np.bool_] | None = None,
 ) -> Arrangement:
     """Lay out the sensors of one type on some patches, module by module, as large as they fit.
 
@@ -148,6 +165,8 @@ def arrange(
         width: columns of the terminal.
         height: lines of the terminal.
         smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
+        only: (n_sensors,) bool, sensors of a region: modules without any are left out, as are the other sensors of
+            modules that have some.
 
     Raises:
         StructureError: there is no such type.
@@ -155,6 +174,8 @@ def arrange(
     wanted = np.zeros(structure.n_sensors, bool)
     wanted[structure.index(type_name)] = True
     wanted &= np.isin(structure.sensor_patch, np.asarray(patches, np.uint32))
+    if only is not None:
+        wanted &= np.isin(structure.sensor_module, structure.sensor_module[wanted & only])
     positions = np.flatnonzero(wanted)
     order = np.argsort(structure.sensor_module[positions], kind="stable")
     positions = positions[order]
@@ -168,9 +189,11 @@ def arrange(
     labels = [
         _within_patch(structure.module_names[block.module], structure.patch_names[block.patch]) for block in blocks
     ]
+    patches = sorted({block.patch for block in blocks}) if only is not None else patches
     names = {patch: structure.patch_names[patch] for patch in patches} if len(patches) > 1 else {}
     grid = _choose_grid(blocks, labels, names, max(8, width), max(1, height), smallest)
-    return _place(blocks, labels, names, grid, positions)
+    arrangement = _place(blocks, labels, names, grid, positions)
+    return arrangement if only is None else arrangement.limited(only)
 
 
 def _within_patch(module: str, patch: str) -> str:

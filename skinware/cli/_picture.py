@@ -20,8 +20,10 @@ from skinware.cli._top_rows import RowKey, patches_of, title_of
 from skinware.cli._wipe import WipeTest
 from skinware.driver_service import DriverFrame
 from skinware.sensor_types import SensorType
+from skinware.skin_layout import SkinLayout
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.regions import Regions
 
 _NAMED_STATUSES = {bit: str(bit.name).lower().replace("_", " ") for bit in Status}
 _PEAK = "peak"
@@ -35,6 +37,8 @@ class Picture:
         type_name: the type to draw where there is one of this name; otherwise each driver's first.
         scale_name: what the colours mean at first, one of ``SCALES``.
         palette: of the terminal.
+        regions: that a person may choose from; None: there are none.
+        region: only sensors in this one are drawn at first; None: all.
 
     Attributes:
         scale_name: what the colours mean: ``change`` from rest, the type's ``range``, ``raw`` counts.
@@ -45,8 +49,17 @@ class Picture:
         marks: what the characters mean, with how many sensors have each.
     """
 
-    def __init__(self, type_name: str | None = None, scale_name: str = CHANGE, palette: Palette = TRUE_COLOURS) -> None:
+    def __init__(
+        self,
+        type_name: str | None = None,
+        scale_name: str = CHANGE,
+        palette: Palette = TRUE_COLOURS,
+        *,
+        regions: Regions | None = None,
+        region: str | None = None,
+    ) -> None:
         self.scale_name = scale_name
+        self._regions, self._region = regions, region
         self.arrangement: Arrangement | None = None
         self.pixels: npt.NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
         self.title = ""
@@ -73,6 +86,34 @@ class Picture:
         """Go over to the next meaning of the colours."""
         self.scale_name = SCALES[(SCALES.index(self.scale_name) + 1) % len(SCALES)]
         self._levels = None
+
+    def next_region(self) -> None:
+        """Go over to the next region; after the last one to all sensors."""
+        names = [None, *(region.name for region in self._regions or ())]
+        self._region = names[(names.index(self._region) + 1) % len(names)]
+
+    def regions_of(self, driver: str, position: int) -> list[str]:
+        """Names of the regions that a sensor is in.
+
+        Args:
+            driver: whose, one that was drawn.
+            position: of the sensor in a frame.
+        """
+        watched = self._watched[driver]
+        structure = watched.structure
+        sensor_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
+        names = [region.name for region in self._regions or ()]
+        return [name for name in names if self._in_region(name, watched, sensor_type.name)[position]]
+
+    def _in_region(self, name: str, watched: _Watched, type_name: str) -> npt.NDArray[np.bool_]:
+        """(n_sensors,) bool: the sensors of a type that are in a region."""
+        structure = watched.structure
+        found = np.zeros(structure.n_sensors, bool)
+        if self._regions is not None:
+            of_type = np.arange(structure.n_sensors)[structure.index(type_name)]
+            index = self._regions.of(watched.layout, type_name)
+            found[of_type[index.get(name, slice(0, 0))]] = True
+        return found
 
     def take_baselines(self) -> None:
         """What comes next is what the sensors read at rest."""
@@ -120,17 +161,21 @@ class Picture:
             height: lines to draw in.
             life: what the driver is doing; where nothing newer comes, no sensor is fresh.
         """
-        sensor_type = self.type_in(frame.structure)
-        made_for = (key, frame.structure, sensor_type, width, height)
+        sensor_type, region = self.type_in(frame.structure), self._region
+        watched = self._watch(key.driver, frame)
+        made_for = (key, frame.structure, sensor_type, region, width, height)
         if self.arrangement is None or made_for != self._made_for:
             patches = patches_of(key, frame)
             smallest = 2 if self._palette.characters else 1
-            self.arrangement = arrange(frame.structure, patches, sensor_type.name, width, height, smallest=smallest)
+            only = None if region is None else self._in_region(region, watched, sensor_type.name)
+            self.arrangement = arrange(
+                frame.structure, patches, sensor_type.name, width, height, smallest=smallest, only=only
+            )
             self._made_for, self._levels = made_for, None
             self.title = title_of(key, frame.structure, patches, sensor_type.name, len(self.arrangement.sensors))
+            self.title += "" if region is None else f", in {region}"
             if self._wanted not in (None, sensor_type.name):
                 self.title += f" (there are no {self._wanted} sensors)"
-        watched = self._watch(key.driver, frame)
         sensors = self.arrangement.sensors
         name, scaled = self._scaled(watched, frame, sensors, sensor_type)
         self._levels = scaled.levels
@@ -148,7 +193,7 @@ class Picture:
         """What is known of a driver, with this frame."""
         watched = self._watched.get(driver)
         if watched is None or watched.structure is not frame.structure:
-            watched = self._watched[driver] = _Watched(frame.structure)
+            watched = self._watched[driver] = _Watched(driver, frame.structure)
         if self._wiping and watched.wipe is None:
             watched.wipe = WipeTest(frame.structure)
         watched.follow(frame)
@@ -177,8 +222,9 @@ class Picture:
 class _Watched:
     """What is kept of a driver from frame to frame."""
 
-    def __init__(self, structure: Structure) -> None:
+    def __init__(self, driver: str, structure: Structure) -> None:
         self.structure = structure
+        self.layout = SkinLayout((driver,), (structure,))
         self.rest = Rest(structure)
         self.wipe: WipeTest | None = None
         self.changes: dict[tuple[str, str], ChangeScale] = {}

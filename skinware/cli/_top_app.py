@@ -25,6 +25,7 @@ from skinware.cli._scale import CHANGE
 from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
+from skinware.tactile.regions import Regions
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
@@ -65,6 +66,8 @@ class SkinTop(App[None]):
         duration_s: end after this time; None = until told to.
         scale_name: what the colours mean at first: ``change``, ``range`` or ``raw``.
         palette: default: what the terminal can show.
+        regions: that a person may choose from; None: there are none.
+        region: only sensors in this one are drawn at first; None: all.
     """
 
     TITLE = "skin-top"
@@ -95,6 +98,7 @@ class SkinTop(App[None]):
         Binding("up", "choose(-1)", show=False),
         Binding("t", "next_type", "Type"),
         Binding("s", "next_scale", "Scale"),
+        Binding("r", "next_region", "Region"),
         Binding("b", "take_baselines", "Baseline"),
         Binding("w", "wipe_test", "Wipe test"),
         Binding("l", "save_list", "Save list", show=False),
@@ -110,12 +114,15 @@ class SkinTop(App[None]):
         *,
         scale_name: str = CHANGE,
         palette: Palette | None = None,
+        regions: Regions | None = None,
+        region: str | None = None,
     ) -> None:
         super().__init__()
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
         self._drivers = LiveDrivers(namespace)
         self._duration_s = duration_s
-        self._picture = Picture(type_name, scale_name, palette)
+        self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
+        self._has_regions = regions is not None
         self._head = Static(id="head", markup=False)
         self._nothing = Container(id="nothing")
         self._why = Static(id="why", markup=False)
@@ -190,6 +197,15 @@ class SkinTop(App[None]):
     def action_next_scale(self) -> None:
         """Change what the colours mean."""
         self._picture.next_scale()
+        self._must_draw = True
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
+        """Whether a key does something."""
+        return self._has_regions or action != "next_region"
+
+    def action_next_region(self) -> None:
+        """Draw the sensors of another region only."""
+        self._picture.next_region()
         self._must_draw = True
 
     def action_take_baselines(self) -> None:
@@ -304,7 +320,8 @@ class SkinTop(App[None]):
         _say(self._scale, picture.scale)
         _say(self._marks, picture.marks)
         if self._pointed is not None and self._pointed < frame.structure.n_sensors:
-            _say(self._detail, describe_sensor(frame, self._pointed))
+            regions = picture.regions_of(row.key.driver, self._pointed)
+            _say(self._detail, describe_sensor(frame, self._pointed) + f"; in {', '.join(regions)}" * bool(regions))
         else:
             _say(self._detail, picture.wipe_text(row.key.driver) or counters_text(row.counters))
 

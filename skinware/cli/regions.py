@@ -12,6 +12,7 @@ import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
+    DEFAULT_REGIONS,
     examples,
     json_option,
     namespace_option,
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverFrame, DriverReader
     from skinware.memory.namespace import Namespace
 
-DEFAULT_FILE = "regions.toml"
 _TELL_EVERY_S = 1.0
 _WAIT_S = 0.1
 _SILENT_S = 5.0
@@ -58,7 +58,7 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
     from skinware.skin import Skin
     from skinware.tactile.region_files import read_regions
 
-    regions = read_regions(*(files or (Path(DEFAULT_FILE),)))
+    regions = read_regions(*(files or (Path(DEFAULT_REGIONS),)))
     with Skin(namespace) as skin:
         layout = skin.refresh()
     counts: dict[str, dict[str, int]] = {region.name: {} for region in regions}
@@ -90,7 +90,7 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
     "file",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    default=DEFAULT_FILE,
+    default=DEFAULT_REGIONS,
     show_default=True,
     help="Write the region into this file, new or not.",
 )

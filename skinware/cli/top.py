@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
+    DEFAULT_REGIONS,
     examples,
     json_option,
     namespace_option,
@@ -24,6 +26,7 @@ from skinware.cli._command import (
 if TYPE_CHECKING:
     from skinware.cli._live import LiveDrivers
     from skinware.memory.namespace import Namespace
+    from skinware.tactile.regions import Regions
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
@@ -37,6 +40,7 @@ _NEEDED = "textual>=8"
     epilog=examples(
         "skin-top                    in the terminal",
         "skin-top --type proximity   draw another type of sensors",
+        "skin-top --region palm      draw a region of regions.toml",
         "skin-top --plain -T 10      ten seconds of plain lines",
     ),
 )
@@ -53,6 +57,15 @@ _NEEDED = "textual>=8"
     show_default=True,
     help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
+@click.option("--region", metavar="NAME", help="Draw only sensors in this region at first.")
+@click.option(
+    "--regions",
+    "region_files",
+    multiple=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
+)
 @namespace_option
 @json_option
 @version_option
@@ -63,6 +76,8 @@ def command(
     duration_s: float | None,
     type_name: str | None,
     scale_name: str,
+    region: str | None,
+    region_files: tuple[Path, ...],
     namespace: str | None,
     as_json: bool,
 ) -> None:
@@ -70,15 +85,30 @@ def command(
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
+    regions = _regions(region, region_files)
     if not plain and not as_json and _on_terminal():
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 
-            app = SkinTop(place, type_name, duration_s, scale_name=scale_name)
+            app = SkinTop(place, type_name, duration_s, scale_name=scale_name, regions=regions, region=region)
             app.run()
             context.exit(app.return_code or 0)
         warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
     show_lines(place, duration_s, as_json)
+
+
+def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
+    """The regions of files, which must have the one that is named; None where nobody asks for any."""
+    if name is None and not files:
+        return None
+    from skinware.errors import ConfigurationError
+    from skinware.tactile.region_files import read_regions
+
+    regions = read_regions(*(files or (Path(DEFAULT_REGIONS),)))
+    names = [region.name for region in regions]
+    if name is not None and name not in names:
+        raise ConfigurationError(f"no region {name!r}; there are: {', '.join(names) or 'none'}")
+    return regions
 
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:

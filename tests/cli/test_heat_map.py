@@ -200,3 +200,20 @@ def test_a_place_is_a_sensor() -> None:
     assert arranged.sensor_at(0, 0) is None  # the module's number
     assert arranged.sensor_at(2, 0) is None
     assert arranged.sensor_at(-1, 0) is None
+
+
+def test_modules_without_a_sensor_of_the_region_are_left_out() -> None:
+    structure = fake_structure(4, 2)
+    only = np.zeros(structure.n_sensors, bool)
+    only[[0, 3, 12 * 3 + 5, 12 * 3 + 10]] = True  # the last one is of another type
+    arranged = arrange(structure, range(4), "pressure", 80, 24, only=only)
+    assert arranged.sensors.tolist() == [0, 3, 41]
+    whole = arrange(structure, range(2), "pressure", 80, 24)
+    assert sorted(set(arranged.pixels.ravel().tolist())) == [-1, 0, 1, 2]
+    assert (arranged.pixels >= 0).sum() == 3 * arranged.zoom**2
+    assert arranged.columns < whole.columns
+    assert {label.text for labels in arranged.labels.values() for label in labels} >= {"board 7", "board 8"}
+    sensors = {arranged.sensor_at(y, x) for y in range(arranged.lines) for x in range(arranged.columns)}
+    assert sensors == {None, 0, 3, 41}
+    nothing = arrange(structure, range(4), "pressure", 80, 24, only=np.zeros(structure.n_sensors, bool))
+    assert (len(nothing.sensors), nothing.lines) == (0, 0)

@@ -15,6 +15,7 @@ from skinware.cli._heat_map import LEVELS
 from skinware.cli._picture import Picture, describe_sensor
 from skinware.cli._scale import RANGE
 from skinware.cli._top_rows import BUS, DRIVER, PATCH, RowKey
+from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 DRIVER_ROW, BUS_ROW, PATCH_ROW = RowKey("a", DRIVER, 0), RowKey("a", BUS, 0), RowKey("a", PATCH, 1)
@@ -205,3 +206,30 @@ def test_a_sensor_in_words() -> None:
             "board 7, triangle 0, temperature 10: temperature 20 degC (raw 40), stale, out of range;"
             " position 10, uid 0x3f2"
         )
+
+
+def test_the_sensors_of_one_region_are_drawn() -> None:
+    regions = Regions(
+        [
+            Region("left", driver=("a",), patch=("board 7",)),
+            Region("odd", type="pressure", uid=(1000, 1003)),
+            Region("arm", driver=("b",), patch=("board 7",)),
+        ]
+    )
+    with published() as (_, reader):
+        picture = Picture(regions=regions, region="left")
+        frame = reader.read()
+        drawn(picture, DRIVER_ROW, frame)
+        assert picture.arrangement is not None
+        assert len(picture.arrangement.sensors) == 30
+        assert picture.title.endswith("30 pressure sensors, in left")
+        assert (picture.regions_of("a", 0), picture.regions_of("a", 1)) == (["left", "odd"], ["left"])
+        for region, count in (("odd", 2), ("arm", 0), (None, 60), ("left", 30)):
+            picture.next_region()
+            drawn(picture, DRIVER_ROW, frame)
+            assert len(picture.arrangement.sensors) == count
+            assert (f", in {region}" in picture.title) == (region is not None)
+        picture.next_type(frame.structure)
+        picture.next_region()
+        drawn(picture, DRIVER_ROW, frame)
+        assert len(picture.arrangement.sensors) == 0  # the region has no temperatures

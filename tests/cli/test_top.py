@@ -13,6 +13,8 @@ from skinware import Namespace
 from skinware.cli import top
 from skinware.cli._command import exit_status
 from skinware.cli.top import command
+from skinware.tactile.region_files import put_region
+from skinware.tactile.regions import Region
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.commands import BIN, PATIENCE_S
 
@@ -98,3 +100,16 @@ def test_signals_end_it_in_good_order(number: int) -> None:
 def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
     code = "import sys, skinware.cli.top; assert not {'textual', 'rich'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_region_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "regions.toml"
+    put_region(file, Region("palm", uid=(1,)))
+    assert exit_status(command, ["--plain", "-T", "0", "--region", "palm", "--regions", str(file)]) == 0
+    capsys.readouterr()
+    for arguments, why in (
+        (["--region", "plam", "--regions", str(file)], "no region 'plam'; there are: palm"),
+        (["--regions", str(tmp_path / "none.toml")], "none.toml: No such file"),
+    ):
+        assert exit_status(command, ["--plain", *arguments]) == 2
+        assert why in capsys.readouterr().err

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from textual.pilot import Pilot
 from textual.widgets import DataTable, Static
@@ -19,6 +20,7 @@ from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLO
 from skinware.cli._scale import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
+from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 
 SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
@@ -30,8 +32,9 @@ async def shown(
     type_name: str | None = None,
     duration_s: float | None = None,
     scale_name: str = CHANGE,
+    regions: Regions | None = None,
 ) -> AsyncIterator[tuple[SkinTop, Pilot[None]]]:
-    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS, scale_name=scale_name)
+    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS, scale_name=scale_name, regions=regions)
     async with app.run_test(size=size) as pilot:
         await pilot.pause()
         yield app, pilot
@@ -391,5 +394,29 @@ def test_a_namespace_that_cannot_be_trusted_is_explained(namespace: Namespace) -
                     await until(pilot, lambda: "can be written by others" in line(app, "why"))
                     namespace.path.chmod(0o2750)
                     await until(pilot, lambda: "b starting" in listed(app))
+
+    go(scene)
+
+
+def test_a_key_goes_from_region_to_region_where_there_are_any() -> None:
+    async def scene() -> None:
+        with publishing(FakeSkin("a", fake_structure(2, 2))):
+            async with shown(regions=Regions([Region("left", patch=("board 7",))])) as (app, pilot):
+                everything, left = "a: 2 patches, 40 pressure sensors", "a: 2 patches, 20 pressure sensors, in left"
+                await until(pilot, lambda: line(app, "title") == everything)
+                await pilot.press("r")
+                await until(pilot, lambda: line(app, "title") == left)
+                arrangement = app._picture.arrangement
+                assert arrangement is not None
+                y, x = next(yx for yx in np.ndindex(arrangement.lines, 30) if arrangement.sensor_at(*yx) is not None)
+                await pilot.hover(app.query_one(HeatMap), offset=(x, y))
+                await until(pilot, lambda: line(app, "detail").endswith("; in left"))
+                await pilot.press("r")
+                await until(pilot, lambda: line(app, "title") == everything)
+            async with shown() as (app, pilot):
+                await until(pilot, lambda: line(app, "title") == everything)
+                await pilot.press("r")
+                await pilot.pause()
+                assert app.check_action("next_region", ()) is False
 
     go(scene)

@@ -65,7 +65,8 @@ def icub(
 ) -> None:
     """Read the skin of an iCub: XML of robots-configuration, positions and drawings of skinGui, or folders of them.
 
-    Configurations go to stdout, or to DIR with one geometry file each. Anything not understood is reported on stderr.
+    Configurations go to stdout, or to DIR with a geometry file and a file of regions each. Anything not understood is
+    reported on stderr.
     """
     from skinware_drivers.icub.importer import import_files
     from skinware_drivers.icub.notes import Notes
@@ -131,6 +132,9 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dic
         if part.groups:
             files["geometry"] = folder / f"{part.name}.geometry.toml"
             texts[files["geometry"]] = part.geometry()
+        if part.regions:
+            files["regions"] = folder / f"{part.name}.regions.toml"
+            texts[files["regions"]] = part.regions_text()
         texts[files["config"]] = part.configuration(files["geometry"].name if part.groups else "")
         written.append({kind: str(path) for kind, path in files.items()})
     in_the_way = [str(path) for path in texts if path.exists()]

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
+from skinware.tactile.region_files import regions_to_toml
+from skinware.tactile.regions import Region
 from skinware_drivers.can.roboskin_options import CHANNELS
 from skinware_drivers.icub.body import check_drawings, places_of, read_body
 from skinware_drivers.icub.device import DeviceReader
@@ -16,6 +18,7 @@ from skinware_drivers.icub.drawing import Drawing, is_drawing, read_drawing
 from skinware_drivers.icub.notes import Level, Notes, shown
 from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
+from skinware_drivers.icub.regions import regions_of
 from skinware_drivers.icub.toml_text import configuration_text
 from skinware_drivers.icub.translate import TranslatedBus, enabled_places, service_name, translate
 from skinware_drivers.icub.wrapper import WRAPPER, Port, Wrapper, read_wrapper
@@ -36,6 +39,7 @@ class ImportedPart:
         ports: body parts in its index.
         buses: in the order of the configuration.
         groups: places of its sensors, also of those that are switched off.
+        regions: its body parts.
         triangles: number of triangles that are switched on.
         placed: number of sensors that are switched on and have a place.
     """
@@ -45,6 +49,7 @@ class ImportedPart:
     ports: Sequence[Port]
     buses: list[TranslatedBus]
     groups: list[GeometryGroup]
+    regions: list[Region]
     triangles: int
     placed: int
 
@@ -65,6 +70,10 @@ class ImportedPart:
         """The text of its geometry file."""
         lines = f"Places of the sensors of {self.name}, made by skin-import: its driver publishes them."
         return geometry_to_toml(self.groups, lines)
+
+    def regions_text(self) -> str:
+        """The text of its file of regions."""
+        return regions_to_toml(self.regions, f"Body parts of {self.name} as regions, made by skin-import.")
 
     def figures(self) -> dict[str, object]:
         """For programs."""
@@ -139,12 +148,13 @@ def import_files(
         buses = translate(part, body, bus_names or {}, notes)
         if not buses:
             continue
-        enabled = enabled_places(buses)
-        check_drawings(body, places_of(part, ports), enabled, notes)
+        enabled, places = enabled_places(buses), places_of(part, ports)
+        check_drawings(body, places, enabled, notes)
         name = service_name(part.name, {each.name for each in parts})
         placed = sum(len(group.uid) for place in enabled for group in body.groups.get(place, ()))
-        groups = body.groups_of([bus.patch for bus in buses])
-        parts.append(ImportedPart(name, part, ports, buses, groups, len(enabled), placed))
+        patches = [bus.patch for bus in buses]
+        groups, regions = body.groups_of(patches), regions_of(name, places, enabled, patches)
+        parts.append(ImportedPart(name, part, ports, buses, groups, regions, len(enabled), placed))
     if not only:
         wrappers.name_unused(notes)
     files.name_unused({port.name for part in parts for port in part.ports})

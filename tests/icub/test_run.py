@@ -13,6 +13,8 @@ import pytest
 from skinware import DriverReader, PatchState
 from skinware.cli._command import exit_status
 from skinware.geometry import read_geometry
+from skinware.tactile.region_files import read_regions
+from skinware.tactile.regions import Region
 from skinware_drivers.cli.import_ import command
 from tests.commands import run, running
 from tests.icub.conftest import DEFAULTS, WRAPPER, Made, board_sets, device, triangle_sets
@@ -42,6 +44,10 @@ def test_a_real_arm_lives(robots: Path, geometry: Path, tmp_path: Path) -> None:
             board_and_triangle = structure.sensor_uid[structure.index("pressure")] >> 8
             palm = (board_and_triangle >= 14 << 8 | 8) & (board_and_triangle <= 14 << 8 | 11)
             assert np.array_equal(places.known, palm)
+            regions = read_regions(tmp_path / f"{name}.regions.toml").of(structure, "pressure")
+            assert list(regions) == ["right_hand", "right_forearm", "right_arm"]
+            boards = {part: set((board_and_triangle[index] >> 8).tolist()) for part, index in regions.items()}
+            assert boards == {"right_hand": {14}, "right_forearm": {12, 13}, "right_arm": {8, 9, 10, 11}}
 
 
 def test_a_real_leg_on_two_buses_lives(robots: Path, geometry: Path, tmp_path: Path) -> None:
@@ -60,6 +66,12 @@ def test_a_real_leg_on_two_buses_lives(robots: Path, geometry: Path, tmp_path: P
             foot = {1 << 16 | 12, 1 << 16 | 13}  # on the second bus
             assert set(boards.tolist()) == {*range(1, 8), *foot}
             assert known.sum() == len(places) == 680 + 250
+            regions = read_regions(tmp_path / f"{name}.regions.toml").of(frame.structure, "pressure")
+            of_foot = np.zeros(len(known), bool)
+            of_foot[regions["left_foot"]] = True
+            uid = frame.structure.sensor_uid[frame.structure.index("pressure")]
+            assert set((uid[of_foot] >> 16).tolist()) == foot
+            assert (of_foot & known).sum() == 250
 
 
 def test_a_made_up_part_lives_with_what_its_files_enable(made: Made, tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -122,6 +134,9 @@ def test_json_holds_everything(made: Made, capsys: pytest.CaptureFixture[str]) -
     (part,) = json.loads(capsys.readouterr().out)["parts"]
     assert Path(part["config"]).read_text().startswith("# torso_skin")
     assert len(read_geometry(part["geometry"])) == 384
+    assert list(read_regions(part["regions"])) == [
+        Region("torso", "pressure", ("torso_skin",), patch=("board 7", "board 8"))
+    ]
 
 
 def test_odd_characters_of_names_reach_no_terminal_and_no_file(made: Made, capsys: pytest.CaptureFixture[str]) -> None:

@@ -35,7 +35,7 @@ class Components:
         self._forward = _forward(table)
         self._is_lonely = (table == NONE).all(axis=1)
         self._module = module if self._is_lonely.any() else None
-        self._position = np.full(n + 1, NONE, np.int64)  # among those that are touched; the last one is that of NONE
+        self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
 
     def of(self, touched: Rows) -> tuple[Rows, int]:
         """(m,) int64, the component of each of m touched taxels, counted from 0 in their order; and how many.
@@ -44,10 +44,10 @@ class Components:
             touched: (m,) int64, taxels in ascending order.
         """
         self._position[touched] = np.arange(len(touched))
-        beside = self._position[self._forward[touched]]
+        beside = self._position[self._forward[touched]].reshape(-1)
         self._position[touched] = NONE
-        row, column = np.nonzero(beside != NONE)
-        one, other = row, beside[row, column]
+        pair = np.flatnonzero(beside != NONE)
+        one, other = pair // max(1, self._forward.shape[1]), beside[pair].astype(np.int64)
         if self._module is not None:
             lonely = np.flatnonzero(self._is_lonely[touched])
             _, first, module = np.unique(self._module[touched[lonely]], return_index=True, return_inverse=True)

@@ -259,9 +259,12 @@ class Contacts:
     ) -> npt.NDArray[np.int64]:
         """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
         placed = np.flatnonzero(self._frame[taxels] >= 0)
-        order = placed[np.argsort(load[placed], kind="stable")]
+        contact, load, of_taxel = contact[placed], load[placed], self._frame[taxels[placed]]
+        largest = np.full(count, -1.0)
+        np.maximum.at(largest, contact, load)
+        is_largest = load == largest[contact]
         frame = np.full(count, -1)
-        frame[contact[order]] = self._frame[taxels[order]]  # the largest comes last, and stays
+        frame[contact[is_largest]] = of_taxel[is_largest]
         return frame
 
 

@@ -51,6 +51,13 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Where baselines are kept over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
 )
+@click.option(
+    "--contacts",
+    metavar="NAME",
+    default="contacts",
+    show_default=True,
+    help="Name of the service of its contacts, beside it; empty: none.",
+)
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @namespace_option
 @json_option
@@ -61,6 +68,7 @@ def command(
     into: str,
     config: Path | None,
     state_path: Path | None,
+    contacts: str,
     group: str | None,
     namespace: str | None,
     as_json: bool,
@@ -70,6 +78,7 @@ def command(
 
     The first seconds it measures what untouched sensors read. It goes on when the driver restarts or changes; what it
     learned is kept for 10 minutes over a restart of its own. Programs may ask it to tare, hold and change settings.
+    Beside the driver it publishes its contacts, of pressure sensors if there are any.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
@@ -82,6 +91,8 @@ def command(
         level=logging.INFO if verbose else logging.WARNING, format="skin-calm: %(message)s", stream=sys.stderr
     )
     check_name(name, "driver")
+    if contacts:
+        check_name(contacts, "service")
     settings = ChainSettings.calm() if config is None else ChainSettings.read(config)
     source, target = Namespace(namespace), Namespace(into)
     service = CalmService(
@@ -91,6 +102,7 @@ def command(
         into=target,
         group=group,
         state_path=state_path or default_path(target.name, name),
+        contacts=contacts or None,
         on_ready=lambda: _tell_ready(service, as_json),
     )
     if name not in source.services():
@@ -121,11 +133,12 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         return
     structure = chain.structure
     units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
+    contacts = service.contacts.name if service.contacts is not None and service.contacts.type_name else ""
     if as_json:
         ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
-        where = {"namespace": service.namespace.name, "into": service.into.name}
+        where = {"namespace": service.namespace.name, "into": service.into.name, "contacts": contacts}
         stages = [{"type": name, "stage": stage.name} for name, of_type in chain.stages.items() for stage in of_type]
         print_json(
             {**ready, **counts, "types": types, "units": units, **where, "stages": stages, "restored": service.restored}
@@ -136,7 +149,8 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         ]
         restored = f"; goes on with {service.restored} baselines" if service.restored else ""
         click.echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
-        click.echo(f"publishing (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+        beside = f" and the service {contacts!r}" if contacts else ""
+        click.echo(f"publishing it{beside} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
 
 
 def _tell_status(service: CalmService) -> None:

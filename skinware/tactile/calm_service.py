@@ -31,8 +31,10 @@ from skinware.service.messages import ACQUIRE
 from skinware.status import PatchState, Status
 from skinware.structure import Structure
 from skinware.tactile.baseline import Baseline
+from skinware.tactile.calm_contacts import CalmContacts
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import read_state, save_state
+from skinware.tactile.contacts_service import NAME
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -54,11 +56,13 @@ class CalmService:
         into: namespace of the calmed driver.
         group: whose members may read it.
         state_path: file for what was learned; None: it is not kept.
+        contacts: name of the service of its contacts, in the namespace of the calmed driver; None: there is none.
         on_ready: called when the first frame was published, and whenever the structure is another.
 
     Attributes:
         frames: that were taken.
         restored: sensors that went on with what the file had.
+        contacts: of what touches it; None: they are not wanted.
 
     Raises:
         ConfigurationError: both namespaces are the same, or a bad name.
@@ -73,6 +77,7 @@ class CalmService:
         into: Namespace | str = "calm",
         group: str | None = None,
         state_path: Path | None = None,
+        contacts: str | None = NAME,
         on_ready: Callable[[], object] = lambda: None,
     ) -> None:
         self.name = name
@@ -82,6 +87,7 @@ class CalmService:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
         self.restored = 0
+        self.contacts: CalmContacts | None = CalmContacts(contacts, name, self.into, group) if contacts else None
         self._settings = settings or ChainSettings.calm()
         self._group, self._state_path, self._on_ready = group, state_path, on_ready
         self._reader: DriverReader | None = None
@@ -162,7 +168,7 @@ class CalmService:
             self._end_saving()
             self._save()
             self._end_saving()
-            for end in (self._writer, self._reader):
+            for end in (self.contacts, self._writer, self._reader):
                 if end is not None:
                     end.close()
 
@@ -182,6 +188,7 @@ class CalmService:
             "ready": {name: int(baseline.ready.sum()) for name, baseline in baselines.items()},
             "refused": {name: baseline.refused_share for name, baseline in baselines.items()},
             "touched": dict(self._touched),
+            "contacts": 0 if self.contacts is None else self.contacts.count,
         }
 
     @property
@@ -234,6 +241,8 @@ class CalmService:
         live = columns["patch_state"] == PatchState.LIVE
         columns["patch_state"][live] = PatchState.STALE
         writer.commit(now_ns())
+        if self.contacts is not None:
+            self.contacts.publish_none(now_ns())
 
     # -- publishing ---------------------------------------------------------------------------------------------
 
@@ -259,6 +268,8 @@ class CalmService:
             columns[name][:] = 0
         self._tell_refusals(chain)
         writer.commit(frame.acquired_ns)
+        if self.contacts is not None:
+            self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
         waiting, self._waiting = self._waiting, []
         for asked_ns, request in waiting:
             if frame.acquired_ns >= asked_ns:
@@ -320,6 +331,8 @@ class CalmService:
             )
             self._writer.request_server()
         own = set(self._writer.column_offsets()) - {"values", "status"}
+        if self.contacts is not None:
+            self.contacts.follow(chain, rate_hz)
         self._copied = sorted(own & set(self._reader.schema.columns))
         self._not_told = sorted(own - set(self._copied))
         self._chain, self._counters, self._is_ready = chain, counters, False

@@ -90,6 +90,7 @@ class BaselineStage(Stage):
 
     Attributes:
         baseline: it.
+        touched: (n,) bool, which taxels are, in the newest frame.
     """
 
     name = "baseline"
@@ -102,11 +103,12 @@ class BaselineStage(Stage):
             taxels, type=replace(before, minimum=-span if signed else 0.0, maximum=span), resolution=0.0
         )
         self.baseline = Baseline(taxels.module, taxels.patch, settings, resolution=taxels.resolution, signed=signed)
+        self.touched: npt.NDArray[np.bool_] = np.zeros(len(taxels), bool)
 
     def step(self, signal: Signal) -> None:
         """See :class:`Stage`."""
         calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
-        signal.values = calm.value
+        signal.values, self.touched = calm.value, calm.touched
         signal.forced |= calm.forced
         signal.unknown |= np.isnan(calm.baseline)
 

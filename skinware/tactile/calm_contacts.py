@@ -1,0 +1,115 @@
+"""Contacts beside a calmed driver: found in what comes out of its chain, and published in the same namespace."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError, NameInUse
+from skinware.memory.namespace import Namespace
+from skinware.structure import Structure
+from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE
+from skinware.tactile.chain import BaselineStage, Chain
+from skinware.tactile.contacts_service import ContactsWriter
+
+log: logging.Logger = logging.getLogger("skinware.calm")
+
+_FIRST_CHOICE = "pressure"
+
+
+class CalmContacts:
+    """The service of contacts of one calmed driver; of sensors that say how hard they are touched, pressure first.
+
+    Args:
+        name: of the service.
+        driver: name of the driver.
+        into: namespace of the calmed driver.
+        group: whose members may read it.
+
+    Attributes:
+        type_name: sensors whose contacts are published; empty: none, for the driver has no such sensors, or another
+            program has the name.
+        count: number of contacts in the newest frame.
+    """
+
+    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+        self.name, self.type_name, self.count = name, "", 0
+        self._driver, self._into, self._group = driver, into, group
+        self._chain: Chain | None = None
+        self._stage: BaselineStage | None = None
+        self._writer: ContactsWriter | None = None
+
+    def follow(self, chain: Chain, rate_hz: float | None) -> None:
+        """Go on with another chain, of other sensors.
+
+        Args:
+            chain: whose values come from now on.
+            rate_hz: nominal rate of the driver.
+        """
+        stages = {
+            name: stage
+            for name, of_type in chain.stages.items()
+            for stage in of_type
+            if isinstance(stage, BaselineStage) and not name.startswith(SIGNED_TYPES)
+        }
+        type_name = _FIRST_CHOICE if _FIRST_CHOICE in stages else next(iter(stages), "")
+        self._chain, self._stage, self.count = chain, stages.get(type_name), 0
+        try:
+            if self._writer is not None and type_name == self.type_name:
+                self._writer.restructure(chain.structure)
+            else:
+                self.close()
+                self._writer = self._made(chain.structure, type_name, rate_hz) if type_name else None
+        except (ConfigurationError, NameInUse) as error:  # places without neighbours; another program's contacts
+            self._give_up(error)
+        self.type_name = type_name if self._writer is not None else ""
+
+    def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
+        """Find the contacts of the next frame, and publish them.
+
+        Args:
+            values: (n_sensors,) what came out of the chain.
+            status: (n_sensors,) likewise; sensors that say nothing now touch nothing.
+            acquired_ns: of the frame.
+        """
+        if self._writer is None or self._chain is None or self._stage is None:
+            return
+        index = self._chain.structure.index(self.type_name)
+        usable = (status[index] & UNUSABLE) == 0
+        try:
+            self.count = len(self._writer.publish(values[index], self._stage.touched & usable, acquired_ns))
+        except NameInUse as error:
+            self._give_up(error)
+
+    def publish_none(self, time_ns: int) -> None:
+        """Say that nothing is touched: the driver is dead."""
+        if self._chain is not None:
+            n = self._chain.structure.n_sensors
+            self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
+
+    def close(self) -> None:
+        """Withdraw the service. Idempotent."""
+        if self._writer is not None:
+            self._writer.close()
+        self._writer, self.type_name, self.count = None, "", 0
+
+    def _made(self, structure: Structure, type_name: str, rate_hz: float | None) -> ContactsWriter:
+        return ContactsWriter(
+            structure,
+            type_name,
+            driver=self._driver,
+            name=self.name,
+            namespace=self._into,
+            rate_hz=rate_hz,
+            group=self._group,
+        )
+
+    def _give_up(self, error: Exception) -> None:
+        """Calm values are worth more than contacts: go on without these."""
+        self.close()
+        log.warning("no contacts of %r: %s", self._driver, str(error))
+
+
+__all__ = ["CalmContacts"]

@@ -1,0 +1,193 @@
+"""Contacts beside a calmed driver."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader, Namespace, Status, Structure
+from skinware.geometry import Geometry
+from skinware.sensor_types import SHEAR_X, TEMPERATURE
+from skinware.tactile.calm_service import CalmService
+from skinware.tactile.contacts_service import ContactsFrame, ContactsReader, ContactsWriter
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
+from tests.commands import running
+from tests.tactile.skins import triangles
+
+REST, PRESSED = 200.0, 150.0
+
+
+@pytest.fixture
+def into(calm_namespace: Namespace) -> Namespace:
+    """Where what is calmed is published."""
+    return calm_namespace
+
+
+def placed_structure() -> Structure:
+    """Eight triangles of ten taxels, in eight rows of ten."""
+    structure = fake_structure(2, 4)
+    uid = structure.sensor_uid[structure.index("pressure")]
+    geometry = Geometry.unknown(["pressure"] * 80, uid)
+    geometry.position_m[:], geometry.normal[:], geometry.frame[:] = triangles(8, 10), (0, 0, 1), "palm"
+    return structure.placed(geometry)
+
+
+def press(skin: FakeSkin, *taxels: int) -> None:
+    """Press some taxels of a skin that rests, counted among the taxels."""
+    values = np.full(skin.structure.n_sensors, REST)
+    if taxels:
+        values[np.arange(skin.structure.n_sensors)[skin.structure.index("pressure")][list(taxels)]] = PRESSED
+    skin.values = values
+
+
+@contextmanager
+def calming(into: Namespace, name: str = "fake", **how: Any) -> Iterator[CalmService]:
+    """A service that runs in a thread, and has taken frames."""
+    service = CalmService(name, into=into, **how)
+    thread = threading.Thread(target=service.run)
+    thread.start()
+    try:
+        wait_until(lambda: service.frames > 0)
+        yield service
+    finally:
+        service.stop()
+        thread.join()
+
+
+def tare(into: Namespace, name: str = "fake") -> None:
+    with DriverReader(name, namespace=into, timeout_s=10) as reader:
+        reader.call("tare")
+
+
+def read_until(reader: ContactsReader, condition: Callable[[ContactsFrame], bool]) -> ContactsFrame:
+    """The first frame that fulfils a condition."""
+    found: list[ContactsFrame] = []
+
+    def look() -> bool:
+        frame = reader.read(timeout_s=10)
+        if condition(frame):
+            found.append(frame)
+        return bool(found)
+
+    wait_until(look)
+    return found[0]
+
+
+def test_contacts_stand_beside_the_calmed_driver(into: Namespace) -> None:
+    skin = FakeSkin("fake", placed_structure())
+    press(skin)
+    with publishing(skin), calming(into) as service, ContactsReader(namespace=into, timeout_s=10) as contacts:
+        tare(into)
+        assert len(contacts.read(timeout_s=10).contacts) == 0
+        press(skin, 22, 23, 33, 78)
+        frame = read_until(contacts, lambda frame: len(frame.contacts) == 2)
+        assert [contact.taxels.tolist() for contact in frame] == [[22, 23, 33], [78]]
+        first, second = frame
+        assert (first.load, first.peak, first.n, first.frame) == (150, 50, 3, "palm")
+        assert np.allclose(first.cop_m, triangles(8, 10)[[22, 23, 33]].mean(axis=0))
+        assert second.normal.tolist() == [0, 0, 1]
+        source = contacts.source
+        assert (source.driver, source.type_name, source.unit) == ("fake", "pressure", "counts")
+        wait_until(lambda: service.status()["contacts"] == 2)
+        press(skin, 23, 33)
+        frame = read_until(contacts, lambda frame: len(frame.contacts) == 1)
+        assert frame.contacts.id.tolist() == [first.id]
+
+
+def test_what_says_nothing_now_touches_nothing(into: Namespace) -> None:
+    skin = FakeSkin("fake", placed_structure())
+    press(skin)
+    with publishing(skin), calming(into), ContactsReader(namespace=into, timeout_s=10) as contacts:
+        tare(into)
+        press(skin, 22, 78)
+        read_until(contacts, lambda frame: len(frame.contacts) == 2)
+        position = np.arange(skin.structure.n_sensors)[skin.structure.index("pressure")][78]
+        skin.status[position] = Status.STALE
+        frame = read_until(contacts, lambda frame: len(frame.contacts) == 1)
+        assert frame.contacts[0].taxels.tolist() == [22]
+
+
+def test_when_the_driver_is_gone_nothing_is_touched(into: Namespace) -> None:
+    skin = FakeSkin("fake", placed_structure())
+    press(skin)
+    with ExitStack() as driver:
+        driver.enter_context(publishing(skin))
+        with calming(into), ContactsReader(namespace=into, timeout_s=10) as contacts:
+            tare(into)
+            press(skin, 22)
+            read_until(contacts, lambda frame: len(frame.contacts) == 1)
+            driver.close()
+            read_until(contacts, lambda frame: len(frame.contacts) == 0)
+
+
+def test_contacts_follow_another_structure(into: Namespace) -> None:
+    with ExitStack() as driver:
+        skin = FakeSkin("fake", placed_structure())
+        press(skin)
+        driver.enter_context(publishing(skin))
+        with calming(into), ContactsReader(namespace=into, timeout_s=10) as contacts:
+            assert len(contacts.source.uid) == 80
+            driver.close()
+            other = FakeSkin("fake", fake_structure(1, 2))
+            press(other)
+            driver.enter_context(publishing(other))
+            wait_until(lambda: contacts.refresh() is None or contacts.structure_changed)
+            contacts.reattach()
+            tare(into)
+            press(other, 3, 9, 12)
+            frame = read_until(contacts, lambda frame: len(frame.contacts) == 2)
+            assert [contact.taxels.tolist() for contact in frame] == [[3, 9], [12]]  # by module: there are no places
+            assert len(contacts.source.uid) == 20
+
+
+def test_two_calmed_drivers_need_two_names(into: Namespace, caplog: pytest.LogCaptureFixture) -> None:
+    structure = fake_structure(1, 2)
+    with publishing(FakeSkin("arm", structure)), publishing(FakeSkin("leg", structure)), calming(into, "arm"):
+        wait_until(lambda: "contacts" in into.services())
+        with caplog.at_level(logging.WARNING), calming(into, "leg") as second:
+            assert second.contacts is not None
+            assert second.contacts.type_name == ""
+            assert "no contacts of 'leg': " in caplog.text
+            with DriverReader("leg", namespace=into, timeout_s=10) as reader:
+                reader.read(timeout_s=10)
+        with calming(into, "leg", contacts="leg_contacts"):
+            with ContactsReader("leg_contacts", namespace=into, timeout_s=10) as contacts:
+                assert contacts.source.driver == "leg"
+        with calming(into, "leg", contacts=None):
+            assert sorted(into.services()) == ["arm", "contacts", "leg"]
+
+
+def test_a_driver_that_feels_no_pressure_has_no_contacts(into: Namespace) -> None:
+    structure = fake_structure(1, 2)
+    ids = np.array([TEMPERATURE.id, SHEAR_X.id], np.uint32)
+    other = structure.replace(types=(TEMPERATURE, SHEAR_X), sensor_type=ids[np.arange(structure.n_sensors) % 2])
+    skin = FakeSkin("fake", other)
+    skin.values = np.full(structure.n_sensors, REST)
+    with publishing(skin), calming(into) as service:
+        assert into.services() == ["fake"]
+        assert service.status()["contacts"] == 0
+
+
+def test_the_command_tells_of_its_contacts(into: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    skin = FakeSkin("fake", placed_structure())
+    press(skin)
+    with publishing(skin):
+        with running("skin-calm", "fake", "--into", into.name) as command:
+            assert command.wait_for("ready")["contacts"] == "contacts"
+            assert command.wait_for("status")["contacts"] == 0
+        with running("skin-calm", "fake", "--into", into.name, "--contacts", "") as command:
+            assert command.wait_for("ready")["contacts"] == ""
+            assert into.services() == ["fake"]
+        with ContactsWriter(skin.structure, namespace=into, name="mine"):
+            with running("skin-calm", "fake", "--into", into.name, "--contacts", "mine") as command:
+                assert command.wait_for("ready")["contacts"] == ""
+                assert "no contacts of 'fake'" in command.errors

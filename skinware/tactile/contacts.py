@@ -24,7 +24,7 @@ from skinware.structure import Structure
 from skinware.tactile.components import Components
 from skinware.tactile.neighbours import area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
-from skinware.tactile.tracking import Places, Tracker, TrackingSettings
+from skinware.tactile.tracking import ContactKind, Places, Tracker, TrackingSettings
 
 MOST = 64
 """Contacts that one frame has at most; of more the ones with the largest loads are kept."""
@@ -51,6 +51,7 @@ class Contact:
         force_n: pressure by area, along the normal, N; NaN unless the values are pressures in Pa at known places.
         frame: name of the coordinate frame, empty if it is not known.
         velocity_m_s: (3,) m/s, of the centre; NaN without places.
+        kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
         taxels: (n,) int64, positions among the n taxels, ascending.
     """
 
@@ -65,6 +66,7 @@ class Contact:
     force_n: float
     frame: str
     velocity_m_s: npt.NDArray[np.float32]
+    kind: ContactKind
     taxels: npt.NDArray[np.int64]
 
 
@@ -78,6 +80,7 @@ class ContactSet:
         n: (m,) uint32.
         cop_m, normal, velocity_m_s: (m, 3) float32.
         frame: (m,) int16, index into ``frames``; -1 if it is not known.
+        kind: (m,) uint8, :class:`skinware.tactile.tracking.ContactKind`.
         contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one of those for which there was no
             room.
         beyond: number of contacts for which there was no room.
@@ -95,6 +98,7 @@ class ContactSet:
     force_n: npt.NDArray[np.float32]
     frame: npt.NDArray[np.int16]
     velocity_m_s: npt.NDArray[np.float32]
+    kind: npt.NDArray[np.uint8]
     contact_of: npt.NDArray[np.int16]
     beyond: int
     frames: tuple[str, ...]
@@ -107,6 +111,7 @@ class ContactSet:
         frame = int(self.frame[row])
         return Contact(
             frame=self.frames[frame] if frame >= 0 else "",
+            kind=ContactKind(self.kind[row]),
             taxels=np.flatnonzero(self.contact_of == row),
             **{name: getattr(self, name)[row].item() for name in ("id", "n", *_SCALARS)},
             **{name: getattr(self, name)[row] for name in _VECTORS},
@@ -124,6 +129,7 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "n": ("<u4", ()),
     **dict.fromkeys(_VECTORS, ("<f4", (3,))),
     "frame": ("<i2", ()),
+    "kind": ("u1", ()),
 }
 """Per contact: dtype and shape of each array of a :class:`ContactSet`."""
 
@@ -213,7 +219,7 @@ class Contacts:
             count = MOST
         found = self._measure(taxels, contact, load, count)
         places = Places(taxels, contact, found["load"], found["frame"], found["cop_m"])
-        found["id"], found["age_s"], found["velocity_m_s"] = self._tracker.follow(places, time_ns)
+        found |= self._tracker.follow(places, time_ns)._asdict()
         order = np.lexsort([found["id"], -found["age_s"]])
         row = np.empty(count, np.int64)
         row[order] = np.arange(count)
@@ -295,4 +301,4 @@ def _tracking(geometry: Geometry) -> TrackingSettings:
     return dataclasses.replace(TrackingSettings(), reach_m=_REACH_PITCHES * median_m, fast_m=median_m)
 
 
-__all__ = ["BEYOND", "COLUMNS", "MOST", "NO_CONTACT", "Contact", "ContactSet", "Contacts"]
+__all__ = ["BEYOND", "COLUMNS", "MOST", "NO_CONTACT", "Contact", "ContactKind", "ContactSet", "Contacts"]

@@ -8,9 +8,9 @@
                 print(contact.id, contact.load, contact.cop_m, contact.taxels)
 
 Columns of a frame: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
-the oldest contact first; in the others ``id`` and ``n`` are 0, ``frame`` is -1 and numbers are NaN. ``beyond`` tells
-how many contacts found no row, ``contact_of`` of each taxel the row of its contact. Static columns: ``sensor_uid`` of
-each taxel, ``frame_name``, and ``driver``, ``type_name`` and ``type_unit`` of the values.
+the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``frame`` is -1 and numbers are NaN.
+``beyond`` tells how many contacts found no row, ``contact_of`` of each taxel the row of its contact. Static columns:
+``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_name`` and ``type_unit`` of the values.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ _TEXTS = {
     "normal": ("", "outwards, of length 1"),
     "velocity_m_s": ("m/s", "of its centre"),
     "frame": ("", "row of frame_name; -1: not known"),
+    "kind": ("", "0: a touch, 1: a hold, 2: sliding"),
     "count": ("", "number of rows that are filled"),
     "beyond": ("", "contacts for which there was no row"),
     "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +30,20 @@ shared, or the contact is so fast that they tell nothing."""
 _DOUBT = 0.5
 """So much of the way that a contact should have gone it may be off."""
 _LONGEST_GUESS_S = 0.1
+_CALM = 3.0
+"""Time constant of the motion that is called sliding, in those of the velocity."""
 _LAST_ID = (1 << 32) - 1
+
+
+class ContactKind(enum.IntEnum):
+    """What a contact is doing."""
+
+    TOUCH = 0
+    """It began just now: a tap, if it ends now."""
+    HOLD = 1
+    """It rests, or its load changes."""
+    SLIDING = 2
+    """Its centre moves while its load is steady."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +54,19 @@ class TrackingSettings:
         patience_s: so long an identity is kept while its contact is gone, s.
         reach_m: so far a contact may jump from where it was expected without sharing a taxel, m.
         fast_m: one that is expected to move farther in a frame is judged by its expected place first, m.
-        velocity_s: time constant of its velocity, s.
+        velocity_s: time constant of its velocity, and of the load that is taken for steady, s.
+        touch_s: so long a contact is a touch, s.
+        sliding_m_s: from this speed on it is sliding, down to half of it, m/s.
+        steady: its load differs by at most this share from what it was.
     """
 
     patience_s: float = 0.06
     reach_m: float = 0.015
     fast_m: float = 0.0065
     velocity_s: float = 0.1
+    touch_s: float = 0.3
+    sliding_m_s: float = 0.005
+    steady: float = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +103,11 @@ class _Tracks:
     velocity_m_s: Floats
     steps: Whole
     """Number of moves in the velocity."""
+    load: Floats
+    """Smoothed."""
+    motion_m_s: Floats
+    """The velocity, smoothed once more: noise is not to look like sliding."""
+    kind: Whole
 
     def __getitem__(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> _Tracks:
         return _Tracks(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
@@ -89,6 +115,22 @@ class _Tracks:
     def and_then(self, others: _Tracks) -> _Tracks:
         pairs = ((getattr(self, field.name), getattr(others, field.name)) for field in dataclasses.fields(self))
         return _Tracks(*(np.concatenate(pair) for pair in pairs))
+
+
+class Followed(NamedTuple):
+    """What is known of the m contacts of a frame from those before it.
+
+    Attributes:
+        id: (m,) int64, from 1 on, never given again until 2**32 were.
+        age_s: (m,) s.
+        velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
+        kind: (m,) int64, :class:`ContactKind`.
+    """
+
+    id: Whole
+    age_s: Floats
+    velocity_m_s: Floats
+    kind: Whole
 
 
 class Tracker:
@@ -102,18 +144,13 @@ class Tracker:
     def __init__(self, n: int, settings: TrackingSettings | None = None) -> None:
         self._settings = settings or TrackingSettings()
         none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
-        self._tracks = _Tracks(none, none, none, none, none, none, nowhere, nowhere, none)
+        self._tracks = _Tracks(none, none, none, none, none, none, nowhere, nowhere, none, np.zeros(0), nowhere, none)
         self._track_of = np.full(n, -1, np.int64)
         self._last_id = 0
         self._time_ns: int | None = None
 
-    def follow(self, places: Places, time_ns: int) -> tuple[Whole, Floats, Floats]:
-        """Identities of the contacts of the next frame.
-
-        Returns:
-            (m,) int64 id, from 1 on, never given again until 2**32 were; (m,) s, age; (m, 3) m/s, velocity, NaN where
-            the centre is not known.
-        """
+    def follow(self, places: Places, time_ns: int) -> Followed:
+        """Identities of the contacts of the next frame, and how they move."""
         self._forget(time_ns)
         tracks, size = self._tracks, np.bincount(places.contact, minlength=len(places.load))
         shared = self._shared(places)
@@ -130,14 +167,18 @@ class Tracker:
             cop_m=places.cop_m,
             velocity_m_s=np.where(np.isnan(places.cop_m), np.nan, 0.0),
             steps=np.zeros(len(size), np.int64),
+            load=places.load.copy(),
+            motion_m_s=np.zeros((len(size), 3)),
+            kind=np.full(len(size), int(ContactKind.TOUCH)),
         )
         now.id[found], now.born_ns[found] = tracks.id[known], tracks.born_ns[known]
         self._name(now.id)
         is_joined = overlap >= 0.5
         is_whole = (is_joined.sum(axis=1)[known] <= 1) & (is_joined.sum(axis=0)[found] <= 1)
         self._move(now, found, known, is_whole)
+        self._judge(now, found, known, places.load, time_ns)
         self._keep(now, places, known, time_ns)
-        return now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s
+        return Followed(now.id, (time_ns - now.born_ns) / NS_PER_S, now.velocity_m_s, now.kind)
 
     def _forget(self, time_ns: int) -> None:
         """Let go of the identities whose contacts have been gone for too long."""
@@ -198,6 +239,21 @@ class Tracker:
         before = np.nan_to_num(now.velocity_m_s[found])
         now.velocity_m_s[found] = before + weight * (velocity - before)
 
+    def _judge(self, now: _Tracks, found: Whole, known: Whole, load: Floats, time_ns: int) -> None:
+        """What each contact that goes on is doing."""
+        tracks, settings = self._tracks, self._settings
+        passed_s = np.maximum(now.seen_ns[found] - tracks.seen_ns[known], 0) / NS_PER_S
+        was, motion = tracks.load[known], tracks.motion_m_s[known]
+        now.load[found] = was + (load[found] - was) * -np.expm1(-passed_s / settings.velocity_s)
+        weight = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
+        now.motion_m_s[found] = motion + weight * (np.nan_to_num(now.velocity_m_s[found]) - motion)
+        is_steady = abs(load - now.load) <= settings.steady * now.load
+        slowest = np.full(len(load), settings.sliding_m_s)
+        slowest[found[tracks.kind[known] == ContactKind.SLIDING]] /= 2
+        is_sliding = is_steady & (np.linalg.norm(now.motion_m_s, axis=1) >= slowest)
+        is_old = time_ns - now.born_ns >= settings.touch_s * NS_PER_S
+        now.kind[is_old] = np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD)[is_old]
+
     def _keep(self, now: _Tracks, places: Places, known: Whole, time_ns: int) -> None:
         """Remember this frame, and those whose contacts are gone."""
         tracks = self._tracks
@@ -218,4 +274,4 @@ def _rank(numbers: Floats | Whole) -> Floats:
     return rank
 
 
-__all__ = ["Places", "Tracker", "TrackingSettings"]
+__all__ = ["ContactKind", "Followed", "Places", "Tracker", "TrackingSettings"]

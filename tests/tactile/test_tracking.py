@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skinware.tactile.contacts import Contacts, ContactSet
+from skinware.tactile.contacts import ContactKind, Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
 from tests.tactile.skins import PITCH_M, placed, pressed, triangles
 
@@ -204,6 +204,26 @@ def test_a_contact_that_grows_at_once_does_not_fly() -> None:
     found = scene.show(*np.linspace(HERE, right_m, 9), radius_m=2 * PITCH_M)
     assert len(found) == 1
     assert np.linalg.norm(found.velocity_m_s[0]) < 0.01
+
+
+def test_a_contact_is_a_touch_a_hold_or_sliding() -> None:
+    scene, fingertip_m = Scene(), 3 * PITCH_M
+    kinds = [scene.show(HERE, radius_m=fingertip_m)[0].kind for _ in range(50)]
+    assert kinds == [ContactKind.TOUCH] * 15 + [ContactKind.HOLD] * 35
+    for step in range(1, 51):  # 20 mm/s
+        (contact,) = scene.show(beside(HERE, step * 0.0004), radius_m=fingertip_m)
+    assert contact.kind == ContactKind.SLIDING
+    kinds = [scene.show(beside(HERE, 0.02), radius_m=fingertip_m)[0].kind for _ in range(50)]
+    assert kinds[-1] == ContactKind.HOLD
+    assert kinds.index(ContactKind.HOLD) < 45
+
+
+def test_a_press_that_grows_at_its_place_does_not_slide() -> None:
+    scene, kinds = Scene(), set()
+    for step in range(60):
+        (contact,) = scene.show(beside(HERE, 0.0031), radius_m=(1 + step / 10) * PITCH_M)
+        kinds.add(contact.kind)
+    assert kinds == {ContactKind.TOUCH, ContactKind.HOLD}
 
 
 def test_time_that_stands_still_or_goes_back_is_borne() -> None:

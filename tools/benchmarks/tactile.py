@@ -1,7 +1,9 @@
 """Tactile services: how well baselines hold beside the rules of others, and what they cost.
 
 * speed: one frame of 30,848 taxels, for some patterns of touch; the rule of the iCub takes the same frames in turns.
-* service: ``skin-calm`` on a driver of 30,848 taxels at 50 Hz: processor time of its whole process.
+* contacts: one frame of as many taxels through contacts, alone and after a baseline (contacts.py).
+* service: ``skin-calm`` on a driver of 30,848 taxels with places at 50 Hz: processor time of its whole process, which
+  publishes contacts too.
 * worlds: 25 minutes of drift and touches (``bench_world``), many worlds for each drift and rate.
 """
 
@@ -18,6 +20,7 @@ from dataclasses import fields
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import contacts
 import numpy as np
 import numpy.typing as npt
 from processes import Processes, answer
@@ -28,6 +31,7 @@ from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_service import CalmService
 from tests.tactile.judging import Marks, Ours, Worlds, judge, peers
 from tests.tactile.peers import ICub
+from tests.tactile.skins import placed, triangles
 
 TAXELS = 30_848
 RATE_HZ = 50
@@ -117,6 +121,8 @@ def write(pipe: Connection, namespace: Namespace) -> None:
         sensor_module=MODULE,
         dtype="u1",
     )
+    places = placed(triangles(176, 176)[:TAXELS])  # of type pressure, with uid from 0 on
+    structure = structure.placed(places)
     idle = np.round(240 - 0.8 * random.standard_normal((50, TAXELS))).astype(np.uint8)
     touched = 60 * blobs(random).astype(np.uint8)
     with DriverWriter("skin", structure, namespace=namespace, rate_hz=RATE_HZ) as writer:
@@ -175,14 +181,16 @@ def line(marks: Marks) -> str:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=["speed", "service", "worlds"], help="default: all")
+    parser.add_argument("part", nargs="*", choices=["speed", "contacts", "service", "worlds"], help="default: all")
     parser.add_argument("--worlds", type=int, default=20, help="of each drift, at each rate")
     parser.add_argument("--rates", default="20,50,100", help="Hz")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the service is measured")
     arguments = parser.parse_args()
-    parts = arguments.part or ["speed", "service", "worlds"]
+    parts = arguments.part or ["speed", "contacts", "service", "worlds"]
     if "speed" in parts:
         speed()
+    if "contacts" in parts:
+        contacts.speed()
     if "service" in parts:
         service(arguments.seconds)
     if "worlds" in parts:

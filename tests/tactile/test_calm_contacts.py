@@ -190,4 +190,4 @@ def test_the_command_tells_of_its_contacts(into: Namespace, tmp_path: Path, monk
         with ContactsWriter(skin.structure, namespace=into, name="mine"):
             with running("skin-calm", "fake", "--into", into.name, "--contacts", "mine") as command:
                 assert command.wait_for("ready")["contacts"] == ""
-                assert "no contacts of 'fake'" in command.errors
+                wait_until(lambda: "no contacts of 'fake'" in command.errors)

@@ -1,4 +1,6 @@
-"""Serial lines: framing, checksum and decoding, in memory and through a pseudo terminal. Run: tools/bench serial.
+"""Serial lines: framing, checksum and decoding, in memory and through a pseudo terminal; the driver beside C.
+
+    tools/bench serial [memory] [pty] [rest]     default: all three
 
 The wire is that of a patch of 100 modules with 12 taxels each: COBS, the number of the module, 24 bytes of uint16
 values, CRC-16/XMODEM; 3 Mbaud carry 100 of its cycles a second. Beside ours, in the same rounds: a state machine that
@@ -43,6 +45,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import fill_rows
 from tests.serial.framings import EXAMPLES
 
+PARTS = ("memory", "pty", "rest")
 NAME = "cobs_crc"
 FRAMING = EXAMPLES[NAME].framing
 BODY = 24
@@ -366,12 +369,20 @@ def through_pty(rounds: int, seconds: float) -> None:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=PARTS)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=2.0, help="for each reader and round")
+    parser.add_argument("--latency", type=float, default=5.0, metavar="MS", help="of rest: how long both do")
     arguments = parser.parse_args()
     assert threading.active_count() == 1  # writers are forked
-    in_memory(arguments.rounds)
-    through_pty(arguments.rounds, arguments.seconds)
+    if "memory" in arguments.parts:
+        in_memory(arguments.rounds)
+    if "pty" in arguments.parts:
+        through_pty(arguments.rounds, arguments.seconds)
+    if "rest" in arguments.parts:
+        import serial_rest  # which imports this module
+
+        serial_rest.compare(arguments.rounds, arguments.seconds, arguments.latency)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Any
 
 from can_receivers import LOOK_S, QUIET_S, Measured
 from rest import compile_program
-from serial_line import FRAMING, NAME, PACED_B_S, Skin, frames_of
+from serial_line import NAME, PACED_B_S, Skin, frames_of
 
 from skinware import Namespace
 from skinware_drivers.options import NoOptions
@@ -81,7 +81,7 @@ def compare(rounds: int, seconds: float, latency_ms: float) -> None:
     os.environ["SKINWARE_NAMESPACE"] = f"bench-{os.getpid()}"
     shares: dict[str, list[float]] = {"driver": [], "C loop": []}
     with tempfile.TemporaryDirectory() as folder:
-        commands = [sys.executable, __file__], [compile_program("serial_loop", folder)]
+        commands: list[list[str | Path]] = [[sys.executable, __file__], [compile_program("serial_loop", folder)]]
         try:
             for _ in range(rounds):
                 for name, command in zip(shares, commands, strict=True):

@@ -13,7 +13,7 @@ from unittest.mock import patch
 from skinware.native import Library
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.counters import BusCounters
+from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.serial import bus
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.native_stream import NativeStream, can_compile
@@ -29,11 +29,15 @@ class BothStreams(Stream):
         framing: what is on the line.
         payload_size: of bodies, at most.
         counters: of the bus.
+
+    Attributes:
+        difference: what they differ in, as it was raised; empty if they do not.
     """
 
     def __init__(self, in_c: NativeStream, framing: Framing, payload_size: int, counters: BusCounters) -> None:
         super().__init__(counters)
         self._python, self._native = PythonStream(framing, payload_size, counters), in_c
+        self.difference = ""
 
     @property
     def is_behind(self) -> bool:
@@ -56,14 +60,14 @@ class BothStreams(Stream):
         taken = self._python.fill(batch, ordinal)
         found = self._native.fill(other, ordinal)
         rows = slice(first, batch.stop)
-        _compare("finds", (taken, batch.stop), (found, other.stop))
+        self._compare("finds", (taken, batch.stop), (found, other.stop))
         for name in ("wire", "time_ns", "bus"):
             own, of_c = getattr(batch, name)[rows], getattr(other, name)[rows]
             if own.tobytes() != of_c.tobytes():
-                _compare(name, own.tolist(), of_c.tolist())
+                self._compare(name, own.tolist(), of_c.tolist())
         if not self.is_behind:
-            _compare("counts", self.counters, self._native.counters)
-            _compare("holds back", self._python.pending, self._native.pending)
+            self._compare("counts", _counted(self.counters), _counted(self._native.counters))
+            self._compare("holds back", self._python.pending, self._native.pending)
         return taken
 
     def take_damaged(self) -> bytes:
@@ -71,25 +75,39 @@ class BothStreams(Stream):
         if self._native.is_behind:
             return b""
         damaged = self._python.take_damaged()
-        _compare("keeps as a sample", damaged, self._native.take_damaged())
+        self._compare("keeps as a sample", damaged, self._native.take_damaged())
         return damaged
 
+    def _compare(self, what: str, of_python: object, of_c: object) -> None:
+        if of_python != of_c:
+            self.difference = f"{what}: Python {of_python}, C {of_c}"
+            defect(self.difference)
 
-def _compare(what: str, of_python: object, of_c: object) -> None:
-    if of_python != of_c:
-        defect(f"{what}: Python {of_python}, C {of_c}")
+
+def _counted(counters: BusCounters) -> tuple[int | FramerCounters, ...]:
+    """What streams count; the rest is the bus'."""
+    return counters.frames, counters.errors, counters.refused, counters.framing
 
 
 @contextmanager
 def both_streams() -> Iterator[None]:
-    """As long as the ``with`` lasts, lines that are opened find frames in both ways, where C can."""
-    library = native.library()
+    """As long as the ``with`` lasts, lines that are opened find frames in both ways, where C can.
+
+    What differs is raised where it is found, in the driver, and here again.
+    """
+    library, streams = native.library(), list[Stream]()
 
     def stream_of(framing: Framing, payload_size: int, counters: BusCounters) -> Stream:
-        return made(library, framing, payload_size, counters)
+        streams.append(made(library, framing, payload_size, counters))
+        return streams[-1]
 
     with patch.object(bus, "stream_of", stream_of):
-        yield
+        try:
+            yield
+        finally:
+            for stream in streams:
+                if isinstance(stream, BothStreams) and stream.difference:
+                    defect(stream.difference)
 
 
 def made(

@@ -146,7 +146,9 @@ class SerialBus(KernelBus):
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
         """Tell C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
         stream, port = self._stream, self._port
-        if self._unsent or not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
+        if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
+            return False
+        if self._unsent or self._epoll is None:  # Python sends on; a thread is opening it
             return False
         self._stay_readable(False)  # C asks the stream itself
         self._handed = stream, port

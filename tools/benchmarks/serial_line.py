@@ -39,6 +39,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Bits, Frame, Layout, Values
 from skinware_drivers.options import NoOptions
+from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
@@ -287,7 +288,8 @@ def read_driver(path: str, seconds: float, _ages_ns: list[int]) -> int:
 
     namespace = Namespace(f"bench-{os.getpid()}")
     try:
-        asyncio.run(run())
+        with asyncio.Runner(loop_factory=FlowLoop) as loop:
+            loop.run(run())
     finally:
         import shutil
 

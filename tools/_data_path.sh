@@ -10,5 +10,6 @@ data_path_tests=(
     tests/sdk/test_{many_buses,pairing,patch_timing,publisher,roboskin_damage,roboskin_inertial,roboskin_kinds}.py
     tests/sdk/test_{roboskin_wire,running_driver,samples,socketcan_receive,socketcan_stamps,stamps}.py
     tests/drivers/test_{conformance,wire_formats}.py
+    tests/serial/test_{device_drivers,serial_driver}.py
     tests/virtual/test_faults.py
 )

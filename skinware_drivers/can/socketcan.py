@@ -242,11 +242,8 @@ class SocketCanBus(KernelBus):
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)
-        source.fd, source.headers, source.control = (
-            self._socket.fileno(),
-            rows.headers_address,
-            rows.control.ctypes.data,
-        )
+        source.fd, source.stream = self._socket.fileno(), None
+        source.headers, source.control = rows.headers_address, rows.control.ctypes.data
         source.offset_ns, source.last_poll_ns = self._stamper.state
         source.lost_before, source.lost, source.frames = self._lost_before, self.counters.lost, 0
         source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
@@ -94,6 +95,22 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.module_time_ns, plan.updated = arrays.at(state.module_time_ns), arrays.at(state.updated)
     plan.patch_time_ns, plan.touched = arrays.at(state.patch_time_ns), arrays.at(state.touched)
     plan.bus_counters, plan.patch_counters = arrays.at(state.bus_counters), arrays.at(state.patch_counters)
+
+
+def compile_batch(batch: FrameBatch, arrays: structs.Arrays) -> structs.Batch:
+    """A batch as it is now, whose memory ``arrays`` keep."""
+    return structs.Batch(
+        wire=arrays.at(batch.wire),
+        time_ns=arrays.at(batch.time_ns),
+        bus=arrays.at(batch.bus),
+        row_bytes=batch.wire.dtype.itemsize,
+        payload_size=batch.payload_size,
+        headroom=batch.headroom,
+        capacity=batch.capacity,
+        start=batch.start,
+        stop=batch.stop,
+        limit=batch.limit,
+    )
 
 
 def _type(dtype: Any) -> tuple[int, int]:

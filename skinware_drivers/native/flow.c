@@ -30,7 +30,7 @@ static struct source *source_of(const struct flow *flow, int fd)
 static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns, bool *is_behind)
 {
     struct batch *batch = path->batch;
-    int64_t n_heard = 0, most = n * FEWEST_ROWS > MOST_ROWS ? n * FEWEST_ROWS : MOST_ROWS;
+    int64_t n_taken = 0, most = n * FEWEST_ROWS > MOST_ROWS ? n * FEWEST_ROWS : MOST_ROWS;
     bool is_news = false;
     if (n < MOST_EVENTS)
         path->words->read_ns = time_ns;
@@ -38,9 +38,12 @@ static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t
     *is_behind = n == MOST_EVENTS;
     for (int64_t i = 0; i < n; i++) {
         batch->limit = batch->stop + (least(batch->capacity, batch->headroom + most) - batch->stop) / (n - i);
-        if (ready[i]->fd < 0 || !receive(path, ready[i]))
+        int64_t first = batch->stop;
+        if (ready[i]->fd < 0 || !(ready[i]->stream ? receive_line : receive)(path, ready[i]))
             continue;
-        n_heard++;
+        n_taken++;
+        if (batch->stop == first)
+            continue;
         ready[i]->heard_ns = time_ns;
         if (batch->stop == batch->limit) {
             *is_behind = true;
@@ -50,7 +53,14 @@ static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t
     }
     if (is_news)
         path->plan->hooks.heard();
-    return n_heard;
+    return n_taken;
+}
+
+static bool is_among(struct source **ready, int64_t n, const struct source *source)
+{
+    while (n > 0 && ready[n - 1] != source)
+        n--;
+    return n > 0;
 }
 
 /* The buses that have something, -1: Python has to read one of them. Of a few, all are asked without a look before. */
@@ -62,12 +72,15 @@ static int64_t find_ready(struct flow *flow, struct source **ready)
             ready[i] = &flow->sources[i];
         return flow->n_sources;
     }
-    int n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
-    for (int i = 0; i < n; i++) {
+    int64_t n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
+    for (int64_t i = 0; i < n; i++) {
         ready[i] = source_of(flow, events[i].data.fd);
         if (!ready[i])
             return -1;
     }
+    for (struct source *source = flow->sources; source < flow->sources + flow->n_sources && n < MOST_EVENTS; source++)
+        if (source->stream && source->stream->is_behind && !is_among(ready, n, source))
+            ready[n++] = source;
     return n;
 }
 

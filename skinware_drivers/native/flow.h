@@ -1,11 +1,12 @@
-/* Where frames come from: CAN sockets, read in C, and the loop that takes, publishes and rests. */
+/* Where frames come from, CAN sockets and serial lines, read in C; and the loop that takes, publishes and rests. */
 #ifndef SKINWARE_DRIVERS_FLOW_H
 #define SKINWARE_DRIVERS_FLOW_H
 
-#include "inside.h"
+#include "framing.h"
 
-struct source { /* a socket whose datagrams are struct can_frame or canfd_frame, stamped by the kernel */
-    int64_t fd, bus;
+struct source { /* a serial line, or a socket whose datagrams are struct can_frame or canfd_frame, with stamps */
+    int64_t fd, bus;                           /* fd: as it is known in `epoll_fd`, -1: it is gone */
+    struct stream *stream;                     /* of a line; NULL: what follows is of a socket */
     int64_t headers, control;                  /* addresses of a mmsghdr and of 8 words for every row of the batch */
     int64_t offset_ns, last_poll_ns;           /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
     int64_t lost_before, lost, frames, heard_ns; /* lost: ever; frames: since Python looked */
@@ -22,6 +23,7 @@ struct flow {
     struct source *sources;
 };
 
-int64_t receive(struct path *path, struct source *source);
+bool receive(struct path *path, struct source *source);
+bool receive_line(struct path *path, struct source *source);
 
 #endif

@@ -1,4 +1,4 @@
-"""Buses from whose sockets C code can receive."""
+"""Buses from whose descriptors C code can receive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skinware_drivers.native.structs import Source
 
 
 class KernelBus(Bus):
-    """A bus of the kernel: a socket whose datagrams are ``struct can_frame`` or ``struct canfd_frame``."""
+    """A bus of the kernel: a socket whose datagrams are ``struct can_frame`` or ``struct canfd_frame``, or a line."""
 
     @property
     @abstractmethod
@@ -22,7 +22,8 @@ class KernelBus(Bus):
 
         Args:
             batch: into whose rows.
-            source: told: the socket, where ancillary data goes, what is known of the clocks and counted so far.
+            source: told: the descriptor, and the stream of a line; of a socket, where ancillary data goes, what is
+                known of the clocks and counted so far.
 
         Returns:
             Whether it can, now.
@@ -32,13 +33,13 @@ class KernelBus(Bus):
     def take_back(self, source: Source) -> None:
         """Go on with what C code did since ``hand_over``; called before anything else is."""
 
-    @abstractmethod
-    def sort_out(self, batch: FrameBatch, new: slice) -> int:
+    def sort_out(self, batch: FrameBatch, new: slice) -> int:  # noqa: ARG002
         """Take what is no data frame of this layout out of new rows of a batch; returns how many are left."""
+        return len(range(new.start, new.stop))
 
     @abstractmethod
     def nothing_received(self, number: int) -> int:
-        """What an error of the kernel means in the place of frames.
+        """What an error of the kernel means in the place of frames; 0: it gave nothing though there was something.
 
         Raises:
             skinware.errors.BusNotAvailable: the interface went down or away.

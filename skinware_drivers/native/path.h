@@ -117,13 +117,14 @@ struct hooks {             /* NULL: there is nothing to do */
     int64_t (*sort_out)(int64_t bus, int64_t first, int64_t n); /* unusual rows are among these; how many are left */
     void (*lose)(int64_t bus, int64_t error);
     void (*heard)(void); /* frames came on a bus that Python wanted to know of */
+    void (*damaged)(int64_t bus, const uint8_t *bytes, int64_t n); /* bytes of a line without a frame, for the samples */
 };
 
 /* -- the whole ----------------------------------------------------------------------------------------------------- */
 
 enum { UNKNOWN, BAD_LENGTH, BAD_CONTENT, BEFORE_BOOT, N_DECODER_COUNTERS };               /* of a bus */
 enum { UPDATES, ORPHANS, LATE, SEQUENCE_LOST, SEQUENCE_REPEATED, SEQUENCE_BACK, N_PATCH_COUNTERS }; /* of a patch */
-enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, N_SAMPLE_KINDS = 5 };
+enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, SAMPLE_REFUSED, N_SAMPLE_KINDS };
 
 struct columns { /* of a slot: where they begin, bytes from its start */
     int64_t values, status, module_time_ns, patch_state, bus_state, bus_reason, bus_since_ns, bus_load, bus_samples;
@@ -186,7 +187,8 @@ struct plan {
     int64_t *skipped;              /* (n_buses,) updates that were never published, since Python looked */
     const int64_t *skipped_before; /* (n_buses,) and before that */
     const int64_t *patch_bus;
-    int64_t skipped_column, lost_column, frames_column;
+    int64_t skipped_column, lost_column, frames_column, errors_column, refused_column;
+    int64_t bytes_column; /* of a line: bytes_in, and the five behind it */
     int64_t *timing;  /* (2, n_patches, SKINWARE__BUCKETS) */
     int64_t *timing_before_ns;
     struct columns columns;

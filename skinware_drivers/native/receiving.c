@@ -113,8 +113,8 @@ static int64_t receive_some(struct path *path, const struct source *source)
     return recvmmsg((int)source->fd, headers, (unsigned)n, MSG_DONTWAIT, NULL);
 }
 
-/* Append what has arrived to the batch, up to its limit; how many rows that are. */
-int64_t receive(struct path *path, struct source *source)
+/* Append what has arrived to the batch, up to its limit; whether there are rows. */
+bool receive(struct path *path, struct source *source)
 {
     struct batch *batch = path->batch;
     int64_t begin = batch->stop, n = ROWS_AT_ONCE;
@@ -124,7 +124,7 @@ int64_t receive(struct path *path, struct source *source)
         if (n < 0 && errno != EAGAIN && errno != EINTR) {
             path->plan->hooks.lose(source->bus, errno);
             source->fd = -1;
-            return batch->stop - begin;
+            return batch->stop > begin;
         }
         if (n <= 0)
             break;
@@ -141,5 +141,5 @@ int64_t receive(struct path *path, struct source *source)
     /* frames are lost only where many wait, or the buffer is full after a few */
     if (batch->stop - begin >= ROWS_AT_ONCE || batch->stop == batch->limit || source->is_small)
         read_memory(path, source);
-    return batch->stop - begin;
+    return batch->stop > begin;
 }

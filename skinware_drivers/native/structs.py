@@ -136,6 +136,7 @@ EXPAND = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p
 PUBLISHED = ctypes.CFUNCTYPE(None, ctypes.c_int64)
 SORT_OUT = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 LOSE = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64)
+DAMAGED = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64)
 
 
 class Hooks(ctypes.Structure):
@@ -152,6 +153,7 @@ class Hooks(ctypes.Structure):
         ("sort_out", SORT_OUT),
         ("lose", LOSE),
         ("heard", HEAR),
+        ("damaged", DAMAGED),
     ]
 
 
@@ -173,7 +175,7 @@ class Plan(ctypes.Structure):
         *_fields("bus_samples_bytes"),
         *_fields("latency_ns data_path", _POINTER),
         *_fields("counts skipped skipped_before patch_bus", _POINTER),
-        *_fields("skipped_column lost_column frames_column"),
+        *_fields("skipped_column lost_column frames_column errors_column refused_column bytes_column"),
         *_fields("timing timing_before_ns", _POINTER),
         ("columns", Columns),
         ("hooks", Hooks),
@@ -191,11 +193,68 @@ class Words(ctypes.Structure):
     )
 
 
-class Source(ctypes.Structure):
-    """A socket that C reads."""
+class Checksum(ctypes.Structure):
+    """How a checksum is computed; size 0: there is none."""
 
     _fields_ = [
-        *_fields("fd bus headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
+        *_fields("form size is_big width init mask xor_out is_negative is_reversed"),
+        *_fields("table", _POINTER),
+    ]
+
+
+class WireField(ctypes.Structure):
+    """A whole number in the header of a frame; size 0: there is none."""
+
+    _fields_ = _fields("offset size is_big mask")
+
+
+class Framing(ctypes.Structure):
+    """How frames lie in a stream of bytes."""
+
+    _fields_ = [
+        *_fields("form body_start shortest longest"),
+        ("checksum", Checksum),
+        ("identifier", WireField),
+        *_fields("delimiter escape longest_segment"),
+        *_fields("meaning", _POINTER),
+        *_fields("n_sync n_trailer"),
+        *_fields("sync trailer", _POINTER),
+        ("length", WireField),
+        *_fields("more bare"),
+        *_fields("totals", _POINTER),
+        *_fields("behind known_from look_ahead confirms_each checksum_at covered_from covered_to"),
+    ]
+
+
+class Reading(ctypes.Structure):
+    """When the bytes of a stream up to a place came."""
+
+    _fields_ = _fields("end time_ns")
+
+
+class Stream(ctypes.Structure):
+    """A stream of bytes in which C finds frames."""
+
+    _fields_ = [
+        *_fields("framing", _POINTER),
+        *_fields("fd payload_size"),
+        *_fields("bytes content", _POINTER),
+        *_fields("size place before follows_at is_discarding is_behind"),
+        *_fields("reads", _POINTER),
+        *_fields("n_reads"),
+        *_fields("chunk", _POINTER),
+        *_fields("chunk_bytes is_good is_damaged frames too_long"),
+        *_fields("bytes_in frame_bytes idle_bytes skipped_bytes found checksum_errors bad_form"),
+    ]
+
+
+class Source(ctypes.Structure):
+    """A socket or a serial line that C reads."""
+
+    _fields_ = [
+        *_fields("fd bus"),
+        *_fields("stream", _POINTER),
+        *_fields("headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
         *_fields("is_counted is_watched is_small"),
         *_fields("speed_up wire_bits fullest", _REAL),
     ]
@@ -216,7 +275,7 @@ UPDATE = np.dtype([(name, np.int64) for name in ["module", "row", "whole", "is_f
 SIZES = (
     *(
         ctypes.sizeof(each)
-        for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source)
+        for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source, Framing, Stream)
     ),
     UPDATE.itemsize,
 )

@@ -1,4 +1,4 @@
-"""Frames flow from sockets into the ring in C, in the place of the event loop's rest.
+"""Frames flow from sockets and serial lines into the ring in C, in the place of the event loop's rest.
 
 An event loop that has nothing to do waits in its selector. Here it is there that frames are taken, published and rested
 from, in one call without the interpreter lock, until the loop's next moment, or until something else has become
@@ -13,6 +13,7 @@ import selectors
 from collections.abc import Callable
 
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.samples import Unused
 from skinware.status import BusReason, BusState
 from skinware_drivers.native import structs
 from skinware_drivers.native.kernel_bus import KernelBus
@@ -97,6 +98,7 @@ class Flow:
         self._sources = (structs.Source * 0)()
         self._handed: list[tuple[BusLine, KernelBus, structs.Source]] = []
         path.sort_out, path.lose, path.heard = self._sort_out, self._lose, self._heard
+        path.damaged = self._keep_sample
 
     def run(self, loop_fd: int, timeout_s: float | None) -> None:
         """Let frames flow, for so long at the most."""
@@ -172,6 +174,9 @@ class Flow:
         kept = self._bus(bus).sort_out(self._batch, slice(first, first + n))
         self._path.interrupt(self._generation.interrupted())
         return kept
+
+    def _keep_sample(self, bus: int, chunk: bytes) -> None:
+        self._lines[bus].bus.samples.note(Unused.REFUSED, 0, chunk)
 
     def _lose(self, bus: int, number: int) -> None:
         line = self._lines[bus]

@@ -22,7 +22,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.layout import Expand
 from skinware_drivers.native import structs
-from skinware_drivers.native.compiling import compile_decoder, why_not
+from skinware_drivers.native.compiling import compile_batch, compile_decoder, why_not
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
 
@@ -59,6 +59,7 @@ class NativePath:
         sort_out: takes what is no data frame out of rows (bus, first, number); returns how many are left.
         lose: told which bus went away, and the system's error number.
         heard: told that frames came on a bus that is watched.
+        damaged: shown bytes of a serial line in which there is no frame, at most four times a second.
     """
 
     def __init__(self, library: Library, decoder: Decoder, publisher: Publisher, batch: FrameBatch) -> None:
@@ -70,12 +71,12 @@ class NativePath:
         self.sort_out: Callable[[int, int, int], int] = lambda _bus, _first, n: n
         self.lose: Callable[[int, int], None] = lambda _bus, _error: None
         self.heard: Callable[[], None] = lambda: None
+        self.damaged: Callable[[int, bytes], None] = lambda _bus, _chunk: None
         self._error: BaseException | None = None
         self._arrays = arrays = structs.Arrays()
-        self._plan, self._words, self._rows = structs.Plan(), structs.Words(), structs.Batch()
+        self._plan, self._words, self._rows = structs.Plan(), structs.Words(), compile_batch(batch, arrays)
         compile_decoder(decoder, self._plan, arrays)
         self._compile_publisher(publisher, arrays)
-        self._compile_batch(batch, arrays)
         self._plan.hooks = self._make_hooks()
         self._load(library)
         self._words.last_published_ns = now_ns()
@@ -213,7 +214,9 @@ class NativePath:
         counts = publisher.count_buses()
         plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)
         plan.skipped_column = self._skipped_column
-        plan.lost_column, plan.frames_column = OWN_BUS_COUNTERS.index("lost"), OWN_BUS_COUNTERS.index("frames")
+        for name in ("lost", "frames", "errors", "refused"):
+            setattr(plan, f"{name}_column", OWN_BUS_COUNTERS.index(name))
+        plan.bytes_column = OWN_BUS_COUNTERS.index("bytes_in")
         self._skipped, self._skipped_before = np.zeros((2, n_buses), np.int64)
         plan.skipped, plan.skipped_before = arrays.at(self._skipped), arrays.at(self._skipped_before)
         self._interrupted = np.zeros(n_buses, bool)
@@ -225,13 +228,6 @@ class NativePath:
         for name, offset in publisher.column_offsets().items():
             setattr(plan.columns, name, offset)
         self._words.on_request = publisher.on_request
-
-    def _compile_batch(self, batch: FrameBatch, arrays: structs.Arrays) -> None:
-        rows = self._rows
-        rows.wire, rows.time_ns, rows.bus = arrays.at(batch.wire), arrays.at(batch.time_ns), arrays.at(batch.bus)
-        rows.row_bytes, rows.payload_size = batch.wire.dtype.itemsize, batch.payload_size
-        rows.headroom, rows.capacity = batch.headroom, batch.capacity
-        rows.start, rows.stop, rows.limit = batch.start, batch.stop, batch.limit
 
     def _update_dtype(self) -> np.dtype[np.void]:
         """Rows of the updates in C."""
@@ -274,6 +270,7 @@ class NativePath:
             structs.SORT_OUT(self._guarded(self._on_unusual)),
             structs.LOSE(self._guarded(self._on_loss)),
             structs.HEAR(self._guarded(lambda: self.heard())),
+            structs.DAMAGED(self._guarded(self._on_damage)),
         )
 
     def _guarded(self, hook: Callable[..., int | None]) -> Callable[..., int]:
@@ -300,6 +297,10 @@ class NativePath:
         self._words.must_leave = True
         self.lose(bus, error)
 
+    def _on_damage(self, bus: int, at: int, n: int) -> None:
+        self.damaged(bus, ctypes.string_at(at, n))
+        self._take_sample_times()
+
     def _on_data(self) -> None:
         self._words.must_leave = True
         self.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
@@ -319,7 +320,10 @@ class NativePath:
     def _on_keep(self, why: int, at: int, n: int) -> None:
         decoder = self._decoder
         decoder.keep_samples(Unused(why), self._batch.bus, self._batch.wire, _view(at, n, np.int64))
-        self._sample_next_ns[:] = [samples.next_ns for samples in decoder.samples]
+        self._take_sample_times()
+
+    def _take_sample_times(self) -> None:
+        self._sample_next_ns[:] = [samples.next_ns for samples in self._decoder.samples]
 
     def _on_expand(self, number: int, updates_at: int, rows_at: int, failed_at: int, n: int) -> None:
         updates, rows = _view(updates_at, n, np.int64), _view(rows_at, n, np.int64)

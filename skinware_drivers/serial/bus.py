@@ -1,4 +1,4 @@
-"""A serial line as a bus: bytes are read in chunks as large as they come, and cut into frames by a framer."""
+"""A serial line as a bus: bytes are read in chunks as large as they come, and become frames in a stream."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import select
 from dataclasses import replace
 from typing import ClassVar
 
-import numpy as np
-import numpy.typing as npt
-
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.native.kernel_bus import KernelBus
+from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.framing import Encoding, Framed, Framer, Framing, Unframed, fill_rows
+from skinware_drivers.serial.framing import Encoding, Framing, Unframed
+from skinware_drivers.serial.native_stream import NativeStream, stream_of
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
-from skinware_drivers.serial.ports import Port, PtyPort
+from skinware_drivers.serial.ports import DescriptorPort, Port, PtyPort
+from skinware_drivers.serial.stream import CHUNK, Stream
 
-_CHUNK = 1 << 16
 _MORE_WAITS = 2048  # a read that gave so much is followed by another
 _MOST_UNSENT = 1 << 16
 _SPAN_NS = NS_PER_S
 """What was skipped is held against what was good so often."""
 
 
-class SerialBus(Bus):
+class SerialBus(KernelBus):
     """A serial line.
 
     Its name is ``serial:PATH?key=value`` (or only ``/dev/...``), where PATH is a device or one of pyserial's URLs;
@@ -71,9 +71,8 @@ class SerialBus(Bus):
         self._event = -1
         self._woken = False
         self._unsent = b""
-        self._backlog: list[tuple[list[Framed], npt.NDArray[np.int64]]] = []
-        self._framer: Framer = self._framing.framer()
-        self._reads: list[tuple[int, int]] = []
+        self._stream: Stream = stream_of(self._framing, payload_size, self.counters)
+        self._handed: tuple[NativeStream, DescriptorPort] | None = None  # to C
         self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     @property
@@ -130,24 +129,50 @@ class SerialBus(Bus):
             raise BusNotAvailable(f"{self!r} is not open")
         if self._unsent:
             self._send_on()
-        if not self._backlog:
+        if not self._stream.is_behind:
             self._read(self._port)
-        taken = 0
-        while self._backlog and batch.free:
-            framed, time_ns = self._backlog[0]
-            count = min(len(framed), batch.free)
-            rows = slice(batch.stop, batch.stop + count)
-            fill_rows(batch.wire[rows], framed[:count])
-            batch.time_ns[rows], batch.bus[rows] = time_ns[:count], ordinal
-            batch.stop += count
-            taken += count
-            if count == len(framed):
-                self._backlog.pop(0)
-            else:
-                self._backlog[0] = framed[count:], time_ns[count:]
-        self._stay_readable(bool(self._backlog))
-        self.counters.frames += taken
+        taken = self._stream.fill(batch, ordinal)
+        if damaged := self._stream.take_damaged():
+            self.samples.note(Unused.REFUSED, 0, damaged)
+        self._stay_readable(self._stream.is_behind)
+        self._tell_garbled(now_ns())
         return taken
+
+    @property
+    def reads_natively(self) -> bool:
+        """Whether C finds the frames of what is on the line, and reads the port, as far as it is known which it is."""
+        return isinstance(self._stream, NativeStream) and isinstance(self._port, DescriptorPort | None)
+
+    def hand_over(self, batch: FrameBatch, source: Source) -> bool:
+        """Tell C code how to receive; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        stream, port = self._stream, self._port
+        if not isinstance(stream, NativeStream) or not isinstance(port, DescriptorPort):
+            return False
+        if self._unsent or self._epoll is None:  # Python sends on; a thread is opening it
+            return False
+        self._stay_readable(False)  # C asks the stream itself
+        self._handed = stream, port
+        source.fd, source.stream = self.fileno(), stream.hand_over(port.fileno(), batch)
+        return True
+
+    def take_back(self, source: Source) -> None:  # noqa: ARG002
+        """Go on with what C code did meanwhile."""
+        if self._handed is not None:
+            self._handed[0].count()
+            self._handed = None
+        if self._port is not None:
+            self._stay_readable(self._stream.is_behind)
+        self._tell_garbled(now_ns())
+
+    def nothing_received(self, number: int) -> int:
+        """What an error of the kernel in the place of bytes means.
+
+        Raises:
+            BusNotAvailable: the port went away.
+        """
+        if self._handed is None:
+            return 0
+        raise self._handed[1].gone(number)
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Send one frame; what the port does not take at once follows when it can.
@@ -182,63 +207,28 @@ class SerialBus(Bus):
         return "" if self._port is None else self._port.note
 
     def _begin_anew(self) -> None:
-        counters = self.counters.framing
-        counters.skipped_bytes += self._framer.pending
-        self._framer = self._framing.framer()
-        self._framer.counters = counters
-        self._told, self._told_ns, self._is_garbled = replace(counters), 0, False
-        self._reads.clear()
-        self._backlog.clear()
+        self.counters.framing.skipped_bytes += self._stream.pending
+        self._stream = stream_of(self._framing, self.payload_size, self.counters)
+        self._told, self._told_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     def _read(self, port: Port) -> None:
-        chunk = more = port.read(_CHUNK)
-        while len(more) >= _MORE_WAITS and len(chunk) < _CHUNK:
+        chunk = more = port.read(CHUNK)
+        while len(more) >= _MORE_WAITS and len(chunk) < CHUNK:
             try:
-                more = port.read(_CHUNK - len(chunk))
+                more = port.read(CHUNK - len(chunk))
             except BusNotAvailable:  # which the next read says again
                 break
             chunk += more
-        if not chunk:
-            return
-        time_ns = now_ns()
-        framer, counters = self._framer, self.counters.framing
-        known = framer.position
-        damaged = counters.checksum_errors + counters.refused
-        framed = framer.feed(chunk)
-        damaged = counters.checksum_errors + counters.refused - damaged
-        self.counters.errors += damaged
-        if damaged and not len(framed):
-            self.samples.note(Unused.REFUSED, 0, chunk)
-        self._reads.append((framer.position, time_ns))
-        fitting = [frame for frame in framed if len(frame.body) <= self.payload_size]
-        self.counters.refused += len(framed) - len(fitting)
-        if fitting:
-            self._backlog.append((fitting, self._times(fitting, known, time_ns)))
-        self._forget_reads()
-        if time_ns > self._told_ns + _SPAN_NS:
-            self._tell_garbled(time_ns)
+        if chunk:
+            self._stream.add(chunk, now_ns())
 
     def _tell_garbled(self, time_ns: int) -> None:
-        """Whether more was skipped than was good since it was last told."""
+        """Whether more was skipped than was good since it was last told, which is to be told now and then."""
         now, before = self.counters.framing, self._told
+        if now.bytes_in == before.bytes_in or time_ns <= self._told_ns + _SPAN_NS:
+            return
         self._is_garbled = now.skipped_bytes - before.skipped_bytes > now.frame_bytes - before.frame_bytes
         self._told, self._told_ns = replace(now), time_ns
-
-    def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
-        """(n,) int64 ns: when the last byte of each frame was read."""
-        if framed[0].end > known:
-            return np.full(len(framed), time_ns)
-        ends, times = zip(*self._reads, strict=True)  # some were held back behind a false beginning
-        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
-        return found
-
-    def _forget_reads(self) -> None:
-        """Keep the times of the bytes that are still held back."""
-        undecided = self._framer.position - self._framer.pending
-        if not self._framer.pending:
-            self._reads.clear()
-        while self._reads and self._reads[0][0] <= undecided:
-            self._reads.pop(0)
 
     def _send(self, identifier: int, payload: bytes) -> None:
         self.may_send_by(self._port)

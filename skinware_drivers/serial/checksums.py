@@ -127,7 +127,7 @@ class Crc(Checksum):
         """Of one piece of data."""
         if self.native is not None:
             return self.native(data)
-        return self._finish(self._after(data, self._first_state))
+        return self._finish(self._after(data, self.first_state))
 
     @cached_property
     def native(self) -> Callable[[bytes | memoryview], int] | None:
@@ -151,16 +151,18 @@ class Crc(Checksum):
         return self.reflected_in or self.reflected_out
 
     @property
-    def _first_state(self) -> int:
+    def first_state(self) -> int:
+        """Before the first byte."""
         return _reversed(self.init, self.width) if self.reflected_in else self.init
 
     @cached_property
-    def _table(self) -> list[int]:
+    def table(self) -> list[int]:
+        """What each value of a byte does to it."""
         return _reflected_table(self) if self.reflected_in else _normal_table(self)
 
     def _after(self, data: bytes, state: int) -> int:
         """The register after some bytes."""
-        table = self._table
+        table = self.table
         if self.reflected_in:
             for byte in data:
                 state = table[(state ^ byte) & 0xFF] ^ state >> 8
@@ -180,7 +182,7 @@ class _WeissCrc(Crc):
     """Updated as if reflected, with the table of the polynomial that is not."""
 
     @cached_property
-    def _table(self) -> list[int]:
+    def table(self) -> list[int]:
         return _normal_table(self)
 
 

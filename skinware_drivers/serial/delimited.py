@@ -57,6 +57,11 @@ class Delimited(Framing):
         """Bytes of header and checksum."""
         return self.body_start + (self.checksum.size if self.checksum is not None else 0)
 
+    @property
+    def is_first_trusted(self) -> bool:
+        """Whether what arrives before the first delimiter may be a frame."""
+        return self.checksum is not None if self.trusts_first is None else self.trusts_first
+
     def framer(self) -> Framer:
         """Something to feed a stream to."""
         return DelimitedFramer(self)
@@ -87,10 +92,9 @@ class DelimitedFramer(Framer):
         self._longest = framing.maximum_body + framing.overhead
         self._longest_segment = framing.stuffing.longest(self._longest)
         self._delimiter = bytes([framing.stuffing.delimiter])
-        trusts_first = framing.checksum is not None if framing.trusts_first is None else framing.trusts_first
         self._decode = framing.stuffing.decode
         self._checksum_size = framing.checksum.size if framing.checksum is not None else 0
-        self._discarding = not trusts_first  # everything up to the next delimiter
+        self._discarding = not framing.is_first_trusted  # everything up to the next delimiter
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         *segments, rest = stream.split(self._delimiter)

@@ -141,6 +141,22 @@ class Packet(Framing):
             return max(self.length.total.values(), default=0)
         return self.maximum
 
+    @property
+    def known_from(self) -> int:
+        """Bytes of a frame from which on its length is known."""
+        if isinstance(self.length, Length):
+            return max(len(self.sync), self.length.field.end)
+        if isinstance(self.length, LengthTable):
+            return max(len(self.sync), self.length.offset + 1)
+        return len(self.sync)
+
+    @property
+    def look_ahead(self) -> int:
+        """Bytes behind a frame that are needed to confirm it."""
+        if not self.confirmed:
+            return 0
+        return self.longest if self.trailer else len(self.sync)
+
     def framer(self) -> Framer:
         """Something to feed a stream to."""
         return PacketFramer(self)
@@ -210,14 +226,7 @@ class PacketFramer(Framer):
         self._begin = re.compile(_prefixes([values_of(what) for what in framing.sync]), re.DOTALL)
         self._whole_sync = re.compile(b"".join(_one_of(values_of(what)) for what in framing.sync), re.DOTALL)
         self._whole_trailer = re.compile(b"".join(_one_of(values_of(what)) for what in framing.trailer), re.DOTALL)
-        self._known_from = len(framing.sync)  # bytes from which on the length is known
-        if isinstance(framing.length, Length):
-            self._known_from = max(self._known_from, framing.length.field.end)
-        elif isinstance(framing.length, LengthTable):
-            self._known_from = max(self._known_from, framing.length.offset + 1)
-        self._look_ahead = 0
-        if framing.confirmed:
-            self._look_ahead = framing.longest if framing.trailer else len(framing.sync)
+        self._known_from, self._look_ahead = framing.known_from, framing.look_ahead
         self._bare = framing.checksum.size if framing.bare_when_empty and framing.checksum else 0
         self._checksum_at = framing.checksum_place(0)  # from the end, if negative
         self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end

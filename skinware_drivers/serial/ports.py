@@ -89,10 +89,15 @@ class DescriptorPort(Port):
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise BusNotAvailable(f"{self._name} went away, perhaps unplugged ({error.strerror})") from None
+            raise self.gone(error.errno or 0) from None
         if not data:
-            raise BusNotAvailable(f"{self._name} went away, perhaps unplugged (readable, but nothing comes)")
+            raise self.gone(0)
         return data
+
+    def gone(self, number: int) -> BusNotAvailable:
+        """What an error of the system means; 0: it is readable, but nothing comes."""
+        why = os.strerror(number) if number else "readable, but nothing comes"
+        return BusNotAvailable(f"{self._name} went away, perhaps unplugged ({why})")
 
     def write(self, data: bytes) -> int:
         """Write what fits into the kernel's buffer."""

@@ -106,6 +106,10 @@ class Escaped(Stuffing):
         sent: what follows the escape byte, for each byte that is replaced by a sender.
         accepted: as ``sent``, for what a receiver takes beyond it.
         opening: frames begin with a delimiter too.
+
+    Attributes:
+        escape: the escape byte.
+        meaning: which byte it stands for together with each of those that may follow it.
     """
 
     def __init__(
@@ -118,10 +122,10 @@ class Escaped(Stuffing):
         opening: bool = True,
     ) -> None:
         self.delimiter = delimiter
-        self._escape = escape
+        self.escape = escape
         self._opening = bytes([delimiter] * opening)
         self._sent = [(escape, sent[escape]), *((byte, code) for byte, code in sent.items() if byte != escape)]
-        self._meaning = {code: byte for byte, code in {**(accepted or {}), **sent}.items()}
+        self.meaning = {code: byte for byte, code in {**(accepted or {}), **sent}.items()}
 
     def longest(self, size: int) -> int:
         """Every byte escaped."""
@@ -130,17 +134,17 @@ class Escaped(Stuffing):
     def encode(self, content: bytes) -> bytes:
         """Escaped, with delimiters."""
         for byte, code in self._sent:  # the escape byte first
-            content = content.replace(bytes([byte]), bytes([self._escape, code]))
+            content = content.replace(bytes([byte]), bytes([self.escape, code]))
         return self._opening + content + bytes([self.delimiter])
 
     def decode(self, segment: bytes) -> bytes | None:
         """The content; None if what follows an escape byte means nothing."""
-        first, *others = segment.split(bytes([self._escape]))
+        first, *others = segment.split(bytes([self.escape]))
         parts = [first]
         for part in others:
-            if not part or part[0] not in self._meaning:
+            if not part or part[0] not in self.meaning:
                 return None
-            parts += (bytes([self._meaning[part[0]]]), part[1:])
+            parts += (bytes([self.meaning[part[0]]]), part[1:])
         return b"".join(parts)
 
 

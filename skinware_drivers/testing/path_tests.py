@@ -7,6 +7,7 @@ from typing import Literal
 import pytest
 
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock, why_python
+from skinware_drivers.testing.both_streams import both_streams
 from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, play
@@ -31,7 +32,8 @@ class PathTests(Suite):
         """
         if why_python():
             pytest.skip(f"no data path in C: {why_python()}")
-        heard, rig = self._hear(trouble)
+        with both_streams():
+            heard, rig = self._hear(trouble)
         require(heard.takes, "the devices sent nothing")
         adapter = rig.adapter
         with (

@@ -40,7 +40,9 @@ from skinware_drivers.testing.both_paths import Pair, Publishing, Way
 from skinware_drivers.testing.clock import HandClock
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths
 from tests.native.traffic import identifier_of
-from tests.serial.fuzzing import Script
+from tests.serial.framings import EXAMPLES, Example
+from tests.serial.fuzzing import Script, examples_of_drivers
+from tests.serial.fuzzing import run as run_on_line
 
 _PERIOD_S = 0.02
 _MOST_ROWS = 256
@@ -157,13 +159,22 @@ def _long() -> Layout:
     )
 
 
+@functools.cache
+def _framings() -> dict[str, Example]:
+    return {**EXAMPLES, **examples_of_drivers()}
+
+
 def run(clock: HandClock, data: bytes) -> int:
-    """Run one input; how many frames it published.
+    """Run one input, on a skin or (one of four) on a serial line; how many frames it published.
 
     Raises:
         AssertionError: the paths differ.
     """
     script = Script(data)
+    if script.number(4) == 0:
+        framings = _framings()
+        run_on_line(framings[sorted(framings)[script.number(len(framings))]], data[2:])
+        return 0
     known = designs()
     design = known[sorted(known)[script.number(len(known))]]
     is_alone = script.number(4) == 0

@@ -7,7 +7,7 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import NoOptions
+from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
@@ -30,6 +31,8 @@ from skinware_drivers.serial.stuffing import COBS
 from skinware_drivers.testing.waiting import wait_until
 
 FRAMING = Delimited(COBS, maximum_body=64, checksum=CRC16_XMODEM, identifier=Field(0))
+LOOP: Callable[[], asyncio.AbstractEventLoop] = FlowLoop
+"""Of drivers that run here."""
 DATA, ASK, ANSWER = 1, 0x10, 0x11
 N_TAXELS = 12
 
@@ -189,7 +192,8 @@ def driving(*ports: str) -> Iterator[Runner]:
 
     def work() -> None:
         try:
-            asyncio.run(run())
+            with asyncio.Runner(loop_factory=LOOP) as loop:
+                loop.run(run())
         except BaseException as error:  # noqa: BLE001  (shown to the test)
             failures.append(error)
             started.set()

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple
 from itertools import pairwise
 
+import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
+from skinware_drivers import native
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framed, Framer, Framing
+from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.serial.stuffing import LINES
+from skinware_drivers.testing.both_streams import made
 from tests.serial.framings import Example
 
+_ROWS = 3
 BUSY = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 """For machines that do other things too."""
 
@@ -50,11 +58,42 @@ def cut(stream: bytes, places: Sequence[int]) -> list[bytes]:
     return [stream[a:b] for a, b in pairwise(edges)]
 
 
-def outcome(framing: Framing, chunks: Iterable[bytes]) -> tuple[list[Framed], tuple[int, ...], int]:
-    """Everything that can be seen of a framer after a stream."""
+def outcome(framing: Framing, chunks: Sequence[bytes]) -> tuple[list[Framed], tuple[int, ...], int]:
+    """Everything that can be seen of a framer after a stream; C sees the same, where it can."""
     framer = framing.framer()
     found = feed(framer, chunks)
+    compare_with_c(framing, chunks)
     return found, astuple(framer.counters), framer.pending
+
+
+class TightStream(NativeStream):
+    """Sanitizers see every byte that it reads behind those that have come."""
+
+    def fill(self, batch: FrameBatch, ordinal: int) -> int:
+        """From memory that ends where they end."""
+        stream = self._stream
+        room, size = stream.bytes, stream.size
+        came = np.frombuffer(ctypes.string_at(room, size), np.uint8).copy()
+        stream.bytes = came.ctypes.data
+        try:
+            return super().fill(batch, ordinal)
+        finally:
+            stream.bytes = room
+
+
+def compare_with_c(framing: Framing, chunks: Iterable[bytes], rows: int = _ROWS) -> None:
+    """Both ways to find frames, into batches of so many rows, some of which are too short for the longest bodies."""
+    for size in (framing.maximum_body, framing.maximum_body // 2):
+        batch = FrameBatch(rows, max(8, -(-size // 8) * 8))
+        stream = made(native.library(), framing, size, BusCounters(), TightStream)
+        for number, chunk in enumerate(chunk for chunk in chunks if chunk):
+            stream.add(chunk, 1000 + number)
+            while True:
+                batch.clear()
+                stream.fill(batch, 3)
+                stream.take_damaged()
+                if not stream.is_behind:
+                    break
 
 
 def bodies(example: Example) -> st.SearchStrategy[bytes]:

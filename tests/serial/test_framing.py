@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.serial.delimited import Delimited
-from skinware_drivers.serial.framing import Framed
-from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.framing import Field, Framed
+from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from tests.serial.framings import EXAMPLES, Example
 from tests.serial.streams import BUSY, cut, feed, frames, noise, outcome, streams
 
@@ -116,6 +117,27 @@ def test_lengths_that_cannot_be_are_refused_at_once() -> None:
     found, counters, pending = outcome(framing, [b"\xaa\xaa\xaa\x00\xff\xff" + good])
     assert found == [Framed(5, b"abc", 6 + len(good))]
     assert (counters, pending) == ((6 + len(good), len(good), 0, 6, 1, 0, 1), 0)
+
+
+@pytest.mark.parametrize("name", [name for name, e in EXAMPLES.items() if isinstance(e.framing, Packet)])
+def test_no_length_leads_out_of_a_frame(name: str) -> None:
+    """Every value of the smallest lengths, and of the largest."""
+    example = EXAMPLES[name]
+    framing, field = example.framing, None
+    if isinstance(framing, Packet) and isinstance(framing.length, Length):
+        field = framing.length.field
+    elif isinstance(framing, Packet) and isinstance(framing.length, LengthTable):
+        field = Field(framing.length.offset)
+    good = framing.encode(example.identifiers[0], bytes(example.body_sizes()[0]))
+    stream = good
+    for says in (*range(24), *range(250, 256), (1 << 8 * field.size) - 1) if field else ():
+        changed = bytearray(good.ljust(field.end if field else 0, b"\0"))
+        if field:
+            field.put(changed, says & field.mask)
+        stream += bytes(changed) + good
+    stream += bytes(2 * framing.maximum_body + 64)
+    for size in (1, 7, len(stream)):
+        assert outcome(framing, cut(stream, range(0, len(stream), size))) == outcome(framing, [stream])
 
 
 def test_a_line_that_never_ends_is_not_kept() -> None:

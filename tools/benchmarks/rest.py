@@ -24,15 +24,13 @@ from can_buses import HERE, Result, run
 from skinware import Namespace
 
 
-def compile_loop(folder: str) -> Path:
-    """The C loop as a program."""
+def compile_program(name: str, folder: str) -> Path:
+    """One of the C programs to compare with."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
-        sys.exit("rest: a C compiler is needed for the loop to compare with (Debian and Ubuntu: apt install gcc)")
-    program = Path(folder) / "receive_loop"
-    subprocess.run(
-        [compiler, "-std=c11", "-O2", "-Wall", "-Wextra", "-o", program, HERE / "receive_loop.c"], check=True
-    )
+        sys.exit("a C compiler is needed for the loop to compare with (Debian and Ubuntu: apt install gcc)")
+    program = Path(folder) / name
+    subprocess.run([compiler, "-std=c11", "-O2", "-Wall", "-Wextra", "-o", program, HERE / f"{name}.c"], check=True)
     return program
 
 
@@ -54,7 +52,7 @@ def main() -> None:
     os.environ["SKINWARE_NAMESPACE"] = f"bench-{os.getpid()}"
     rate_hz = arguments.boards * 32 * arguments.hz
     with tempfile.TemporaryDirectory() as folder:
-        loop = str(compile_loop(folder))
+        loop = str(compile_program("receive_loop", folder))
         found: dict[str, list[Result]] = {"driver": [], "C loop": []}
         try:
             for _ in range(arguments.rounds):

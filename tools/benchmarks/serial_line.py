@@ -1,4 +1,6 @@
-"""Serial lines: framing, checksum and decoding, in memory and through a pseudo terminal. Run: tools/bench serial.
+"""Serial lines: framing, checksum and decoding, in memory and through a pseudo terminal; the driver beside C.
+
+    tools/bench serial [memory] [pty] [rest]     default: all three
 
 The wire is that of a patch of 100 modules with 12 taxels each: COBS, the number of the module, 24 bytes of uint16
 values, CRC-16/XMODEM; 3 Mbaud carry 100 of its cycles a second. Beside ours, in the same rounds: a state machine that
@@ -37,12 +39,14 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import Bits, Frame, Layout, Values
 from skinware_drivers.options import NoOptions
+from skinware_drivers.running.flow import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import fill_rows
 from tests.serial.framings import EXAMPLES
 
+PARTS = ("memory", "pty", "rest")
 NAME = "cobs_crc"
 FRAMING = EXAMPLES[NAME].framing
 BODY = 24
@@ -284,7 +288,8 @@ def read_driver(path: str, seconds: float, _ages_ns: list[int]) -> int:
 
     namespace = Namespace(f"bench-{os.getpid()}")
     try:
-        asyncio.run(run())
+        with asyncio.Runner(loop_factory=FlowLoop) as loop:
+            loop.run(run())
     finally:
         import shutil
 
@@ -366,12 +371,20 @@ def through_pty(rounds: int, seconds: float) -> None:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=PARTS)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=2.0, help="for each reader and round")
+    parser.add_argument("--latency", type=float, default=5.0, metavar="MS", help="of rest: how long both do")
     arguments = parser.parse_args()
     assert threading.active_count() == 1  # writers are forked
-    in_memory(arguments.rounds)
-    through_pty(arguments.rounds, arguments.seconds)
+    if "memory" in arguments.parts:
+        in_memory(arguments.rounds)
+    if "pty" in arguments.parts:
+        through_pty(arguments.rounds, arguments.seconds)
+    if "rest" in arguments.parts:
+        import serial_rest  # which imports this module
+
+        serial_rest.compare(arguments.rounds, arguments.seconds, arguments.latency)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,135 @@
+"""Bytes of a line on their way to rows of a batch: framed, with the time at which their last byte was read."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import BusCounters
+from skinware_drivers.serial.framing import Framed, Framing, fill_rows
+
+CHUNK = 1 << 16
+"""Bytes of a chunk, at most."""
+
+
+class Stream(ABC):
+    """What a line brings from when it is opened, or its framing is another, until it is closed or gets another.
+
+    Attributes:
+        counters: of the bus; go on from one stream to the next.
+    """
+
+    def __init__(self, counters: BusCounters) -> None:
+        self.counters = counters
+
+    @property
+    @abstractmethod
+    def is_behind(self) -> bool:
+        """Whether there may be more frames in what has come; until there are not, nothing more is added."""
+
+    @property
+    @abstractmethod
+    def pending(self) -> int:
+        """Bytes that may still become part of a frame."""
+
+    @abstractmethod
+    def add(self, chunk: bytes, time_ns: int) -> None:
+        """What was read at this time, CLOCK_MONOTONIC ns: at most ``CHUNK`` bytes."""
+
+    @abstractmethod
+    def fill(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append frames to a batch, as many as there are and as fit; returns how many that were."""
+
+    @abstractmethod
+    def take_damaged(self) -> bytes:
+        """Once: the chunk that came last, if nothing was found in it but what is no frame."""
+
+
+class PythonStream(Stream):
+    """A stream whose frames are found by a framer.
+
+    Args:
+        framing: what is on the line.
+        payload_size: of bodies, at most; frames with longer ones are counted as refused.
+        counters: of the bus.
+    """
+
+    def __init__(self, framing: Framing, payload_size: int, counters: BusCounters) -> None:
+        super().__init__(counters)
+        self._payload_size = payload_size
+        self._framer = framing.framer()
+        self._framer.counters = counters.framing
+        self._reads: list[tuple[int, int]] = []
+        self._backlog: list[tuple[list[Framed], npt.NDArray[np.int64]]] = []
+        self._damaged = b""
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether frames did not fit into the batch."""
+        return bool(self._backlog)
+
+    @property
+    def pending(self) -> int:
+        """As the framer holds back."""
+        return self._framer.pending
+
+    def add(self, chunk: bytes, time_ns: int) -> None:
+        """Find the frames that it completes."""
+        framer, counters = self._framer, self.counters.framing
+        known = framer.position
+        damaged = counters.checksum_errors + counters.refused
+        framed = framer.feed(chunk)
+        damaged = counters.checksum_errors + counters.refused - damaged
+        self.counters.errors += damaged
+        self._damaged = chunk if damaged and not framed else b""
+        self._reads.append((framer.position, time_ns))
+        fitting = [frame for frame in framed if len(frame.body) <= self._payload_size]
+        self.counters.refused += len(framed) - len(fitting)
+        if fitting:
+            self._backlog.append((fitting, self._times(fitting, known, time_ns)))
+        self._forget_reads()
+
+    def fill(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append what was found."""
+        taken = 0
+        while self._backlog and batch.free:
+            framed, time_ns = self._backlog[0]
+            count = min(len(framed), batch.free)
+            rows = slice(batch.stop, batch.stop + count)
+            fill_rows(batch.wire[rows], framed[:count])
+            batch.time_ns[rows], batch.bus[rows] = time_ns[:count], ordinal
+            batch.stop += count
+            taken += count
+            if count == len(framed):
+                self._backlog.pop(0)
+            else:
+                self._backlog[0] = framed[count:], time_ns[count:]
+        self.counters.frames += taken
+        return taken
+
+    def take_damaged(self) -> bytes:
+        """The chunk, or nothing."""
+        damaged, self._damaged = self._damaged, b""
+        return damaged
+
+    def _times(self, framed: list[Framed], known: int, time_ns: int) -> npt.NDArray[np.int64]:
+        """(n,) int64 ns: when the last byte of each frame was read."""
+        if framed[0].end > known:
+            return np.full(len(framed), time_ns)
+        ends, times = zip(*self._reads, strict=True)  # some were held back behind a false beginning
+        found: npt.NDArray[np.int64] = np.array(times)[np.searchsorted(ends, [frame.end for frame in framed])]
+        return found
+
+    def _forget_reads(self) -> None:
+        """Keep the times of the bytes that are still held back."""
+        undecided = self._framer.position - self._framer.pending
+        if not self._framer.pending:
+            self._reads.clear()
+        while self._reads and self._reads[0][0] <= undecided:
+            self._reads.pop(0)
+
+
+__all__ = ["CHUNK", "PythonStream", "Stream"]

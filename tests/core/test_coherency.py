@@ -70,6 +70,8 @@ def write_on_request(board: Path, slots: int) -> None:
     rows = Board(board).rows
     with ServiceWriter("flood", COLUMNS, slots=slots) as writer:
         writer.request_server()
+        fill(writer.begin(), 1)
+        writer.commit(1, 1)  # whoever has seen this may ask
         while not rows[0, LAST]:
             waiting = writer.requests(0.05)
             for request in waiting:
@@ -96,7 +98,7 @@ def compare(board: Path, row: int, way: str, wanted: int) -> None:
     """Take frames and look at every number in them."""
     mine = Board(board).rows[row]
     with ServiceReader[Frame]("flood", timeout_s=PATIENCE_S) as reader:
-        reader.read(timeout_s=PATIENCE_S) if way != "on request" else None
+        reader.read(timeout_s=PATIENCE_S)
         take = taker(reader, way)
         before = 0
         while mine[COMPARED] < wanted:

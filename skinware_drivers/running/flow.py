@@ -145,11 +145,9 @@ class Flow:
         for line in self._lines:
             source = self._sources[len(self._handed)]
             if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
-                source.bus, source.heard_ns, source.is_watched = (
-                    line.ordinal,
-                    line.heard_ns,
-                    line.state != BusState.LIVE,
-                )
+                source.bus = line.ordinal
+                source.heard_ns = line.heard_ns
+                source.is_watched = line.state != BusState.LIVE
                 self._handed.append((line, line.bus, source))
         n_open = sum(line.bus.fileno() >= 0 for line in self._lines)
         self._flow.n_sources, self._flow.has_others = len(self._handed), n_open > len(self._handed)

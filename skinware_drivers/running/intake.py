@@ -80,9 +80,9 @@ class Intake:
                 self.read_until_ns = time_ns
                 return "all" if turn else "nothing"
             batch = self._empty_batch()
-            self.read_until_ns = self._fill(batch, [fd for fd, _ in events], time_ns)
+            is_all = self._fill(batch, [fd for fd, _ in events], time_ns)
             self._digest(batch)
-            if self.read_until_ns == time_ns:
+            if is_all:
                 return "all"
         return "some"
 
@@ -102,24 +102,25 @@ class Intake:
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
-    def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> int:
+    def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> bool:
         """Fill a batch from those buses that have something.
 
         Returns:
-            Until when all was taken: now, if no bus had more than its share.
+            Whether that was all: no bus had more than its share.
         """
         ready = [line for fd in fds if (line := self._line_of(fd)) is not None]
-        read_until_ns = time_ns
+        is_all, self.read_until_ns = True, time_ns
         for number, line in enumerate(ready):
             batch.limit = batch.stop + (batch.capacity - batch.stop) // (len(ready) - number)
             try:
                 if line.bus.receive(batch, line.ordinal):
                     line.heard_ns = time_ns
                     if not batch.free:
-                        read_until_ns = min(read_until_ns, int(batch.time_ns[batch.stop - 1]) - 1)
+                        is_all = False
+                        self.read_until_ns = min(self.read_until_ns, int(batch.time_ns[batch.stop - 1]) - 1)
             except Exception as error:  # noqa: BLE001  (whatever it is: the bus cannot be trusted any more)
                 line.lose(bus_failure(line.name, "receive", error))
-        return read_until_ns
+        return is_all
 
     def _line_of(self, fd: int) -> BusLine | None:
         line = self._by_fd.get(fd)

@@ -106,9 +106,10 @@ def test_a_wake_up_ends_in_time_however_much_waits() -> None:
     assert taken == 2
 
 
-def test_it_says_until_when_all_was_taken() -> None:
+@pytest.mark.parametrize(("first_ns", "first_told_ns"), [(-100, -100 + 63 - 1), (+50, 0)], ids=["late", "early"])
+def test_it_says_until_when_all_was_taken(first_ns: int, first_told_ns: int) -> None:
     clock_ns = 1_000_000_000
-    waiting = [*range(clock_ns - 100, clock_ns)]  # stamps
+    waiting = [*range(clock_ns + first_ns, clock_ns + first_ns + 100)]  # stamps; a bus's clock may be ahead
 
     def receive(batch: FrameBatch, ordinal: int) -> int:
         n = min(batch.free, len(waiting))
@@ -131,7 +132,7 @@ def test_it_says_until_when_all_was_taken() -> None:
         epoll.register(fd, select.EPOLLIN)
         gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), digest, 0.0)
         assert gather.take() == "all"
-        assert told == [1_000_000_000 - 100 + 63 - 1, 1_000_000_500]
+        assert told == [1_000_000_000 + first_told_ns, 1_000_000_500]
         assert gather.take() == "nothing"
         assert gather.read_until_ns == 1_000_001_000
     os.close(fd)

@@ -128,7 +128,7 @@ class ServiceWriter(Ownership):
                 if timer.missed > self.missed_periods:
                     self._ring.count_missed_periods(timer.missed - self.missed_periods)
                     self.missed_periods = timer.missed
-                waiting = self._answer_requests()
+                waiting = self.answer_requests()
                 if self._paused:
                     continue
                 self._ring.count_lateness(now_ns() - (timer.deadline_ns - timer.period_ns))
@@ -144,7 +144,7 @@ class ServiceWriter(Ownership):
         """
         with self._closing_ends_the_loop():
             while not self._must_end():
-                waiting = self._answer_requests(WAIT_SLICE_NS / NS_PER_S)
+                waiting = self.answer_requests(WAIT_SLICE_NS / NS_PER_S)
                 if waiting and not self._paused:
                     yield from self._one_frame(waiting, from_last)
 
@@ -169,6 +169,35 @@ class ServiceWriter(Ownership):
             found = self.request_server().take(min(left_s, _LONGEST_WAIT_S))
             if found or left_s <= _LONGEST_WAIT_S:
                 return found
+
+    def answer_requests(self, timeout_s: float = 0.0) -> list[Request]:
+        """Carry out the operations that are asked for, within the time of one turn, as the loops above do.
+
+        Args:
+            timeout_s: longest wait for the first request.
+
+        Returns:
+            Those that ask for a frame (``acquire``), for a ``reply`` as in :meth:`requests`; none while paused.
+
+        Raises:
+            Closed, NamespaceError, NameInUse: as for :meth:`requests`.
+        """
+        self.keep_files()
+        server = self.request_server()
+        waiting: list[Request] = []
+        found = server.take(timeout_s, at_most=1)
+        end_ns = now_ns() + server.turn_ns
+        while found:
+            (request,) = found
+            if request.operation == ACQUIRE:
+                waiting.append(request)
+            else:
+                self._carry_out(request)
+            found = server.take(at_most=1) if now_ns() < end_ns else []
+        if not self._paused:
+            return waiting
+        self._refuse(waiting)
+        return []
 
     def stop(self) -> None:
         """End ``periodic`` or ``on_request`` in another thread, within 50 ms; that thread then closes this writer."""
@@ -212,24 +241,6 @@ class ServiceWriter(Ownership):
     def _refuse(self, waiting: list[Request]) -> None:
         for request in waiting:
             request.fail("the service is paused", "paused")
-
-    def _answer_requests(self, timeout_s: float = 0.0) -> list[Request]:
-        """Do what is asked for, within the time of one turn; returns those that want a frame."""
-        self.keep_files()
-        server = self.request_server()
-        waiting: list[Request] = []
-        found = server.take(timeout_s, at_most=1)
-        end_ns = now_ns() + server.turn_ns
-        while found:
-            (request,) = found
-            if request.operation == ACQUIRE:
-                waiting.append(request)
-            else:
-                self._carry_out(request)
-            found = server.take(at_most=1) if now_ns() < end_ns else []
-        if self._paused:
-            self._refuse(waiting)
-        return waiting
 
     def _carry_out(self, request: Request) -> None:
         try:

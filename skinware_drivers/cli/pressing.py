@@ -7,8 +7,7 @@ import numpy as np
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
-from skinware.service import Request, ServiceWriter
-from skinware.service.messages import ACQUIRE
+from skinware.service import ServiceWriter
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
 
 _RATE_HZ = 50
@@ -54,15 +53,7 @@ class PressingService:
     def step(self, now_ns: int) -> int:
         """Publish and answer what is due; returns when it will be due by itself, CLOCK_MONOTONIC ns."""
         self._now_ns = now_ns
-        waiting: list[Request] = []
-        for request in self._writer.requests():
-            if request.operation == ACQUIRE:
-                waiting.append(request)
-                continue
-            try:
-                request.reply(self.press(**request.arguments))
-            except (TypeError, ValueError) as error:
-                request.fail(f"{request.operation}: {error}")
+        waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
             self._publish(now_ns)
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ

@@ -107,7 +107,7 @@ def test_operations_take_no_longer_than_a_turn_together() -> None:
             for number in range(4):
                 ask(peer, number, number)
         server.turn_ns = 1_000_000
-        assert writer._answer_requests() == []
+        assert writer.answer_requests() == []
         assert len(done) == 1
 
 

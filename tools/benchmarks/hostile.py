@@ -60,7 +60,7 @@ def own(pipe: Connection, namespace: Namespace, fifo: bool) -> None:
     with ServiceWriter(
         "x", {"values": ("<u4", 100)}, namespace=namespace, group=GROUP, operations={"echo": lambda value: value}
     ) as writer:
-        answer_requests = writer._answer_requests
+        answer_requests = writer.answer_requests
 
         def timed(timeout_s: float = 0.0) -> list[object]:
             nonlocal longest_ns, longest_cpu_ns
@@ -70,7 +70,7 @@ def own(pipe: Connection, namespace: Namespace, fifo: bool) -> None:
             longest_cpu_ns = max(longest_cpu_ns, time.thread_time_ns() - begin_cpu_ns)
             return found
 
-        writer._answer_requests = timed  # type: ignore[method-assign, assignment]
+        writer.answer_requests = timed  # type: ignore[method-assign, assignment]
         for columns in writer.periodic(1000):
             columns["values"][:] = writer.sequence
             if writer.sequence == 1:

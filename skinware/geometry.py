@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from skinware._columns import column, texts, within
 from skinware.errors import ConfigurationError, StructureError
-from skinware.toml_text import Keys, TomlText, wrong_value
+from skinware.toml_text import Keys, TomlText
 
 FORMAT, VERSION = "skinware-geometry", 1
 
@@ -246,8 +246,16 @@ def read_geometry(path: str | Path) -> Geometry:
     Raises:
         ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
     """
-    text = TomlText(Path(path))
-    return _from_data(text.data, text.place)
+    return geometry_of(TomlText(Path(path)))
+
+
+def geometry_of(text: TomlText) -> Geometry:
+    """What a geometry file says.
+
+    Raises:
+        ConfigurationError: as for :func:`read_geometry`.
+    """
+    return _joined(text.of_format("geometry file", FORMAT, VERSION, _File).group, text.place)
 
 
 def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
@@ -271,26 +279,6 @@ def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
                 lines += [f"  [{', '.join(repr(float(number)) for number in row)}]," for row in rows]
                 lines.append("]")
     return "\n".join(lines) + "\n"
-
-
-def _from_data(data: dict[str, Any], place: Callable[[Keys], str]) -> Geometry:
-    """The geometry that a file describes.
-
-    Args:
-        data: what it says.
-        place: file and line of a value, for messages.
-    """
-    if data.get("format") != FORMAT:
-        raise ConfigurationError(f'{place(("format",))}: no geometry file: it does not say format = "{FORMAT}"')
-    if data.get("version") != VERSION:
-        known = f"this Skinware reads version {VERSION}"
-        raise ConfigurationError(f"{place(('version',))}: version {data.get('version')}, {known}")
-    try:
-        groups = msgspec.convert(data, _File).group
-    except msgspec.ValidationError as error:
-        text, keys = wrong_value(error)
-        raise ConfigurationError(f"{place(keys)}: {text}") from None
-    return _joined(groups, place)
 
 
 def _joined(groups: Sequence[GeometryGroup], place: Callable[[Keys], str]) -> Geometry:

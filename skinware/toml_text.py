@@ -7,12 +7,13 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from skinware.errors import ConfigurationError
 
+T = TypeVar("T", bound=msgspec.Struct)
 Keys = tuple[str | int, ...]
 """Where a value is: ``("bus", 1, "name")``."""
 
@@ -54,6 +55,31 @@ class TomlText:
     def place(self, keys: Sequence[str | int]) -> str:
         """File and line of a value, for messages."""
         return f"{self._path}:{line_of(self._text, keys)}"
+
+    def of_format(self, what: str, format_name: str, version: int, struct: type[T]) -> T:
+        """What it says, if it is a file of one of our formats, which begin with ``format`` and ``version``.
+
+        Args:
+            what: such a file is called, for messages.
+            format_name: that it must have.
+            version: likewise.
+            struct: of all that may be in it, these two included.
+
+        Raises:
+            ConfigurationError: another format or version, or a value that does not fit; the message says where.
+        """
+        if self.data.get("format") != format_name:
+            raise ConfigurationError(f'{self.place(("format",))}: no {what}: it does not say format = "{format_name}"')
+        found = self.data.get("version")
+        if found != version:
+            raise ConfigurationError(
+                f"{self.place(('version',))}: version {found}, this Skinware reads version {version}"
+            )
+        try:
+            return msgspec.convert(self.data, struct)
+        except msgspec.ValidationError as error:
+            text, keys = wrong_value(error)
+            raise ConfigurationError(f"{self.place(keys)}: {text}") from None
 
 
 def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:

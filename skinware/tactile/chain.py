@@ -53,7 +53,7 @@ from skinware.tactile.stages import (
     StageSettings,
     Taxels,
 )
-from skinware.toml_text import TomlText, wrong_value
+from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-chain", 1
 
@@ -188,13 +188,7 @@ class ChainSettings:
         """
         path = Path(path)
         text = TomlText(path)
-        if text.data.get("format") != FORMAT or text.data.get("version") != VERSION:
-            raise ConfigurationError(f'{path}: no chain: give format = "{FORMAT}" and version = {VERSION}')
-        try:
-            stages = msgspec.convert(text.data, _File).stage
-        except msgspec.ValidationError as error:
-            why, keys = wrong_value(error)
-            raise ConfigurationError(f"{text.place(keys)}: {why}") from None
+        stages = text.of_format("chain", FORMAT, VERSION, _File).stage
         if not stages:
             raise ConfigurationError(f"{path}: no [[stage]] in it")
         beside = [

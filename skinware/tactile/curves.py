@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.toml_text import Keys, TomlText, wrong_value
+from skinware.toml_text import Keys, TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
 MOST_KNOTS = 8
@@ -86,13 +86,7 @@ def read_curves(path: str | Path) -> tuple[Curve, ...]:
         ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
     """
     text = TomlText(Path(path))
-    if text.data.get("format") != FORMAT or text.data.get("version") != VERSION:
-        raise ConfigurationError(f'{path}: no curves: give format = "{FORMAT}" and version = {VERSION}')
-    try:
-        curves = msgspec.convert(text.data, _File).curve
-    except msgspec.ValidationError as error:
-        why, keys = wrong_value(error)
-        raise ConfigurationError(f"{text.place(keys)}: {why}") from None
+    curves = text.of_format("file of curves", FORMAT, VERSION, _File).curve
     _refuse_twice(curves, text.place)
     return curves
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import msgspec.structs
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.regions import Box, Region, Regions
-from skinware.toml_text import Keys, TomlText, line_of, wrong_value
+from skinware.toml_text import TomlText, line_of
 
 FORMAT, VERSION = "skinware-regions", 1
 
@@ -36,7 +36,7 @@ def read_regions(*paths: str | Path) -> Regions:
     places: list[str] = []
     for path in paths:
         text = TomlText(Path(path))
-        found = _from_data(text.data, text.place)
+        found = text.of_format("file of regions", FORMAT, VERSION, _File).region
         places += [text.place(("region", number)) for number in range(len(found))]
         regions += found
     return Regions(regions, places)
@@ -124,20 +124,6 @@ def _value(value: Any, name: str) -> str:
     if isinstance(value, int | float):
         return f"{value:#x}" if name == "uid" else repr(float(value))
     return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
-
-
-def _from_data(data: dict[str, Any], place: Callable[[Keys], str]) -> tuple[Region, ...]:
-    """The regions of a file, each right in itself."""
-    if data.get("format") != FORMAT:
-        raise ConfigurationError(f'{place(("format",))}: no file of regions: it does not say format = "{FORMAT}"')
-    if data.get("version") != VERSION:
-        known = f"this Skinware reads version {VERSION}"
-        raise ConfigurationError(f"{place(('version',))}: version {data.get('version')}, {known}")
-    try:
-        return msgspec.convert(data, _File).region
-    except msgspec.ValidationError as error:
-        text, keys = wrong_value(error)
-        raise ConfigurationError(f"{place(keys)}: {text}") from None
 
 
 __all__ = ["put_region", "read_regions", "regions_to_toml"]

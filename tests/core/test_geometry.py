@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from skinware import Structure
 from skinware.errors import ConfigurationError, StructureError
-from skinware.geometry import Geometry, GeometryGroup, _from_data, geometry_to_toml, read_geometry
+from skinware.geometry import Geometry, GeometryGroup, geometry_of, geometry_to_toml, read_geometry
 from skinware.sensor_types import PRESSURE, TEMPERATURE
+from skinware.toml_text import TomlText
 
 HEAD = 'format = "skinware-geometry"\nversion = 1\n'
 GROUP = """
@@ -173,10 +174,12 @@ groups = st.fixed_dictionaries(
 @settings(deadline=None, max_examples=300)
 @given(group=groups)
 def test_no_data_raises_anything_else(group: dict[str, Any]) -> None:
+    text = TomlText(None)
+    text.data = {"format": "skinware-geometry", "version": 1, "group": [group]}
     try:
-        geometry = _from_data({"format": "skinware-geometry", "version": 1, "group": [group]}, lambda _: "here")
+        geometry = geometry_of(text)
     except ConfigurationError as error:
-        assert str(error).startswith("here: ")  # noqa: PT017
+        assert str(error).startswith(f"{text.place(())}: ")  # noqa: PT017
     else:
         assert len(geometry) == len(group["uid"])
 

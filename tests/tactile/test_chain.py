@@ -162,7 +162,7 @@ def test_a_fit_finds_the_curve_and_its_hysteresis() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no curves: give format"),
+        ("", "no file of curves: it does not say format"),
         ("x = [0.0, 10.0]", "3 x and 2 y|2 x and 3 y"),
         ("x = [0.0, 10.0, 5.0]", "x must rise"),
         ("y = [0.0, 10.0, 5.0]", "y must not fall"),

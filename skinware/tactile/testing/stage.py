@@ -30,7 +30,7 @@ import msgspec
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.testing.gestures import Gesture, Push, Stroke
-from skinware.toml_text import TomlText, wrong_value
+from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-stage", 1
 
@@ -89,16 +89,7 @@ def read_stage(path: str | Path) -> Play:
         ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
     """
     text = TomlText(Path(path))
-    if text.data.get("format") != FORMAT:
-        raise ConfigurationError(f'{text.place(("format",))}: no stage file: it does not say format = "{FORMAT}"')
-    if text.data.get("version") != VERSION:
-        known = f"this Skinware reads version {VERSION}"
-        raise ConfigurationError(f"{text.place(('version',))}: version {text.data.get('version')}, {known}")
-    try:
-        file = msgspec.convert(text.data, _File)
-    except msgspec.ValidationError as error:
-        words, keys = wrong_value(error)
-        raise ConfigurationError(f"{text.place(keys)}: {words}") from None
+    file = text.of_format("stage file", FORMAT, VERSION, _File)
     gestures: list[Gesture] = []
     of_kind: dict[str, tuple[_Push | _Stroke, ...]] = {"push": file.push, "stroke": file.stroke}
     for kind, acts in of_kind.items():

@@ -101,15 +101,18 @@ def many_buses(arguments: argparse.Namespace) -> None:
 def read_ages(namespace: str, ages: Any) -> None:
     """A reader: age of each frame when it has it, ms."""
     with DriverReader("bench", namespace=Namespace(namespace), timeout_s=30) as reader:
-        last = first = 0
+        last = first = newest_ns = taken = 0
         found: list[float] = []
         try:
             for frame in reader.frames(timeout_s=2.5):
-                found.append((time.monotonic_ns() - frame.acquired_ns) / 1e6)
+                taken += 1
+                if frame.acquired_ns > newest_ns:  # others tell that boards went silent
+                    found.append((time.monotonic_ns() - frame.acquired_ns) / 1e6)
+                    newest_ns = frame.acquired_ns
                 first, last = first or frame.sequence, frame.sequence
         except ServiceTimeout:
             pass
-    ages.put((found[5:-3], last - first + 1, len(found)))
+    ages.put((found[5:-3], last - first + 1, taken))
 
 
 def whole_skin(arguments: argparse.Namespace) -> None:
@@ -156,14 +159,14 @@ PARTS = {"receive": compare_receivers, "buses": many_buses, "skin": whole_skin, 
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=list(PARTS))
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="default: all")
     parser.add_argument("--seconds", type=float, default=5.0, help="how long each run sends")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--rates", type=int, nargs="+", default=[8000, 50000, 200000], help="frames/s of one bus")
     arguments = parser.parse_args()
     os.environ["SKINWARE_NAMESPACE"] = f"bench-{os.getpid()}"
     try:
-        for part in arguments.parts:
+        for part in arguments.parts or PARTS:
             PARTS[part](arguments)
     finally:
         shutil.rmtree(Namespace().path, ignore_errors=True)

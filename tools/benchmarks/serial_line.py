@@ -371,17 +371,18 @@ def through_pty(rounds: int, seconds: float) -> None:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=PARTS)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="default: all")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=2.0, help="for each reader and round")
     parser.add_argument("--latency", type=float, default=5.0, metavar="MS", help="of rest: how long both do")
     arguments = parser.parse_args()
     assert threading.active_count() == 1  # writers are forked
-    if "memory" in arguments.parts:
+    parts = arguments.parts or PARTS
+    if "memory" in parts:
         in_memory(arguments.rounds)
-    if "pty" in arguments.parts:
+    if "pty" in parts:
         through_pty(arguments.rounds, arguments.seconds)
-    if "rest" in arguments.parts:
+    if "rest" in parts:
         import serial_rest  # which imports this module
 
         serial_rest.compare(arguments.rounds, arguments.seconds, arguments.latency)

@@ -181,7 +181,7 @@ def line(marks: Marks) -> str:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=["speed", "contacts", "service", "worlds"], help="default: all")
+    parser.add_argument("part", nargs="*", choices=["speed", "contacts", "service", "worlds", []], help="default: all")
     parser.add_argument("--worlds", type=int, default=20, help="of each drift, at each rate")
     parser.add_argument("--rates", default="20,50,100", help="Hz")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the service is measured")

@@ -7,6 +7,7 @@ import numpy as np
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
+from skinware.realtime import now_ns as clock_ns
 from skinware.service import ServiceWriter
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
 
@@ -30,7 +31,6 @@ class PressingService:
     def __init__(self, name: str, hardware: PlacedHardware, bus_name: str, namespace: Namespace | None = None) -> None:
         self._hardware = hardware
         self._bus_name = bus_name
-        self._now_ns = 0
         self._due_ns = 0
         self._writer = ServiceWriter(
             name,
@@ -52,10 +52,9 @@ class PressingService:
 
     def step(self, now_ns: int) -> int:
         """Publish and answer what is due; returns when it will be due by itself, CLOCK_MONOTONIC ns."""
-        self._now_ns = now_ns
         waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
-            self._publish(now_ns)
+            self._publish(clock_ns())  # later than what was asked for before
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ
         for request in waiting:
             request.reply(position=self._writer.position)
@@ -70,7 +69,7 @@ class PressingService:
             ValueError: the numbers make no sense, or nothing of the skin would feel it.
         """
         pressing = Pressing.of(at_m, force_n, radius_m, seconds)
-        return {self._bus_name: self._hardware.press(pressing, self._now_ns)}
+        return {self._bus_name: self._hardware.press(pressing, clock_ns())}
 
     def close(self) -> None:
         """Withdraw it."""

@@ -282,7 +282,10 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
         try:
             await read_files()
         except (ConfigurationError, DriverError) as error:
-            log.error("buses and places stay as they are: %s", error)
+            if isinstance(error, DriverError) and not error.bus:
+                runner.fail(error)
+            else:
+                log.error("buses and places stay as they are: %s", error)
 
     had_terminal = _has_terminal()
 

@@ -15,6 +15,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
@@ -35,6 +36,28 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
     """``rows`` of a batch, bus by bus."""
     bus = batch.bus[rows]
     return [rows[bus == ordinal] for ordinal in range(n_buses)]
+
+
+def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
+    """The driver's look at a skin, which knows already of the patches that report errors.
+
+    Raises:
+        DriverError: its code failed.
+    """
+    try:
+        watch = lines[0].adapter.watch(tables)
+    except Exception as error:
+        raise failure("watch", f"buses {', '.join(line.name for line in lines)}", error) from error
+    for line in lines:
+        for key in line.suspects:
+            patch = tables.patch_key.get((line.ordinal, key))
+            if patch is None:
+                continue
+            try:
+                watch.suspect(patch)
+            except Exception as error:
+                raise failure("Watch.suspect", f"bus {line.name}", error) from error
+    return watch
 
 
 @dataclass
@@ -79,9 +102,6 @@ class Generation:
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
-            for key in line.suspects:
-                if (line.ordinal, key) in self.tables.patch_key:
-                    self.watch.suspect(self.tables.patch_key[line.ordinal, key])
 
     @property
     def tables(self) -> SkinTables:

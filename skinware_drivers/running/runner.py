@@ -27,8 +27,8 @@ from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.desk import RequestDesk, offered
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.flow import FlowLoop, flow_of
-from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
-from skinware_drivers.running.guard import end_of_driver, failure, hook
+from skinware_drivers.running.generation import Generation, make_batch, make_watch, split_by_bus
+from skinware_drivers.running.guard import end_of_driver, hook
 from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
 from skinware_drivers.running.places import put_in_place
@@ -278,6 +278,9 @@ class Runner:
         self._built.notify_all()
 
     def _go_over_to(self, tables: SkinTables) -> None:
+        # the driver's own code comes first: if it fails, nothing has changed
+        decoder = Decoder(self._layouts, tables, [line.adapter.period_s for line in self.lines])
+        watch = make_watch(self.lines, tables)
         if self.writer is None:
             self.writer = writer = DriverWriter(
                 self.name,
@@ -297,14 +300,7 @@ class Runner:
             writer = self.writer
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
-        periods_s = [line.adapter.period_s for line in self.lines]
-        decoder = Decoder(self._layouts, tables, periods_s)
-        adapter = self.lines[0].adapter
-        try:
-            watch = adapter.watch(tables)
-        except Exception as error:
-            raise failure("watch", f"buses {', '.join(line.name for line in self.lines)}", error) from error
-        by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
+        by_cycle = self.lines[0].adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self._intake.latency_s = self._longest_rest_s

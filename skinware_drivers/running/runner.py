@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skinware.driver_service import DriverWriter
-from skinware.errors import BusNotAvailable, DriverError, StructureError
+from skinware.errors import DriverError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, short_turns
@@ -23,7 +23,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.bus_changes import BusChanges
-from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.bus_line import BusLine, open_buses
 from skinware_drivers.running.desk import RequestDesk, offered
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.flow import FlowLoop, flow_of
@@ -141,31 +141,27 @@ class Runner:
 
     async def _run(self, loop: asyncio.AbstractEventLoop) -> None:
         self._namespace.create(self._group)
+        beginning = loop.create_task(self._begin())
+        beginning.add_done_callback(self._has_begun)
         try:
-            self._open_buses()
-            self._intake.start()
-            for line in self.lines:
-                self._serving.begin(line)
             await self._stopping.wait()
         finally:
+            beginning.cancel()
+            await asyncio.gather(beginning, return_exceptions=True)
             await self._serving.end()
             await self._shut_down(loop)
         if self._failure is not None:
             raise self._failure
 
-    def _open_buses(self) -> None:
-        absent: list[tuple[BusLine, BusNotAvailable]] = []
+    async def _begin(self) -> None:
+        await open_buses(self.lines, wait_for_one=self._wait_for_buses)
+        self._intake.start()
         for line in self.lines:
-            try:
-                line.open()
-            except BusNotAvailable as error:
-                if error.reason == BusReason.REFUSED:
-                    raise
-                absent.append((line, error))
-        if len(absent) == len(self.lines) and not self._wait_for_buses:
-            raise absent[0][1]
-        for line, why in absent:
-            line.begin_lost(why)
+            self._serving.begin(line)
+
+    def _has_begun(self, beginning: asyncio.Task[None]) -> None:
+        if not beginning.cancelled() and (error := beginning.exception()) is not None:
+            self.fail(error)
 
     def stop(self) -> None:
         """Ask ``run`` to come back; safe in a signal handler of the loop."""
@@ -230,8 +226,7 @@ class Runner:
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
-        for line in self.lines:
-            line.bus.close()
+        await asyncio.gather(*(line.close() for line in self.lines))
         self._epoll.close()
         if self.writer is not None:
             self.writer.close()

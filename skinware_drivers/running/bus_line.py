@@ -19,6 +19,7 @@ from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.running.guard import bus_failure, hook
 from skinware_drivers.running.limits import BusLimits
+from skinware_drivers.running.patch_news import PatchNews
 from skinware_drivers.running.slow_call import SlowCall
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -48,6 +49,7 @@ class BusLine:
         state: what the bus is doing.
         reason: why, or what is wrong with it though frames come.
         limits: how close it is to what it can carry.
+        patch_news: which of its patches fell silent, or are live again.
         since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
@@ -86,6 +88,7 @@ class BusLine:
         self.set_up_ns = 0
         self._epoll = epoll
         self.limits: BusLimits = BusLimits(name, bus)
+        self.patch_news: PatchNews = PatchNews(name)
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,10 +16,9 @@ from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
+from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _LOOK_PAUSE_NS = NS_PER_S // 20
 
@@ -200,17 +198,20 @@ class Generation:
         state = self.publisher.patch_state[self.tables.structure.patch_bus == line.ordinal]
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
-    def log_patches(self) -> None:
-        """Tell each change of a patch's state once, and which buses have patches that need care."""
+    def tell_patches(self) -> Iterator[PatchChange]:
+        """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
         now, before = self.publisher.patch_state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
             if line.busy.locked():
                 continue  # its devices are being set up, and may be silent for it
-            if now[patch] == PatchState.STALE:
-                log.warning("%s: %s fell silent", line.name, self.name_of(patch))
-            elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
-                log.warning("%s: %s is live again", line.name, self.name_of(patch))
+            is_live = bool(now[patch] == PatchState.LIVE)
+            if now[patch] == PatchState.STALE or (is_live and before[patch] != PatchState.EXPECTED):
+                line.patch_news.note(self.name_of(patch), is_live=is_live)
             before[patch] = now[patch]
         for bus in set(self.tables.structure.patch_bus[now != PatchState.LIVE].tolist()):
             self.lines[bus].needs_care.set()
+        for line in self.lines:
+            change = line.patch_news.catch_up()
+            if change is not None:
+                yield change

@@ -31,6 +31,7 @@ from skinware_drivers.running.generation import Generation, make_batch, make_wat
 from skinware_drivers.running.guard import end_of_driver, hook
 from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
@@ -59,6 +60,7 @@ class Runner:
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         geometry: where the sensors are, for programs; None where nobody knows.
         on_ready: called once, when frames are being published.
+        on_patches: called with patches that fell silent, or are live again.
 
     Attributes:
         lines: the buses; those that were removed keep their places.
@@ -83,6 +85,7 @@ class Runner:
         group: str | None = None,
         geometry: Geometry | None = None,
         on_ready: Callable[[], None] = lambda: None,
+        on_patches: Callable[[PatchChange], None] = lambda _change: None,
     ) -> None:
         self.name = name
         self.driver_type = driver_type
@@ -102,7 +105,7 @@ class Runner:
         self._slots = slots
         self._group = group
         self._geometry = geometry
-        self._on_ready = on_ready
+        self._on_ready, self._on_patches = on_ready, on_patches
         self._machine = MachineLimits()
         self._latency_s = latency_s
         self._intake = Intake(
@@ -371,7 +374,8 @@ class Runner:
         self._machine.look()
         self.generation.update_bus_states()
         self.generation.publish_if_due(self._intake.read_until_ns)
-        self.generation.log_patches()
+        for change in self.generation.tell_patches():
+            self._on_patches(change)
         self._arm_timer()
 
     def _arm_timer(self) -> None:

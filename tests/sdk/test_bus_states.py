@@ -25,6 +25,7 @@ from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNe
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from tests.sdk.clock import Clock
 from tests.sdk.driving import TroubledBus, driving, emulated, follow, hardware_of, read_until
 
 pytestmark = pytest.mark.usefixtures("hurry")
@@ -315,19 +316,6 @@ def test_silence_counts_only_where_devices_send_of_themselves(
         line.remove()
     assert before == []
     assert told(caplog, "bus can0") == ["bus can0: nothing is heard any more", "bus can0: frames come again"]
-
-
-class Clock:
-    """A clock that the test moves."""
-
-    def __init__(self) -> None:
-        self.time_ns = 10**12
-
-    def __call__(self) -> int:
-        return self.time_ns
-
-    def pass_s(self, duration_s: float) -> None:
-        self.time_ns += round(duration_s * 1e9)
 
 
 def test_a_bus_that_comes_and_goes_for_an_hour_fills_no_log(caplog: pytest.LogCaptureFixture) -> None:

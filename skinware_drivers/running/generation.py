@@ -13,6 +13,7 @@ from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
@@ -72,6 +73,7 @@ class Generation:
         begun_ns: when it began.
         native: does the work of decoder and publisher in C; None where numpy does.
         why_python: why numpy does; empty where it does not.
+        flows: C reads the buses that it can read (see ``running.flow``).
     """
 
     lines: Sequence[BusLine]
@@ -83,6 +85,7 @@ class Generation:
     begun_ns: int = field(init=False)
     native: NativePath | None = field(init=False)
     why_python: str = field(init=False)
+    flows: bool = False
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
@@ -182,6 +185,16 @@ class Generation:
             self.publisher.bus_since_ns[line.ordinal] = line.since_ns
             self.publisher.bus_load[line.ordinal] = line.limits.permille
             self.publisher.bus_samples[line.ordinal] = line.bus.samples.rows
+            in_c = self.flows and is_read_natively(line.bus)
+            self.publisher.bus_data_path[line.ordinal] = DataPath.NATIVE if in_c else DataPath.PYTHON
+
+    @property
+    def data_path(self) -> DataPath:
+        """Which way frames take."""
+        of_buses = set(self.publisher.bus_data_path.tolist())
+        if len(of_buses) > 1:
+            return DataPath.MIXED
+        return DataPath.PYTHON if self.native is None else DataPath.NATIVE
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
         """Number of a patch in the structure, None if it is not in it (any more)."""

@@ -314,7 +314,7 @@ class Runner:
             return
         take = self._guard(self._intake.take)
         flow = flow_of(self.generation, self._epoll.fileno(), self._intake.latency_s, take, self.fail)
-        self._flows = flow is not None
+        self._flows = self.generation.flows = flow is not None
         loop.selector.flow = None if flow is None else flow.run
         if flow is None:
             self._intake.start()

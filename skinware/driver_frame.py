@@ -102,8 +102,14 @@ class DriverFrame(Frame):
 
     @property
     def data_path(self) -> DataPath:
-        """Which way the driver's frames take."""
-        return DataPath(int(self._told("data_path", (1,), np.uint8)[0]))
+        """Which way the driver's frames take; ``MIXED`` where it is another for some buses, see ``bus_data_path``."""
+        own, of_buses = DataPath(int(self._told("data_path", (1,), np.uint8)[0])), set(self.bus_data_path.tolist())
+        return DataPath.MIXED if of_buses >= {DataPath.PYTHON, DataPath.NATIVE} else own
+
+    @property
+    def bus_data_path(self) -> npt.NDArray[np.uint8]:
+        """(n_buses,) uint8, :class:`skinware.status.DataPath`: what reads each bus; 0 where it is not told."""
+        return self._told("bus_data_path", (len(self.structure.buses),), np.uint8)
 
     def _told(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         """A column that a driver need not have."""

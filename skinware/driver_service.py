@@ -2,7 +2,7 @@
 
 Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
 ``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``,
-``patch_age_counts``, ``latency_ns``, ``data_path``.
+``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``.
 Static columns: the structure's tables, ``driver_type`` and the names of the counters.
 """
 
@@ -254,6 +254,7 @@ def _frame_columns(
         "patch_age_counts": ("<u8", n_patches * BUCKETS),
         "latency_ns": ("<i8", 1),
         "data_path": ("u1", 1),
+        "bus_data_path": ("u1", n_buses),
     }
 
 

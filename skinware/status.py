@@ -86,7 +86,7 @@ class BusReason(enum.IntEnum):
 
 
 class DataPath(enum.IntEnum):
-    """Which way a driver's frames take from its buses to its readers; the values are the same by both."""
+    """Which way frames take from a driver's buses to its readers; the values are the same by both."""
 
     NOT_TOLD = 0
     """The driver does not tell."""
@@ -94,6 +94,8 @@ class DataPath(enum.IntEnum):
     """Through numpy: the native path was not compiled, is switched off, or cannot do what the driver says."""
     NATIVE = 2
     """Through compiled code."""
+    MIXED = 3
+    """Through compiled code, from some of the buses; the others are read in Python. Of a driver, never of a bus."""
 
 
 LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF

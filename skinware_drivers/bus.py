@@ -174,7 +174,7 @@ class Bus(ABC):
 
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
-        opens_slowly: ``open`` may take long; once other buses run, it is called in a thread.
+        opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
         narrows: it can leave out frames that nobody wants, see ``narrow``.

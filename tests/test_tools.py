@@ -106,12 +106,28 @@ def project(tmp_path: Path) -> Path:
     return project
 
 
-def installs(project: Path, compiler: str = "true") -> bool:
+@pytest.fixture
+def compiling(project: Path) -> Path:
+    """Such a project where installing it compiles: its library."""
+    library = project / "skinware/native/libskinware.so"
+    put(
+        project / ".venv/bin/python",
+        f'echo "$@" >>"{project}/asked"; case "$*" in *"pip install"*) touch "{library}" ;; esac',
+    )
+    return library
+
+
+def prepare(project: Path, compiler: str, extra: str = "test") -> subprocess.CompletedProcess[str]:
+    script = f'source "{project}/tools/_environment.sh"; prepare_environment {extra}'
+    environment = {**os.environ, "CC": compiler}
+    return subprocess.run(["bash", "-euc", script], env=environment, check=True, capture_output=True, text=True)
+
+
+def installs(project: Path, compiler: str = "true", extra: str = "test") -> bool:
     """Whether the environment was installed anew."""
     asked = project / "asked"
     asked.unlink(missing_ok=True)
-    prepare = f'source "{project}/tools/_environment.sh"; prepare_environment test'
-    subprocess.run(["bash", "-euc", prepare], env={**os.environ, "CC": compiler}, check=True, capture_output=True)
+    prepare(project, compiler, extra)
     return "-m pip install" in asked.read_text()
 
 
@@ -129,3 +145,33 @@ def test_a_compiler_that_comes_later_compiles(project: Path) -> None:
     assert not installs(project, compiler="no-such-compiler")
     assert installs(project, compiler="true")
     assert not installs(project, compiler="true")
+
+
+@pytest.mark.parametrize("extra", ["test", "top"])
+def test_a_library_that_was_cleaned_away_is_compiled_again(project: Path, compiling: Path, extra: str) -> None:
+    assert installs(project)
+    assert not installs(project)
+    assert installs(project, extra="top")  # which compiles too, and leaves nothing to do for the other
+    assert not installs(project)
+    compiling.unlink()
+    assert installs(project, extra=extra)
+    assert compiling.exists()
+    assert not installs(project, extra=extra)
+
+
+@pytest.mark.parametrize("source", ["skinware/native/ring.c", "skinware/include/skinware.h"])
+def test_a_library_older_than_its_sources_is_compiled_again(project: Path, compiling: Path, source: str) -> None:
+    """As after a checkout that was compiled for other sources meanwhile: the sources alone are what they were."""
+    assert installs(project)
+    earlier_s = (project / source).stat().st_mtime - 10
+    os.utime(compiling, (earlier_s, earlier_s))
+    assert installs(project)
+    assert not installs(project)
+
+
+def test_what_cannot_be_compiled_is_not_tried_each_time(project: Path) -> None:
+    done = prepare(project, compiler="no-such-compiler")
+    assert done.stderr.splitlines()[-1].startswith("the native data path is not compiled: Python runs instead")
+    assert prepare(project, compiler="no-such-compiler").stderr == ""
+    assert installs(project)  # there is a compiler, but what it needs is missing
+    assert not installs(project)

@@ -26,7 +26,7 @@ from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
-from skinware.status import load_report
+from skinware.status import DataPath, load_report
 
 FrameT = TypeVar("FrameT", bound=Frame)
 
@@ -197,6 +197,7 @@ def _buses(driver: DriverReader, frame: DriverFrame | None) -> list[dict[str, An
             "reason": bus_reason_name(int(frame.bus_reason[bus])),
             "state_age_s": round((time_ns - since_ns) / NS_PER_S, 3) if since_ns else None,
             **load_report(int(frame.bus_load[bus])),
+            "data_path": DataPath(int(frame.bus_data_path[bus])).name.lower(),
             "samples": sample_report(frame.bus_samples[bus]),
         }
         entries.append(_with_counters(own, counters))

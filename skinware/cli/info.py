@@ -40,6 +40,7 @@ _OF_A_PATCH = {"interval 99 %": "interval", "delay 99 %": "age"}
 """What is shown of a patch where it is told, by the column's title: bounds of the time between two updates of a module,
 and of an update's age when it was published."""
 _ABOUT_A_PATCH = "99 %: 99th percentile; interval: time between two updates; delay: time until publication"
+_BUS_READERS = {"native": "compiled code", "python": "Python"}
 _INDENT = 2
 _LIFE_COLOURS = {
     "live": "green",
@@ -163,13 +164,17 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
 
 def _path_lines(driver: dict[str, Any]) -> list[str]:
     """Which way frames take, and how long they may wait."""
-    if driver["data_path"] not in ("native", "python"):
+    path = driver["data_path"]
+    if path in (None, "not_told"):
         return []
-    rest = f"frames wait up to {driver['latency_ms']:g} ms to be taken together"
-    return [
-        "",
-        f"{driver['data_path']} data path; {rest}" if driver["latency_ms"] else f"{driver['data_path']} data path",
-    ]
+    parts = [f"{path} data path"]
+    if path == "mixed":
+        for way, reader in _BUS_READERS.items():
+            names = ", ".join(bus["name"] for bus in driver["buses"] if bus["data_path"] == way)
+            parts.append(f"{reader} reads {names}")
+    if driver["latency_ms"]:
+        parts.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")
+    return ["", "; ".join(parts)]
 
 
 def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
@@ -287,7 +292,7 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
-_OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown", "samples"}
+_OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown", "samples", "data_path"}
 _OWN_KEYS |= {"bus", "age_ms", "modules", "sensors", "fresh"}
 _OWN_KEYS |= set(_OF_A_PATCH.values())
 

@@ -22,8 +22,8 @@ from skinware.cli._command import (
     run,
     version_option,
 )
-from skinware.cli._format import plural
 from skinware.errors import ConfigurationError, DriverError
+from skinware_drivers.cli.driver_events import report, tell_patches, tell_ready
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
@@ -265,7 +265,8 @@ def command(
         slots=slots,
         group=group,
         geometry=geometry_of(settings),
-        on_ready=lambda: _tell_ready(runner, as_json),
+        on_ready=lambda: tell_ready(runner, as_json),
+        on_patches=lambda change: tell_patches(runner, change) if as_json else None,
     )
     if profile is not None:
         profile.apply()
@@ -282,7 +283,10 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
         try:
             await read_files()
         except (ConfigurationError, DriverError) as error:
-            log.error("buses and places stay as they are: %s", error)
+            if isinstance(error, DriverError) and not error.bus:
+                runner.fail(error)
+            else:
+                log.error("buses and places stay as they are: %s", error)
 
     had_terminal = _has_terminal()
 
@@ -298,7 +302,7 @@ async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, runner.stop)
     loop.add_signal_handler(signal.SIGHUP, on_hangup)
-    reporting = asyncio.create_task(_report(runner)) if as_json else None
+    reporting = asyncio.create_task(report(runner)) if as_json else None
     if reporting is not None:
         reporting.add_done_callback(lambda task: None if task.cancelled() else task.result())
     try:
@@ -331,37 +335,6 @@ def _has_terminal() -> bool:
     except OSError:
         return False
     return True
-
-
-async def _report(runner: Runner) -> None:
-    while True:
-        await asyncio.sleep(1)
-        if runner.ready:
-            try:
-                print_json({"event": "status", "name": runner.name, **runner.status()})
-            except BrokenPipeError:
-                runner.stop()
-                return
-
-
-def _tell_ready(runner: Runner, as_json: bool) -> None:
-    from skinware_drivers.running.figures import path_figures
-
-    if runner.generation is None:
-        return
-    structure = runner.generation.tables.structure
-    buses = [line.name for line in runner.lines]
-    if as_json:
-        types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
-        counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
-        ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
-        print_json({**ready, "types": types, "buses": buses, **path_figures(runner.generation)})
-    else:
-        patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
-        what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
-        click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
-        if runner.generation.why_python:
-            click.echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
 
 
 def _profile(realtime: str | None, cpus: str | None, configured_cpus: Sequence[int]) -> Profile | None:

@@ -146,7 +146,7 @@ SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
                 return NO_MEMORY;
             if (is_due)
                 publish_if_due(path);
-            if (taken == ALL)
+            if (taken == ALL || is_other) /* Python takes, and then lets more come together */
                 flow->rest_until_ns = path_time_ns(path) + flow->latency_ns;
             if (is_other)
                 return OTHER_BUS;

@@ -128,7 +128,7 @@ enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, SAMPLE
 
 struct columns { /* of a slot: where they begin, bytes from its start */
     int64_t values, status, module_time_ns, patch_state, bus_state, bus_reason, bus_since_ns, bus_load, bus_samples;
-    int64_t bus_counters, patch_counters, patch_interval_counts, patch_age_counts, latency_ns, data_path;
+    int64_t bus_counters, patch_counters, patch_interval_counts, patch_age_counts, latency_ns, data_path, bus_data_path;
 };
 
 struct plan {
@@ -182,7 +182,7 @@ struct plan {
     const uint16_t *bus_load;
     int64_t bus_samples_bytes;
     const int64_t *latency_ns;
-    const uint8_t *data_path;
+    const uint8_t *data_path, *bus_data_path;
     int64_t *counts;  /* (n_buses, n_counts) */
     int64_t *skipped;              /* (n_buses,) updates that were never published, since Python looked */
     const int64_t *skipped_before; /* (n_buses,) and before that */

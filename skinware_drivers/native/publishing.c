@@ -100,6 +100,7 @@ static void write_frame(struct path *path, int64_t time_ns)
     fill(plan->timing + n_timing, slot, columns->patch_age_counts, n_timing * 8);
     fill(plan->latency_ns, slot, columns->latency_ns, 8);
     fill(plan->data_path, slot, columns->data_path, 1);
+    fill(plan->bus_data_path, slot, columns->bus_data_path, plan->n_buses);
     int64_t acquired_ns = path->words->newest_ns ? path->words->newest_ns : time_ns;
     path->words->sequence = (int64_t)skinware_ring_commit(ring, acquired_ns, 0);
 }

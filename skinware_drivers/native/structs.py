@@ -125,7 +125,7 @@ class Columns(ctypes.Structure):
 
     _fields_ = _fields(
         "values status module_time_ns patch_state bus_state bus_reason bus_since_ns bus_load bus_samples"
-        " bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns data_path"
+        " bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns data_path bus_data_path"
     )
 
 
@@ -173,7 +173,7 @@ class Plan(ctypes.Structure):
         *_fields("burst_pause_ns standing_out_ns gap_ns module_heard_ns patch_heard_ns patch_updated_ns", _POINTER),
         *_fields("behind patch_state module_status bus_state bus_reason bus_samples bus_since_ns bus_load", _POINTER),
         *_fields("bus_samples_bytes"),
-        *_fields("latency_ns data_path", _POINTER),
+        *_fields("latency_ns data_path bus_data_path", _POINTER),
         *_fields("counts skipped skipped_before patch_bus", _POINTER),
         *_fields("skipped_column lost_column frames_column errors_column refused_column bytes_column"),
         *_fields("timing timing_before_ns", _POINTER),

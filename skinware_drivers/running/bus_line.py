@@ -19,12 +19,16 @@ from skinware_drivers.running.backoff import Backoff
 from skinware_drivers.running.bus_news import WORDS, BusNews, reason_text
 from skinware_drivers.running.guard import bus_failure, hook
 from skinware_drivers.running.limits import BusLimits
+from skinware_drivers.running.patch_news import PatchNews
+from skinware_drivers.running.slow_call import SlowCall
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _FIRST_PAUSE_ASIDE_S, _LONGEST_PAUSE_ASIDE_S = 1.0, 60.0
 _STOP_TIMEOUT_S = 0.8
+_OPENING_S, _CLOSING_S = 10.0, 0.9
+"""How long an interface may take to be opened and closed before somebody says that it hangs."""
 _CHECK_PAUSE_NS = NS_PER_S // 2
 _NEVER_NS = 1 << 63
 
@@ -45,6 +49,7 @@ class BusLine:
         state: what the bus is doing.
         reason: why, or what is wrong with it though frames come.
         limits: how close it is to what it can carry.
+        patch_news: which of its patches fell silent, or are live again.
         since_ns: since when both have been so, CLOCK_MONOTONIC ns.
         heard_ns: when it last delivered frames.
         opened_ns: when it was last opened.
@@ -83,28 +88,43 @@ class BusLine:
         self.set_up_ns = 0
         self._epoll = epoll
         self.limits: BusLimits = BusLimits(name, bus)
+        self.patch_news: PatchNews = PatchNews(name)
         self._news = BusNews()
         self._noted = ""
         self._checked_ns = 0
         self._speaks_from_ns = 0 if bus.listen_only else _NEVER_NS  # before, it only answers
         self._has_spoken = False
         self._reopening = _attempts()
+        self._opening: SlowCall | None = None
 
-    def open(self) -> None:
+    async def open(self) -> None:
         """Open the bus.
 
         Raises:
-            BusNotAvailable: it cannot be opened now.
+            BusNotAvailable: it cannot be opened now, or takes long.
             ConfigurationError: it can never be opened like this.
             PlatformError: this system cannot.
         """
         try:
-            self.bus.open()
+            await self._open_bus()
             self._is_open()
         except (BusNotAvailable, ConfigurationError, PlatformError):
             raise
         except Exception as error:
             raise bus_failure(self.name, "open", error) from error
+
+    async def _open_bus(self) -> None:
+        """Open the bus itself; if that hangs, the next attempt waits for the same one to end."""
+        if not self.bus.opens_slowly:
+            self.bus.open()
+            return
+        if self._opening is None:
+            self._opening = SlowCall(f"bus {self.name}, opening", self.bus.open)
+        if not await self._opening.is_over(_OPENING_S):
+            why = f"bus {self.name} is not open after {_OPENING_S:g} s: its interface hangs"
+            raise BusNotAvailable(why, reason=BusReason.FAILED)
+        opening, self._opening = self._opening, None
+        opening.check()
 
     def _is_open(self) -> None:
         self._epoll.register(self.bus.fileno(), select.EPOLLIN)
@@ -124,16 +144,31 @@ class BusLine:
         if self.bus.fileno() >= 0:
             with contextlib.suppress(OSError):
                 self._epoll.unregister(self.bus.fileno())
-        self.bus.close()
+        self._close_bus()
         self.lost.set()
         self.needs_care.set()
+
+    def _close_bus(self) -> None:
+        opening, self._opening = self._opening, None
+        if opening is None or not opening.leave(self.bus.close):
+            self.bus.close()
+        else:
+            log.warning("bus %s: its interface hangs while it is opened, and is left to itself", self.name)
+
+    async def close(self) -> None:
+        """Close the bus for good. One that hangs is left to itself after a second, and holds up no other meanwhile."""
+        if not self.bus.opens_slowly or self._opening is not None:
+            self._close_bus()
+        elif not await SlowCall(f"bus {self.name}, closing", self.bus.close).is_over(_CLOSING_S):
+            log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self.name)
 
     async def reopen(self) -> None:
         """Wait until a lost bus is back."""
         if now_ns() - self.opened_ns > self._reopening.longest_s * NS_PER_S:
             self._reopening.begin_again()  # it was there for a while, and not for a moment again and again
         while True:
-            await asyncio.sleep(self._reopening.next_s())
+            if self._opening is None:
+                await asyncio.sleep(self._reopening.next_s())
             self._news.catch_up()
             try:
                 await self._open_again()
@@ -144,19 +179,14 @@ class BusLine:
 
     async def _open_again(self) -> None:
         was_there = self.opened_ns
-        if self.bus.opens_slowly:  # the other buses go on meanwhile
-            opening = asyncio.ensure_future(asyncio.to_thread(self.bus.open))
-            try:
-                await asyncio.shield(opening)
-            finally:
-                await asyncio.gather(opening, return_exceptions=True)
-        else:
-            self.bus.open()
+        await self._open_bus()
         self._is_open()
         self._news.tell(f"bus {self.name} is {'back' if was_there else 'there'}")
 
     def _is_away(self, error: Exception) -> None:
-        if isinstance(error, BusNotAvailable):
+        if self._opening is not None:
+            state, reason = BusState.CONNECTING, BusReason.FAILED
+        elif isinstance(error, BusNotAvailable):
             state, reason = (BusState.DOWN if error.is_down else BusState.GONE), error.reason
         else:
             state, reason = BusState.GONE, BusReason.FAILED
@@ -176,7 +206,7 @@ class BusLine:
 
     def look(self, silence_ns: int) -> None:
         """Tell a living bus from one that says nothing, is off the wire, or is gone."""
-        if self.bus.fileno() < 0:
+        if self.bus.fileno() < 0 or self.lost.is_set():
             return
         time_ns = now_ns()
         self._news.catch_up()
@@ -304,9 +334,14 @@ class BusLine:
     async def stop(self) -> None:
         """Make its devices silent, if they may have been told to send and it can be done now.
 
+        A bus that is being opened meanwhile has as long for it.
+
         Raises:
             DriverError: the driver's own code failed.
         """
+        if self._opening is not None:
+            await self._opening.is_over(_STOP_TIMEOUT_S)
+            return
         if not self.started or self.bus.fileno() < 0:
             return
         try:
@@ -317,6 +352,30 @@ class BusLine:
             log.warning("%s: not stopped in good order: %s", self.name, str(error))
         except TimeoutError:
             log.warning("%s: not stopped in good order: it took too long", self.name)
+
+
+async def open_buses(lines: Sequence[BusLine], *, wait_for_one: bool) -> None:
+    """Open what is there, all at once: one that takes its time holds up no other. Those that are not are waited for.
+
+    Args:
+        lines: all buses of a driver.
+        wait_for_one: also if not one is there.
+
+    Raises:
+        BusNotAvailable: not one is there, or this user may not open one.
+        ConfigurationError, PlatformError: one can never be opened like this.
+    """
+    opened = await asyncio.gather(*(line.open() for line in lines), return_exceptions=True)
+    absent: dict[BusLine, BusNotAvailable] = {}
+    for line, error in zip(lines, opened, strict=True):
+        if isinstance(error, BusNotAvailable) and error.reason != BusReason.REFUSED:
+            absent[line] = error
+        elif error is not None:
+            raise error
+    if len(absent) == len(lines) and not wait_for_one:
+        raise absent[lines[0]]
+    for line, why in absent.items():
+        line.begin_lost(why)
 
 
 def are_patches(found: Iterable[object]) -> Sequence[Patch]:

@@ -33,10 +33,8 @@ def reason_text(reason: BusReason) -> str:
     return reason.name.lower().replace("_", "-")
 
 
-class BusNews:
-    """What is told of one bus, with a limit.
-
-    The last change of a burst is always told, late if need be, with the number of those before it that were not.
+class Allowance:
+    """How often something may be told: a few times at once, then now and then.
 
     Args:
         clock: CLOCK_MONOTONIC ns.
@@ -47,6 +45,27 @@ class BusNews:
         self._interval_ns = round(LINE_EVERY_S * NS_PER_S)
         self._savings_ns = (LINES_AT_ONCE - 1) * self._interval_ns
         self._free_at_ns = clock() - self._savings_ns
+
+    def take(self) -> bool:
+        """Whether a line may be told now; it then is."""
+        time_ns = self._clock()
+        if time_ns < self._free_at_ns:
+            return False
+        self._free_at_ns = max(self._free_at_ns, time_ns - self._savings_ns) + self._interval_ns
+        return True
+
+
+class BusNews:
+    """What is told of one bus, with a limit.
+
+    The last change of a burst is always told, late if need be, with the number of those before it that were not.
+
+    Args:
+        clock: CLOCK_MONOTONIC ns.
+    """
+
+    def __init__(self, clock: Callable[[], int] = now_ns) -> None:
+        self._allowance = Allowance(clock)
         self._untold = ""
         self._kept_back = 0
 
@@ -59,12 +78,8 @@ class BusNews:
 
     def catch_up(self) -> None:
         """Tell what was kept back, if its time has come; to be called now and then."""
-        if not self._untold:
+        if not self._untold or not self._allowance.take():
             return
-        time_ns = self._clock()
-        if time_ns < self._free_at_ns:
-            return
-        self._free_at_ns = max(self._free_at_ns, time_ns - self._savings_ns) + self._interval_ns
         before = f" ({self._kept_back} changes before this one were not told)" if self._kept_back else ""
         log.warning("%s%s", self._untold, before)
         self._untold, self._kept_back = "", 0

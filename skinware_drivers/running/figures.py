@@ -9,7 +9,7 @@ from skinware.driver_service import DriverWriter
 from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns
 from skinware.samples import sample_report
-from skinware.status import PatchState, load_report
+from skinware.status import DataPath, PatchState, load_report
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.limits import MachineLimits
@@ -30,7 +30,8 @@ def figures(
     buses = []
     for line, row in zip(lines, publisher.count_buses().tolist(), strict=True):
         counters = dict(zip(ALL_BUS_COUNTERS, row, strict=True))
-        buses.append({**_bus(line), **counters})
+        path = DataPath(int(publisher.bus_data_path[line.ordinal])).name.lower()
+        buses.append({**_bus(line), "data_path": path, **counters})
     patches = []
     for patch in range(structure.n_patches):
         last_ns = int(state.patch_time_ns[patch])
@@ -53,7 +54,7 @@ def figures(
 def path_figures(generation: Generation) -> dict[str, Any]:
     """Which way frames take, why not the native one, and how long they may wait."""
     return {
-        "data_path": "python" if generation.native is None else "native",
+        "data_path": generation.data_path.name.lower(),
         "why_python": generation.why_python,
         "latency_ms": int(generation.publisher.latency_ns[0]) / 1e6,
     }

@@ -16,7 +16,7 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason, BusState
 from skinware_drivers.native import structs
-from skinware_drivers.native.kernel_bus import KernelBus
+from skinware_drivers.native.kernel_bus import KernelBus, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.guard import bus_failure
@@ -62,15 +62,15 @@ def flow_of(
     take: Callable[[], object],
     fail: Callable[[BaseException], None],
 ) -> Flow | None:
-    """What lets the frames of a generation flow (see ``Flow``), None if C cannot read all of its buses."""
+    """What lets the frames of a generation flow (see ``Flow``), None if C can read none of its buses."""
     buses = [line.bus for line in generation.lines if line.reason != BusReason.REMOVED]
-    if generation.native is None or not all(isinstance(bus, KernelBus) and bus.reads_natively for bus in buses):
+    if generation.native is None or not any(is_read_natively(bus) for bus in buses):
         return None
     return Flow(generation, generation.native, epoll_fd, latency_s, take, fail)
 
 
 class Flow:
-    """The buses of one generation, as long as C reads them.
+    """The buses of one generation, as long as C reads them; when one that it cannot read has something, it comes back.
 
     Args:
         generation: what is in service.

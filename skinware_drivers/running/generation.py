@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,12 +13,13 @@ from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables
+from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
+from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _LOOK_PAUSE_NS = NS_PER_S // 20
 
@@ -37,6 +37,28 @@ def split_by_bus(batch: FrameBatch, rows: npt.NDArray[np.int64], n_buses: int) -
     return [rows[bus == ordinal] for ordinal in range(n_buses)]
 
 
+def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
+    """The driver's look at a skin, which knows already of the patches that report errors.
+
+    Raises:
+        DriverError: its code failed.
+    """
+    try:
+        watch = lines[0].adapter.watch(tables)
+    except Exception as error:
+        raise failure("watch", f"buses {', '.join(line.name for line in lines)}", error) from error
+    for line in lines:
+        for key in line.suspects:
+            patch = tables.patch_key.get((line.ordinal, key))
+            if patch is None:
+                continue
+            try:
+                watch.suspect(patch)
+            except Exception as error:
+                raise failure("Watch.suspect", f"bus {line.name}", error) from error
+    return watch
+
+
 @dataclass
 class Generation:
     """One structure in service.
@@ -51,6 +73,7 @@ class Generation:
         begun_ns: when it began.
         native: does the work of decoder and publisher in C; None where numpy does.
         why_python: why numpy does; empty where it does not.
+        flows: C reads the buses that it can read (see ``running.flow``).
     """
 
     lines: Sequence[BusLine]
@@ -62,6 +85,7 @@ class Generation:
     begun_ns: int = field(init=False)
     native: NativePath | None = field(init=False)
     why_python: str = field(init=False)
+    flows: bool = False
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
@@ -79,9 +103,6 @@ class Generation:
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
-            for key in line.suspects:
-                if (line.ordinal, key) in self.tables.patch_key:
-                    self.watch.suspect(self.tables.patch_key[line.ordinal, key])
 
     @property
     def tables(self) -> SkinTables:
@@ -164,6 +185,16 @@ class Generation:
             self.publisher.bus_since_ns[line.ordinal] = line.since_ns
             self.publisher.bus_load[line.ordinal] = line.limits.permille
             self.publisher.bus_samples[line.ordinal] = line.bus.samples.rows
+            in_c = self.flows and is_read_natively(line.bus)
+            self.publisher.bus_data_path[line.ordinal] = DataPath.NATIVE if in_c else DataPath.PYTHON
+
+    @property
+    def data_path(self) -> DataPath:
+        """Which way frames take."""
+        of_buses = set(self.publisher.bus_data_path.tolist())
+        if len(of_buses) > 1:
+            return DataPath.MIXED
+        return DataPath.PYTHON if self.native is None else DataPath.NATIVE
 
     def number_of(self, line: BusLine, patch: Patch) -> int | None:
         """Number of a patch in the structure, None if it is not in it (any more)."""
@@ -180,17 +211,20 @@ class Generation:
         state = self.publisher.patch_state[self.tables.structure.patch_bus == line.ordinal]
         return [line.patches[number] for number in np.flatnonzero(np.isin(state, states)).tolist()]
 
-    def log_patches(self) -> None:
-        """Tell each change of a patch's state once, and which buses have patches that need care."""
+    def tell_patches(self) -> Iterator[PatchChange]:
+        """Note each change of a patch's state, and which buses have patches that need care; what is told of it."""
         now, before = self.publisher.patch_state, self._known_state
         for patch in np.flatnonzero(now != before).tolist():
             line = self.lines[int(self.tables.structure.patch_bus[patch])]
             if line.busy.locked():
                 continue  # its devices are being set up, and may be silent for it
-            if now[patch] == PatchState.STALE:
-                log.warning("%s: %s fell silent", line.name, self.name_of(patch))
-            elif now[patch] == PatchState.LIVE and before[patch] != PatchState.EXPECTED:
-                log.warning("%s: %s is live again", line.name, self.name_of(patch))
+            is_live = bool(now[patch] == PatchState.LIVE)
+            if now[patch] == PatchState.STALE or (is_live and before[patch] != PatchState.EXPECTED):
+                line.patch_news.note(self.name_of(patch), is_live=is_live)
             before[patch] = now[patch]
         for bus in set(self.tables.structure.patch_bus[now != PatchState.LIVE].tolist()):
             self.lines[bus].needs_care.set()
+        for line in self.lines:
+            change = line.patch_news.catch_up()
+            if change is not None:
+                yield change

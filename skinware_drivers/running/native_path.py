@@ -210,6 +210,7 @@ class NativePath:
         plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
         plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
         plan.latency_ns, plan.data_path = arrays.at(publisher.latency_ns), arrays.at(publisher.data_path)
+        plan.bus_data_path = arrays.at(publisher.bus_data_path)
         self._skipped_column = OWN_BUS_COUNTERS.index("updates_skipped")
         counts = publisher.count_buses()
         plan.counts, plan.n_counts, plan.n_own_counts = arrays.at(counts), counts.shape[1], len(OWN_BUS_COUNTERS)

@@ -107,6 +107,7 @@ class Publisher:
         self.bus_samples: npt.NDArray[np.void] = np.zeros((len(structure.buses), SAMPLES), SAMPLE)
         self.latency_ns: npt.NDArray[np.int64] = np.zeros(1, np.int64)
         self.data_path: npt.NDArray[np.uint8] = np.full(1, int(DataPath.PYTHON), np.uint8)
+        self.bus_data_path: npt.NDArray[np.uint8] = np.full(len(structure.buses), int(DataPath.PYTHON), np.uint8)
         self.bus_counters: Sequence[BusCounters] = [BusCounters() for _ in structure.buses]
 
     @property
@@ -213,6 +214,7 @@ class Publisher:
         columns["patch_age_counts"][:] = self.timing.ages.reshape(-1)
         columns["latency_ns"][:] = self.latency_ns
         columns["data_path"][:] = self.data_path
+        columns["bus_data_path"][:] = self.bus_data_path
         self._writer.commit(state.newest_ns or time_ns)
         if self.wanted_ns < NOBODY_WAITS:
             self.answer(self._oldest_new_ns(time_ns))

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skinware.driver_service import DriverWriter
-from skinware.errors import BusNotAvailable, DriverError, StructureError
+from skinware.errors import DriverError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, short_turns
@@ -23,14 +23,15 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.bus_changes import BusChanges
-from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.bus_line import BusLine, open_buses
 from skinware_drivers.running.desk import RequestDesk, offered
 from skinware_drivers.running.figures import figures
 from skinware_drivers.running.flow import FlowLoop, flow_of
-from skinware_drivers.running.generation import Generation, make_batch, split_by_bus
-from skinware_drivers.running.guard import end_of_driver, failure, hook
+from skinware_drivers.running.generation import Generation, make_batch, make_watch, split_by_bus
+from skinware_drivers.running.guard import end_of_driver, hook
 from skinware_drivers.running.intake import Intake, latency_for
 from skinware_drivers.running.limits import MachineLimits
+from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
@@ -59,6 +60,7 @@ class Runner:
         namespace, slots, group: as for :class:`skinware.driver_service.DriverWriter`.
         geometry: where the sensors are, for programs; None where nobody knows.
         on_ready: called once, when frames are being published.
+        on_patches: called with patches that fell silent, or are live again.
 
     Attributes:
         lines: the buses; those that were removed keep their places.
@@ -83,6 +85,7 @@ class Runner:
         group: str | None = None,
         geometry: Geometry | None = None,
         on_ready: Callable[[], None] = lambda: None,
+        on_patches: Callable[[PatchChange], None] = lambda _change: None,
     ) -> None:
         self.name = name
         self.driver_type = driver_type
@@ -102,7 +105,7 @@ class Runner:
         self._slots = slots
         self._group = group
         self._geometry = geometry
-        self._on_ready = on_ready
+        self._on_ready, self._on_patches = on_ready, on_patches
         self._machine = MachineLimits()
         self._latency_s = latency_s
         self._intake = Intake(
@@ -141,31 +144,27 @@ class Runner:
 
     async def _run(self, loop: asyncio.AbstractEventLoop) -> None:
         self._namespace.create(self._group)
+        beginning = loop.create_task(self._begin())
+        beginning.add_done_callback(self._has_begun)
         try:
-            self._open_buses()
-            self._intake.start()
-            for line in self.lines:
-                self._serving.begin(line)
             await self._stopping.wait()
         finally:
+            beginning.cancel()
+            await asyncio.gather(beginning, return_exceptions=True)
             await self._serving.end()
             await self._shut_down(loop)
         if self._failure is not None:
             raise self._failure
 
-    def _open_buses(self) -> None:
-        absent: list[tuple[BusLine, BusNotAvailable]] = []
+    async def _begin(self) -> None:
+        await open_buses(self.lines, wait_for_one=self._wait_for_buses)
+        self._intake.start()
         for line in self.lines:
-            try:
-                line.open()
-            except BusNotAvailable as error:
-                if error.reason == BusReason.REFUSED:
-                    raise
-                absent.append((line, error))
-        if len(absent) == len(self.lines) and not self._wait_for_buses:
-            raise absent[0][1]
-        for line, why in absent:
-            line.begin_lost(why)
+            self._serving.begin(line)
+
+    def _has_begun(self, beginning: asyncio.Task[None]) -> None:
+        if not beginning.cancelled() and (error := beginning.exception()) is not None:
+            self.fail(error)
 
     def stop(self) -> None:
         """Ask ``run`` to come back; safe in a signal handler of the loop."""
@@ -230,8 +229,7 @@ class Runner:
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
-        for line in self.lines:
-            line.bus.close()
+        await asyncio.gather(*(line.close() for line in self.lines))
         self._epoll.close()
         if self.writer is not None:
             self.writer.close()
@@ -278,6 +276,9 @@ class Runner:
         self._built.notify_all()
 
     def _go_over_to(self, tables: SkinTables) -> None:
+        # the driver's own code comes first: if it fails, nothing has changed
+        decoder = Decoder(self._layouts, tables, [line.adapter.period_s for line in self.lines])
+        watch = make_watch(self.lines, tables)
         if self.writer is None:
             self.writer = writer = DriverWriter(
                 self.name,
@@ -297,14 +298,7 @@ class Runner:
             writer = self.writer
             writer.restructure(tables.structure, rate_hz=1 / self._period_s)
             log.info("new generation: %r", tables.structure)
-        periods_s = [line.adapter.period_s for line in self.lines]
-        decoder = Decoder(self._layouts, tables, periods_s)
-        adapter = self.lines[0].adapter
-        try:
-            watch = adapter.watch(tables)
-        except Exception as error:
-            raise failure("watch", f"buses {', '.join(line.name for line in self.lines)}", error) from error
-        by_cycle = adapter.by_cycle if self._publish is None else self._publish != "rate"
+        by_cycle = self.lines[0].adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
         publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
         self._intake.latency_s = self._longest_rest_s
@@ -320,7 +314,7 @@ class Runner:
             return
         take = self._guard(self._intake.take)
         flow = flow_of(self.generation, self._epoll.fileno(), self._intake.latency_s, take, self.fail)
-        self._flows = flow is not None
+        self._flows = self.generation.flows = flow is not None
         loop.selector.flow = None if flow is None else flow.run
         if flow is None:
             self._intake.start()
@@ -380,7 +374,8 @@ class Runner:
         self._machine.look()
         self.generation.update_bus_states()
         self.generation.publish_if_due(self._intake.read_until_ns)
-        self.generation.log_patches()
+        for change in self.generation.tell_patches():
+            self._on_patches(change)
         self._arm_timer()
 
     def _arm_timer(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import termios
 import threading
@@ -14,10 +15,13 @@ from typing import Any
 
 from skinware.errors import BusNotAvailable
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 _MOST_THREADED = 1 << 16
 """Bytes that a port with threads holds in each direction."""
 _THREAD_TURN_S = 0.1
-_THREAD_END_S = 1.0
+_THREAD_END_S, _CLOSE_S = 0.25, 0.8
+"""How long a thread may go on with what it does; how long a port may take to be closed, as for python-can's."""
 
 
 class Port(ABC):
@@ -173,15 +177,25 @@ class ThreadedPort(Port):
         return len(taken)
 
     def close(self) -> None:
-        """End the threads."""
+        """End the threads. A port that hangs in it is left to itself after 0.8 s, which is logged."""
         if self._closing:
             return
         with self._changed:
             self._closing = True
             self._changed.notify_all()
+        closing = threading.Thread(target=self._end, name=f"{self._name} closing", daemon=True)
+        closing.start()
+        closing.join(_CLOSE_S)
+        if closing.is_alive():
+            log.warning("%s: it hangs while it is closed, and is left to itself", self._name)
+
+    def _end(self) -> None:
         for thread in self._threads:
             thread.join(_THREAD_END_S)
-        self._serial.close()  # which ends a write that nobody takes
+        try:
+            self._serial.close()  # which ends a write that nobody takes
+        except Exception as error:  # noqa: BLE001  (see _work)
+            log.debug("%s: %s", self._name, error)
         for thread in self._threads:
             thread.join()
         os.close(self._event)

@@ -77,6 +77,7 @@ class FakeSkin:
         self.bus_reason = np.zeros(len(self.structure.buses), np.uint8)
         self.bus_since_ns = np.zeros(len(self.structure.buses), np.int64)
         self.bus_load = np.zeros(len(self.structure.buses), np.uint16)
+        self.data_path, self.bus_data_path = 0, np.zeros(len(self.structure.buses), np.uint8)
         self.bus_samples = np.zeros((len(self.structure.buses), SAMPLES), SAMPLE)
         self.interval_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
         self.age_counts = np.zeros((self.structure.n_patches, 32), np.uint64)
@@ -104,6 +105,8 @@ class FakeSkin:
             columns["bus_reason"][:] = self.bus_reason
             columns["bus_since_ns"][:] = self.bus_since_ns
             columns["bus_load"][:] = self.bus_load
+            columns["data_path"][:] = self.data_path
+            columns["bus_data_path"][:] = self.bus_data_path
             columns["bus_samples"][:] = self.bus_samples.view(np.uint8).ravel()
             columns["patch_interval_counts"][:] = self.interval_counts.ravel()
             columns["patch_age_counts"][:] = self.age_counts.ravel()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import signal
 from pathlib import Path
 
 import pytest
 
-from tests.commands import run
+from tests.commands import run, running
 
 DRIVER = """
 import asyncio
@@ -57,3 +58,33 @@ def test_it_ends_with_one_line(place: str, fault: str, words: str, tmp_path: Pat
     done = run("skin-driver", "--driver", str(path), "--bus", "virtual:roboskin", "--boards", "7", timeout_s=30)
     told = re.sub(r"(events|thread)\.py, line \d+", r"\1.py, line N", done.stderr)
     assert (told, done.returncode) == (f"skin-driver: {words}\n", 1)
+
+
+UNWATCHED = """
+from skinware_drivers.can.roboskin import RoboskinDriver
+
+
+class MySkin(RoboskinDriver):
+    made = 0
+
+    @classmethod
+    def watch(cls, tables):
+        cls.made += 1
+        if cls.made > 1:
+            raise KeyError("oops")
+        return super().watch(tables)
+"""
+
+
+def test_a_watch_that_fails_for_a_bus_that_joins_ends_it_too(tmp_path: Path) -> None:
+    path, file = tmp_path / "my_skin.py", tmp_path / "torso.toml"
+    path.write_text(UNWATCHED)
+    first, second = (f'[[bus]]\nname = "virtual:roboskin?boards={board}"\n' for board in (7, 8))
+    file.write_text(first)
+    with running("skin-driver", "--driver", str(path), "--config", str(file)) as driver:
+        driver.wait_for("ready")
+        file.write_text(first + second)
+        driver.process.send_signal(signal.SIGHUP)
+        assert driver.process.wait(60) == 1
+        driver.stop()
+        assert "`watch` failed: KeyError: 'oops' (my_skin.py, line 12)" in driver.errors

@@ -20,11 +20,12 @@ from skinware.memory.announcement import MOST_ANNOUNCEMENTS
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.service import Columns
-from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, DataPath
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
 UNTOLD: dict[str, Any] = {"reason": None, "state_age_s": None, "load": None, "load_unknown": "bit_rate", "samples": []}
+UNTOLD |= {"data_path": "not_told"}
 """What a driver need not tell of a bus."""
 
 
@@ -153,6 +154,36 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
     assert re.search(r"age  interval 99 %  delay 99 %.*(?s:.*)\n  99 %: 99th percentile", out)
     assert re.search(r"board 7 .*ms +34 ms +2.1 ms", out)
     assert re.search(r"board 8 .*ms +- +2.1 ms", out)
+
+
+@pytest.mark.parametrize(
+    ("own", "of_buses", "path", "line"),
+    [
+        (DataPath.NATIVE, [DataPath.NATIVE, DataPath.NATIVE], "native", "native data path"),
+        (DataPath.PYTHON, [DataPath.PYTHON, DataPath.PYTHON], "python", "python data path"),
+        (
+            DataPath.NATIVE,
+            [DataPath.NATIVE, DataPath.PYTHON],
+            "mixed",
+            "mixed data path; compiled code reads can0; Python reads can1",
+        ),
+        (DataPath.NATIVE, [DataPath.NOT_TOLD, DataPath.NOT_TOLD], "native", "native data path"),  # of an older version
+        (DataPath.NOT_TOLD, [DataPath.NOT_TOLD, DataPath.NOT_TOLD], "not_told", ""),
+    ],
+)
+def test_which_way_frames_take_is_shown(
+    own: DataPath, of_buses: list[DataPath], path: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with FakeSkin("torso", fake_structure(2, 1, buses=2)) as skin:
+        skin.data_path, skin.bus_data_path[:] = own, of_buses
+        skin.publish()
+        (driver,) = told(capsys)["drivers"]
+        out = text(capsys)
+    assert (driver["data_path"], [bus["data_path"] for bus in driver["buses"]]) == (
+        path,
+        [way.name.lower() for way in of_buses],
+    )
+    assert [text.strip() for text in out.splitlines() if "data path" in text] == [line] * bool(line)
 
 
 def test_nothing_runs(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:

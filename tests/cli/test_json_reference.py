@@ -179,6 +179,15 @@ def test_a_driver_and_those_that_look_at_it(
         check("`status`, `stopped`", status, driver.stop())
 
 
+def test_patches_that_fall_silent() -> None:
+    bus = "virtual?boards=7,8&restart=8&restart_after_s=1.5&boot_s=0.1"
+    with running("skin-driver", "--bus", bus) as driver:
+        silent = driver.wait_for("patches", lambda change: change["silent"] == ["board 8"])
+        live = driver.wait_for("patches", lambda change: change["live"] == ["board 8"])
+    check("`patches`", silent, live)
+    assert "board 8 fell silent" in driver.errors
+
+
 def test_bare_frames(printing: Print) -> None:
     check("`skin-dump --raw`", *printing(dump, "--raw", f"{VIRTUAL}&streaming=yes", "-n", "3"))
 

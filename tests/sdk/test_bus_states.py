@@ -25,7 +25,8 @@ from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNe
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
-from tests.sdk.driving import TroubledBus, driving, emulated, hardware_of, read_until
+from tests.sdk.clock import Clock
+from tests.sdk.driving import TroubledBus, driving, emulated, follow, hardware_of, read_until
 
 pytestmark = pytest.mark.usefixtures("hurry")
 
@@ -187,6 +188,63 @@ def test_a_driver_stops_while_an_interface_is_being_opened() -> None:
     assert slow.fileno() == -1  # opened after all, and closed
 
 
+def test_an_interface_that_hangs_while_it_is_opened_holds_up_no_other(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(bus_line, "_OPENING_S", 0.2)
+    slow, other = reporting(SlowBus), emulated(boards=(8,))
+    slow.opening.clear()
+    with driving(slow, other), DriverReader("roboskin") as reader:
+        frame = follow(reader, lambda f: f.bus_state.tolist() == [BusState.CONNECTING, BusState.LIVE])
+        assert (frame.bus_reason[0], frame.structure.n_patches) == (BusReason.FAILED, 1)
+        follow(reader, lambda f: f.sequence >= frame.sequence + 10 and not f.status.any())
+        slow.opening.set()
+        follow(reader, lambda f: f.structure.n_patches == 2 and not f.status.any())
+    assert len(slow.opened_at_s) == 1  # nobody tried again while it hung
+    assert told(caplog, "bus bus0") == [
+        "bus bus0 is not open after 0.2 s: its interface hangs; waiting for it to appear",
+        "bus bus0 is there",
+    ]
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_driver_stops_while_an_interface_hangs(
+    is_there: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(bus_line, "_STOP_TIMEOUT_S", 0.2)
+    slow = reporting(SlowBus)
+    if not is_there:
+        slow.opening.clear()
+    with driving(slow, wait=is_there) as running:
+        if is_there:
+            slow.opened_in.clear()
+            slow.opening.clear()
+            running.do(slow.go_down)
+        wait_until(lambda: bool(slow.opened_in))
+    assert told(caplog, "bus bus0")[-1] == ("bus bus0: its interface hangs while it is opened, and is left to itself")
+    threads = threading.active_count()
+    slow.down = False
+    slow.opening.set()  # nobody waits for it any more
+    wait_until(lambda: threading.active_count() < threads)
+    assert slow.fileno() == -1
+
+
+def test_interfaces_are_closed_side_by_side(caplog: pytest.LogCaptureFixture) -> None:
+    class Closing(SlowBus):
+        all_at_once = threading.Barrier(3)
+
+        def close(self) -> None:
+            if self.fileno() >= 0:
+                self.all_at_once.wait(30)
+            super().close()
+
+    buses = [Closing.with_hardware(EmulatedRoboskin(RoboskinOptions(boards=(7,)))) for _ in range(3)]
+    with driving(*buses):
+        pass
+    assert [bus.fileno() for bus in buses] == [-1, -1, -1]
+    assert "hangs" not in caplog.text
+
+
 def test_a_bus_that_cannot_be_opened_again_for_an_odd_reason_is_tried_for_ever(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -233,7 +291,7 @@ def test_silence_counts_only_where_devices_send_of_themselves(
     monkeypatch.setattr(bus_line, "now_ns", clock)
     with closing(select.epoll()) as epoll:
         line = BusLine("can0", 0, adapter, emulated(boards=(7,), listen_only=listen_only), epoll)
-        line.open()
+        asyncio.run(line.open())
 
         def hear() -> None:
             clock.pass_s(0.01)
@@ -258,19 +316,6 @@ def test_silence_counts_only_where_devices_send_of_themselves(
         line.remove()
     assert before == []
     assert told(caplog, "bus can0") == ["bus can0: nothing is heard any more", "bus can0: frames come again"]
-
-
-class Clock:
-    """A clock that the test moves."""
-
-    def __init__(self) -> None:
-        self.time_ns = 10**12
-
-    def __call__(self) -> int:
-        return self.time_ns
-
-    def pass_s(self, duration_s: float) -> None:
-        self.time_ns += round(duration_s * 1e9)
 
 
 def test_a_bus_that_comes_and_goes_for_an_hour_fills_no_log(caplog: pytest.LogCaptureFixture) -> None:

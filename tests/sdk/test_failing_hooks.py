@@ -26,7 +26,7 @@ from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.watch import Watch
-from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of
+from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")
 
@@ -245,6 +245,34 @@ def test_a_watch_that_fails_after_an_operation_is_named() -> None:
     with fails(words, driving(emulated(boards=(7,)), driver=Watched)), DriverReader("roboskin") as reader:
         with contextlib.suppress(PeerGone, RequestFailed):
             reader.call("rebaseline")
+
+
+def test_a_watch_that_fails_for_a_known_suspect_is_named_and_nothing_has_changed() -> None:
+    class Unsuspecting(Watch):
+        def suspect(self, patch: int) -> None:
+            raise KeyError("oops")
+
+    class Watched(RoboskinDriver):
+        @classmethod
+        def watch(cls, tables: SkinTables) -> Watch:
+            return Unsuspecting(tables)
+
+    late = troubled(boards=(8,))
+    late.down = True
+    words = "^bus bus0: `Watch.suspect` failed: KeyError: 'oops'"
+    with (
+        fails(words, driving(emulated(boards=(7,)), late, driver=Watched)) as running,
+        DriverReader("roboskin") as reader,
+    ):
+        before = follow(reader, lambda f: 0 in f.status)
+        runner = running.runner
+        assert runner is not None
+        (board,) = runner.lines[0].patches or ()
+        runner.lines[0].suspects.add(board.key)  # as if it had reported an error, and gone on sending
+        late.down = False
+        wait_until(lambda: running.failure is not None)
+        assert reader.structure.n_patches == 1
+        assert reader.generation == before.generation
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ from skinware_drivers.virtual.roboskin.options import RoboskinOptions as Emulato
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.watch import Watch
 from tests.sdk.cable import Cable
-from tests.sdk.driving import follow
+from tests.sdk.driving import emulated, follow
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason=f"no native data path: {native.why_python()}")
 
@@ -161,6 +161,26 @@ def test_requests_are_answered_with_frames_that_begin_later(cable: Cable) -> Non
             assert frame.sequence > before.sequence
             assert frame.acquired_ns > before.acquired_ns
             before = frame
+
+
+def test_buses_that_only_python_can_read_flow_beside_others(cable: Cable) -> None:
+    lines: Sequence[Any] = [
+        (RoboskinDriver(RoboskinOptions(boards=BOARDS)), EndOfCable(cable.end)),
+        (RoboskinDriver(RoboskinOptions(boards=(8,))), emulated(boards=(8,))),
+    ]
+    with (
+        boards_on(cable, EmulatedRoboskin(EmulatorOptions(boards=BOARDS))),
+        driving_lines(lines, "roboskin") as running,
+    ):
+        with DriverReader("roboskin") as reader:
+            frame = follow(reader, lambda f: not f.status.any())
+            for _ in range(5):
+                frame = follow(reader, newer_and_good(frame))
+        assert frame.data_path == DataPath.MIXED
+        assert frame.bus_data_path.tolist() == [DataPath.NATIVE, DataPath.PYTHON]
+        status = running.status()
+        assert (status["data_path"], status["why_python"]) == ("mixed", "")
+        assert [bus["data_path"] for bus in status["buses"]] == ["native", "python"]
 
 
 def test_what_is_no_data_frame_is_sorted_out(cable: Cable) -> None:

@@ -13,8 +13,8 @@ from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
 from skinware_drivers.can.wire_time import wire_bits
 from skinware_drivers.running.limits import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
+from tests.sdk.clock import Clock
 from tests.sdk.driving import driving, emulated, read_until
-from tests.sdk.test_bus_states import Clock
 
 
 @pytest.fixture

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import pty
 import select
+import signal
 import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import can
 import pytest
@@ -19,6 +21,7 @@ from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.testing.waiting import wait_until
+from tests.commands import running
 
 
 class Unplugged:
@@ -160,3 +163,38 @@ def test_an_identifier_that_is_not_sent_is_named_as_candump_writes_it(monkeypatc
     with pytest.raises(BusSendError, match=r"frame 0F1 not sent"):
         bus.send(0xF1, b"")
     bus.close()
+
+
+HANGING = """
+import sys
+import threading
+
+import can
+
+from skinware_drivers.can.roboskin import RoboskinDriver
+
+
+def hang(**_):
+    print("opening", file=sys.stderr, flush=True)
+    threading.Event().wait()
+
+
+can.Bus = hang
+
+
+class MySkin(RoboskinDriver):
+    pass
+"""
+
+
+def test_a_driver_ends_though_the_library_of_its_only_bus_hangs(tmp_path: Path) -> None:
+    file = tmp_path / "my_skin.py"
+    file.write_text(HANGING)
+    with running("skin-driver", "--driver", str(file), "--bus", "slcan:/dev/ttyACM0") as driver:
+        wait_until(lambda: "opening" in driver.errors)
+        assert driver.stop(signal.SIGTERM)["event"] == "stopped"
+    assert driver.process.returncode == 0
+    assert driver.errors.splitlines() == [
+        "opening",
+        "skin-driver: bus slcan:/dev/ttyACM0: its interface hangs while it is opened, and is left to itself",
+    ]

@@ -195,6 +195,7 @@ def test_a_dead_board_beside_a_living_one(caplog: pytest.LogCaptureFixture) -> N
         )
         assert (later.status[192:] & Status.STALE).all()
         assert (later.published_ns - later.acquired_ns) < 1_000_000_000
+        wait_until(lambda: "board 8 fell silent" in caplog.text)
     assert caplog.text.count("board 8 fell silent") == 1
 
 

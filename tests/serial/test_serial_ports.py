@@ -7,6 +7,7 @@ import fcntl
 import grp
 import os
 import termios
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,6 +21,8 @@ from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.serial import opening
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import ThreadedPort
+from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import FRAMING, Usb, data_frame, is_readable, line, opened, receive
 
 
@@ -186,3 +189,46 @@ def test_what_is_no_serial_port(tmp_path: Path, usb: Usb) -> None:
         SerialBus("/dev/ttyUSB0", {"serial_number": "A7"}).open()
     with pytest.raises(ConfigurationError, match="did you mean 'baudrate'"):
         SerialBus("/dev/ttyUSB0", {"baudrat": "9600"})
+
+
+class Hanging:
+    """A port of pyserial's that does not return from one of its calls until it is told to."""
+
+    in_waiting = 0
+
+    def __init__(self, hangs_in: str) -> None:
+        self.told, self.closed = threading.Event(), threading.Event()
+        self._hangs_in = hangs_in
+
+    def read(self, _size: int) -> bytes:
+        return self._hang("read")
+
+    def write(self, _data: bytes) -> None:
+        self._hang("write")
+
+    def close(self) -> None:
+        self._hang("close")
+        self.closed.set()
+
+    def _hang(self, where: str) -> bytes:
+        if where == self._hangs_in:
+            self.told.wait()
+        return b""
+
+
+@pytest.mark.parametrize("hangs_in", ["read", "write", "close"])
+def test_a_port_that_hangs_holds_nobody_up(hangs_in: str, caplog: pytest.LogCaptureFixture) -> None:
+    threads = threading.active_count()
+    hanging = Hanging(hangs_in)
+    port = ThreadedPort("rfc2217://far:1", hanging)
+    port.write(b"something")
+    port.close()
+    assert [record.getMessage() for record in caplog.records] == [
+        "rfc2217://far:1: it hangs while it is closed, and is left to itself"
+    ]
+    assert threading.active_count() > threads
+    port.close()
+    hanging.told.set()
+    assert hanging.closed.wait(30)
+    wait_until(lambda: threading.active_count() == threads)
+    assert len(caplog.records) == 1

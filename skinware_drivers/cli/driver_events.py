@@ -1,0 +1,54 @@
+"""What ``skin-driver`` prints while it runs: lines for people, or one JSON object per event."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import print_json
+from skinware.cli._format import plural
+
+if TYPE_CHECKING:
+    from skinware_drivers.running.patch_news import PatchChange
+    from skinware_drivers.running.runner import Runner
+
+
+def tell_ready(runner: Runner, as_json: bool) -> None:
+    """Frames are being published."""
+    from skinware_drivers.running.figures import path_figures
+
+    if runner.generation is None:
+        return
+    structure = runner.generation.tables.structure
+    buses = [line.name for line in runner.lines]
+    if as_json:
+        types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
+        counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
+        ready: dict[str, Any] = {"event": "ready", "driver": runner.driver_type, "name": runner.name, **counts}
+        print_json({**ready, "types": types, "buses": buses, **path_figures(runner.generation)})
+    else:
+        patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
+        what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
+        click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
+        if runner.generation.why_python:
+            click.echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
+
+
+def tell_patches(runner: Runner, change: PatchChange) -> None:
+    """Patches fell silent, or are live again: for programs. People have it in the log."""
+    if runner.ready:
+        print_json({"event": "patches", "name": runner.name, **change._asdict()})
+
+
+async def report(runner: Runner) -> None:
+    """Its state each second, for programs, until nobody reads any more."""
+    while True:
+        await asyncio.sleep(1)
+        if runner.ready:
+            try:
+                print_json({"event": "status", "name": runner.name, **runner.status()})
+            except BrokenPipeError:
+                runner.stop()
+                return

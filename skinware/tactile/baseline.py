@@ -43,7 +43,7 @@ _STEPS = 3
 _OFF_TO_ON = 0.6
 """Of the least thresholds."""
 _MOVED_SHARE = 0.05
-"""Of the taxels may move while their rest is measured."""
+"""Of the taxels may move while the rest is measured; of more, those that move have to wait."""
 _AWAY_S = 600.0
 """After so long without data a baseline is worth nothing."""
 
@@ -83,9 +83,9 @@ class Calm:
 class Baseline:
     """Follows the baselines of the n taxels of one sensor type of one driver.
 
-    Nothing is touched before the rest was measured: for some seconds in which at most 5 % of the taxels move, however
-    many are covered meanwhile. ``tare`` ends that at once. A taxel that sends later, or again after 10 minutes, is
-    measured when it does.
+    Nothing is touched before the rest was measured, for some seconds, however many taxels are covered meanwhile. If
+    more than 5 % of them move, those that rest begin, and each of the others when it has rested for as long. ``tare``
+    ends that at once. A taxel that sends later, or again after 10 minutes, is measured when it does.
 
     Args:
         module: (n,) int, the module of each: what sags and settles together.
@@ -97,8 +97,7 @@ class Baseline:
 
     Attributes:
         type_name: the type, where it was made for one.
-        refused_share: of the taxels moved when the rest was measured last, so that it is measured again; 0: it was not
-            refused.
+        refused_share: of the taxels is not ready yet, because they move; 0: none has to wait.
     """
 
     def __init__(
@@ -131,6 +130,7 @@ class Baseline:
         self._below_s: Floats = np.zeros(n, np.float32)
         self._away_s: Floats = np.zeros(n, np.float32)
         self._forced = np.zeros(n, bool)
+        self._is_ending = np.zeros(n, bool)
         self._suspect = np.zeros(n, bool)
         self._set_thresholds()
 
@@ -204,7 +204,7 @@ class Baseline:
         if self._minimum_on == 0 and not self._ready[taxels].all():
             raise ConfigurationError("the noise is not known yet: wait until it is measured, or set minimum_on")
         self._touches.forget(taxels)
-        self._begin_at(taxels, self._smooth, self._noise)
+        self._begin_at(np.flatnonzero(taxels), self._smooth[taxels], self._noise[taxels])
         self._forced |= taxels
         return int(taxels.sum())
 
@@ -261,9 +261,10 @@ class Baseline:
             limit=self._on,
         )
         above = now - self._base
-        value = np.where(self._touches.touched, above if self._signed else np.maximum(above, 0), np.float32(0))
+        touched = self._touches.touched & ~self._ending(above)
+        value = np.where(touched, above if self._signed else np.maximum(above, 0), np.float32(0))
         forced, self._forced = self._forced, np.zeros(len(live), bool)
-        return Calm(value, self._touches.touched.copy(), held, self._base.copy(), self._noise.copy(), forced, live)
+        return Calm(value, touched, held, self._base.copy(), self._noise.copy(), forced, live)
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """All that was learned, by name: arrays (n,), copies."""
@@ -331,23 +332,28 @@ class Baseline:
             self._smooth += step
         share = -math.expm1(-passed_s / self._settings.smooth_s) if self._settings.smooth_s else 1.0
         self._smooth += np.where(usable, now - self._smooth, np.float32(0)) * np.float32(share)
+        if not self._signed:  # the end of a touch shows soon, however firm it was
+            np.minimum(self._smooth, now + self._on, out=self._smooth, where=usable)
         self._last = now
         return now
 
     def _measure(self, time_ns: int, now: Floats, usable: Flags) -> None:
-        """Measure the rest of those whose it is not known; begin again if too many of them move."""
+        """Measure the rest of those whose it is not known; where many move, they have to wait until they rest."""
         if self._measurement is None:
             self._measurement = RestingMeasurement(len(now), self._settings.calibrate_s)
         if not self._measurement.add(time_ns, now, usable & ~self._ready):
             return
-        rest, self._measurement = self._measurement.result(), None
-        measured = np.isfinite(rest.level) & ~self._ready
+        taxels = np.flatnonzero(~self._ready)
+        rest = self._measurement.result(taxels)
         threshold = np.maximum(self._minimum_on, self._settings.on_sigma * rest.noise)
-        moving = int((measured & (rest.range > threshold)).sum())
-        refused = moving > max(1, _MOVED_SHARE * measured.sum())
-        self.refused_share = moving / int(measured.sum()) if refused else 0.0
+        measured = np.isfinite(rest.level)
+        moving = measured & (rest.range > threshold)
+        refused = int(moving.sum()) > max(1, _MOVED_SHARE * measured.sum())
+        self.refused_share = int(moving.sum()) / int(self._seen.sum()) if refused else 0.0
+        begins = measured & ~moving if refused else measured
         if not refused:
-            self._begin_at(measured, rest.level, rest.noise)
+            self._measurement = None  # whoever sends later begins anew
+        self._begin_at(taxels[begins], rest.level[begins], rest.noise[begins])
 
     def _follow_touches(self, deviation: Floats, live: Flags, passed_s: float) -> Flags:
         """(n,) which taxels are held."""
@@ -358,6 +364,13 @@ class Baseline:
             self._put(over, deviation)
         held = self._touches.hold(live, passed_s, self._settings.settle_s)
         return np.ones_like(held) if self._all_held else held
+
+    def _ending(self, above: Floats) -> Flags:
+        """(n,) whose values say that their touch is over, though it does not show yet where they are smoothed."""
+        load, smooth = (np.abs(of) if self._signed else of for of in (above, self._smooth - self._base))
+        ending = load < np.where(self._is_ending, self._off, np.minimum(self._off, smooth / 2))
+        self._is_ending = ending & self._touches.touched
+        return self._is_ending
 
     def _recover(self, deviation: Floats, free: Flags, passed_s: float) -> None:
         """Baselines that were learned under a load, which is gone now."""
@@ -375,11 +388,11 @@ class Baseline:
             self._below_s[taxels] = 0
             deviation[taxels] = 0
 
-    def _begin_at(self, taxels: Flags, level: Floats, noise: Floats) -> None:
-        """Their rest is known."""
-        self._base[taxels] = level[taxels]
-        self._noise[taxels] = noise[taxels]
-        self._ready |= taxels
+    def _begin_at(self, taxels: npt.NDArray[np.intp], level: Floats, noise: Floats) -> None:
+        """The rest of k taxels is known: (k,) their level and noise."""
+        self._base[taxels] = level
+        self._noise[taxels] = noise
+        self._ready[taxels] = True
         if self._ready.all():
             self._measurement = None
         self._set_thresholds()

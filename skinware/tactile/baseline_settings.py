@@ -20,7 +20,8 @@ class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         tau_s: time constant of a taxel's own drift, away from contacts.
         common_tau_s: time constant of the drift that is common to a patch.
         settle_s: how long after a contact the taxels near it keep their own baselines.
-        smooth_s: time constant of what is compared with the thresholds; values themselves are not smoothed.
+        smooth_s: time constant of what is compared with the thresholds, but for the end of a touch, which shows at
+            once; values themselves are not smoothed.
         on_sigma: a touch begins above so many standard deviations of the noise.
         off_sigma: and ends below so many.
         minimum_on: and begins above this at least. None: three steps of the raw values; 0 for those that have no steps.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +20,12 @@ _MEDIAN_OF_VARIANCE = {4: 0.789, 5: 0.839, 6: 0.870, 7: 0.891, 8: 0.907, 9: 0.91
 
 
 class Resting(NamedTuple):
-    """What was found.
+    """What was found of k taxels.
 
     Attributes:
-        level: (n,) float32, NaN where there was not enough data.
-        noise: (n,) float32, standard deviation from frame to frame.
-        range: (n,) float32, between the highest and the lowest level of a tenth of the time.
+        level: (k,) float32, NaN where there was not enough data.
+        noise: (k,) float32, standard deviation from frame to frame.
+        range: (k,) float32, between the highest and the lowest level of a tenth of the time.
     """
 
     level: npt.NDArray[np.float32]
@@ -33,7 +34,7 @@ class Resting(NamedTuple):
 
 
 class RestingMeasurement:
-    """Measures levels and noise of n taxels over some seconds, in a tenth of them at a time.
+    """Measures levels and noise of n taxels over the last seconds, in a tenth of them at a time.
 
     Level and noise are medians of those of the tenths: a touch of a third of the time moves neither, and medians of
     means are finer than the steps of the values, which medians of integers are not.
@@ -51,13 +52,8 @@ class RestingMeasurement:
         self._count = np.zeros(n, np.float32)
         self._sum = np.zeros(n, np.float32)
         self._squares = np.zeros(n, np.float32)
-        self._levels: list[npt.NDArray[np.float32]] = []
-        self._variances: list[npt.NDArray[np.float32]] = []
-
-    @property
-    def progress(self) -> float:
-        """0 to 1: how much of it is done."""
-        return len(self._levels) / _BLOCKS
+        self._levels: deque[npt.NDArray[np.float32]] = deque(maxlen=_BLOCKS)
+        self._variances: deque[npt.NDArray[np.float32]] = deque(maxlen=_BLOCKS)
 
     def add(self, time_ns: int, values: npt.NDArray[np.float32], usable: npt.NDArray[np.bool_]) -> bool:
         """Take a frame in.
@@ -68,7 +64,8 @@ class RestingMeasurement:
             usable: (n,) which of them count.
 
         Returns:
-            Whether it was the last that is needed.
+            Whether there is something to be found that was not there before: once after all the time, and then again
+            after each tenth of it.
         """
         if self._first is None:
             self._first, self._begun_ns = np.where(usable, values, np.nan).astype(np.float32), time_ns
@@ -78,19 +75,25 @@ class RestingMeasurement:
         self._sum += difference
         self._squares += difference * difference
         self._frames += 1
-        if time_ns - self._begun_ns >= self._block_ns and self._frames >= _FRAMES:
-            self._end_block(time_ns)
+        if time_ns - self._begun_ns < self._block_ns or self._frames < _FRAMES:
+            return False
+        self._end_block(time_ns)
         return len(self._levels) == _BLOCKS
 
-    def result(self) -> Resting:
-        """What was found in the blocks that are over."""
+    def result(self, taxels: npt.NDArray[np.intp]) -> Resting:
+        """What was found of some taxels in the last tenths.
+
+        Args:
+            taxels: (k,) their numbers.
+        """
         assert self._first is not None  # noqa: S101 - add() said so
-        levels, variances = np.sort(self._levels, axis=0), np.sort(self._variances, axis=0)  # NaN comes last
+        blocks = (np.array([block[taxels] for block in of_taxels]) for of_taxels in (self._levels, self._variances))
+        levels, variances = (np.sort(of_taxels, axis=0) for of_taxels in blocks)  # NaN comes last
         found = np.isfinite(levels).sum(axis=0)
         enough = found >= _ENOUGH * len(levels)
         taxel = np.arange(len(found))
         at = (np.maximum(found - 1, 0) // 2, taxel), (np.minimum(found // 2, len(levels) - 1), taxel)
-        level = self._first + (levels[at[0]] + levels[at[1]]) / 2
+        level = self._first[taxels] + (levels[at[0]] + levels[at[1]]) / 2
         noise = np.sqrt((variances[at[0]] + variances[at[1]]) / 2)
         spread = levels[np.maximum(found - 1, 0), taxel] - levels[0]
         return Resting(*(np.where(enough, array, np.nan).astype(np.float32) for array in (level, noise, spread)))

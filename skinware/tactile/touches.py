@@ -11,6 +11,8 @@ from skinware.tactile.baseline_settings import BaselineSettings
 
 _LEVEL_RISES_S, _LEVEL_FALLS_S = 2.0, 20.0
 """Of the level that a contact is held at: a bump of a moment must not raise it, a weaker grip may become the rule."""
+_COMES_BACK_S = 0.3
+"""What sagged comes back a little after the touch has ended, and belongs to it."""
 _JUST_TOUCHED = np.float32(1.5)
 """Times the threshold: so much a taxel that drifted beyond it a moment ago may show."""
 
@@ -30,6 +32,7 @@ class Touches:
             back.
         settling_s: (n,) float32, for how long each is still held.
         fading_s: (n_modules,) float64, for how long most of the load of each module has been gone.
+        ended_s: (n_modules,) float64, for how long none of its taxels has been touched.
     """
 
     def __init__(self, module: npt.NDArray[np.intp], neighbours: npt.NDArray[np.integer] | None = None) -> None:
@@ -43,6 +46,7 @@ class Touches:
         self.sunk: npt.NDArray[np.float32] = np.zeros(n, np.float32)
         self.settling_s: npt.NDArray[np.float32] = np.zeros(n, np.float32)
         self.fading_s: npt.NDArray[np.float64] = np.zeros(self._n_modules)
+        self.ended_s: npt.NDArray[np.float64] = np.full(self._n_modules, np.inf)
 
     def judge(
         self,
@@ -99,8 +103,9 @@ class Touches:
         if not len(active):
             return active
         touched, module = self.touched[active], self._module[active]
-        in_contact = np.zeros(self._n_modules, bool)
-        in_contact[module[touched]] = True
+        self.ended_s += passed_s
+        self.ended_s[module[touched]] = 0
+        in_contact = self.ended_s < _COMES_BACK_S
         self.contact_s[active] += np.float32(passed_s) * touched
         now, level = np.where(touched, load[active], np.float32(0)), self.level[active]
         rise, fall = (np.float32(-math.expm1(-passed_s / tau)) for tau in (_LEVEL_RISES_S, _LEVEL_FALLS_S))

@@ -98,6 +98,40 @@ def test_the_rest_is_not_taken_while_many_taxels_move() -> None:
     assert np.abs(calm.baseline - 15).max() < 0.5
 
 
+def test_those_that_rest_begin_and_each_of_the_others_when_it_has_rested() -> None:
+    bench = Bench()
+    for round_of in range(8):
+        calm = bench.run(1.0, on(*range(12 * (round_of % 2), 12 * (round_of % 2) + 12)))
+        assert not calm.usable[:24].any()
+    assert calm.usable[24:].all()
+    assert np.abs(calm.baseline[24:] - 15).max() < 0.5
+    assert bench.baseline.refused_share == 0.5
+    calm = bench.run(2.0, on(*range(6)))
+    assert bench.baseline.refused_share == 0.5
+    calm = bench.run(2.7)
+    assert not calm.usable[:6].any(), "they were pressed a moment ago"
+    calm = bench.run(0.5)
+    assert calm.usable[6:].all()
+    assert not calm.usable[:6].any()
+    calm = bench.run(2.5)
+    assert calm.usable.all()
+    assert bench.baseline.refused_share == 0
+    assert np.abs(calm.baseline - 15).max() < 0.5
+    assert np.abs(calm.noise - 0.85).max() < 0.25
+
+
+def test_a_tare_ends_the_waiting_of_those_that_move() -> None:
+    bench = Bench()
+    for round_of in range(6):
+        calm = bench.run(1.0, on(*range(12 * (round_of % 2), 12 * (round_of % 2) + 12)))
+    assert calm.usable.sum() == 24
+    bench.run(0.5)
+    bench.baseline.tare()
+    calm = bench.run(0.1)
+    assert calm.usable.all()
+    assert not calm.touched.any()
+
+
 def test_a_touch_has_its_value_without_delay_and_nothing_else_has_one() -> None:
     bench = Bench()
     bench.run(6)
@@ -111,6 +145,24 @@ def test_a_touch_has_its_value_without_delay_and_nothing_else_has_one() -> None:
     assert not calm.touched.any()
     assert calm.held[:12].all(), "what was near a contact settles for a while"
     assert not bench.run(3.0).held.any()
+
+
+@pytest.mark.parametrize("load", [12, 25, 60, 120, 200])
+def test_the_end_of_a_touch_shows_at_once_however_firm_it_was(load: float) -> None:
+    bench = Bench()
+    bench.run(6)
+    assert bench.run(2, on(5, load=load)).touched[5]
+    assert not bench.run(0.14).touched.any()
+
+
+def test_a_glitch_does_not_end_a_light_touch() -> None:
+    bench = Bench()
+    bench.run(6)
+    seen: list[bool] = []
+    for _ in range(20):
+        bench.run(0.5, on(5, load=8), each=lambda calm: seen.append(bool(calm.touched[5])))
+        bench.run(0.02)
+    assert np.mean(seen) > 0.99
 
 
 def test_a_light_touch_stays_for_as_long_as_it_lasts() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,13 +32,12 @@ from skinware.structure import Structure
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_contacts import CalmContacts
 from skinware.tactile.chain import Chain, ChainSettings
-from skinware.tactile.chain_state import read_state, save_state
 from skinware.tactile.contacts_service import NAME
+from skinware.tactile.learned_state import LearnedState
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
 _WAIT_S = WAIT_SLICE_NS / NS_PER_S
-_SAVE_EVERY_NS = 20 * NS_PER_S
 _DRIVER_TYPE = "calm"
 
 
@@ -89,7 +87,8 @@ class CalmService:
         self.restored = 0
         self.contacts: CalmContacts | None = CalmContacts(contacts, name, self.into, group) if contacts else None
         self._settings = settings or ChainSettings.calm()
-        self._group, self._state_path, self._on_ready = group, state_path, on_ready
+        self._group, self._on_ready = group, on_ready
+        self._learned = LearnedState(state_path)
         self._reader: DriverReader | None = None
         self._writer: DriverWriter | None = None
         self._chain: Chain | None = None
@@ -102,8 +101,6 @@ class CalmService:
         self._touched: dict[str, int] = {}
         self._refused: set[str] = set()
         self._waiting: list[tuple[int, Request]] = []
-        self._saving: threading.Thread | None = None
-        self._next_save_ns = now_ns() + _SAVE_EVERY_NS
         self._operations: dict[str, Callable[..., object]] = {
             "tare": self.tare,
             "hold": self.hold,
@@ -160,14 +157,12 @@ class CalmService:
                 self._answer()
                 if frame is not None:
                     self._publish(frame)
-                self._keep_state()
+                self._learned.keep(self._chain)
                 if now_ns() >= next_report_ns:
                     next_report_ns = now_ns() + round(every_s * NS_PER_S)
                     report()
         finally:
-            self._end_saving()
-            self._save()
-            self._end_saving()
+            self._learned.close(self._chain)
             for end in (self.contacts, self._writer, self._reader):
                 if end is not None:
                     end.close()
@@ -281,11 +276,12 @@ class CalmService:
             self._on_ready()
 
     def _tell_refusals(self, chain: Chain) -> None:
-        """Warn, once, where there will be no baselines until somebody does something about it."""
+        """Warn, once, where many sensors have no baselines until they rest."""
         for name, baseline in chain.baselines.items():
             if baseline.refused_share and name not in self._refused:
                 log.warning(
-                    "%s: no baselines yet: %.0f %% of the sensors move; leave them alone for %g s, or tare",
+                    "%s: no baselines yet for %.0f %% of the sensors: they move; each has one when it rested for %g s,"
+                    " or after a tare",
                     name,
                     100 * baseline.refused_share,
                     baseline.settings.calibrate_s,
@@ -304,8 +300,8 @@ class CalmService:
         chain = self._settings.chain(frame.structure)
         if before is not None:
             chain.restore(before.state())
-        elif self._state_path is not None:
-            self._restore(chain, self._state_path)
+        else:
+            self.restored = self._learned.restore(chain)
         static = self._reader.static()
         counters = tuple(
             static[f"{what}_counter_name"].tolist() if f"{what}_counter_name" in static else []
@@ -374,44 +370,6 @@ class CalmService:
         if type_name is not None and type_name not in found:
             raise ConfigurationError(f"no baseline of {type_name!r}; there are: {', '.join(found) or 'none'}")
         return found if type_name is None else {type_name: found[type_name]}
-
-    # -- what was learned ---------------------------------------------------------------------------------------
-
-    def _restore(self, chain: Chain, path: Path) -> None:
-        state, why = read_state(path)
-        try:
-            self.restored = 0 if state is None else chain.restore(state)
-        except ConfigurationError as error:
-            why = f"{path}: {error}"
-        if why:
-            log.warning("begun anew: %s", why)
-
-    def _keep_state(self) -> None:
-        if now_ns() >= self._next_save_ns:
-            self._next_save_ns = now_ns() + _SAVE_EVERY_NS
-            self._save()
-
-    def _end_saving(self) -> None:
-        if self._saving is not None:
-            self._saving.join()
-
-    def _save(self) -> None:
-        """In a thread: a disk may take long."""
-        path, chain = self._state_path, self._chain
-        if path is None or chain is None or (self._saving is not None and self._saving.is_alive()):
-            return
-        if not any(baseline.ready.any() for baseline in chain.baselines.values()):
-            return  # a file from before says more
-        state = chain.state()
-
-        def save() -> None:
-            try:
-                save_state(path, state)
-            except OSError as error:
-                log.warning("what was learned cannot be kept: %s: %s", path, error.strerror or error)
-
-        self._saving = threading.Thread(target=save, name="calm-state")
-        self._saving.start()
 
 
 __all__ = ["CalmService"]

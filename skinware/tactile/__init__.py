@@ -1,1 +1,88 @@
-"""The skin understood: numpy only, over arrays first; services and commands are built round it."""
+"""The skin understood: what touches it, where and how hard, whatever drifts. numpy only.
+
+Everything works on arrays, in a notebook or on a recording::
+
+    from skinware.tactile import Baseline, Contacts
+
+    baseline, contacts = Baseline.of(structure, "pressure"), Contacts.of(structure, "pressure")
+    for frame in frames:
+        calm = baseline.take(frame)
+        for contact in contacts.update(calm.value, calm.touched, frame.acquired_ns):
+            print(contact.id, contact.load, contact.cop_m, contact.taxels)
+
+Services do the same for other programs (``skin-calm``), and :class:`ContactsReader` reads what they found.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skinware.tactile.baseline import Baseline, Calm
+    from skinware.tactile.baseline_settings import BaselineSettings
+    from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
+    from skinware.tactile.contacts import Contact, ContactKind, Contacts, ContactSet
+    from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
+    from skinware.tactile.curves import Curve, CurveTable, fit_curve, read_curves
+    from skinware.tactile.neighbours import neighbours_of_pairs
+    from skinware.tactile.region_files import put_region, read_regions
+    from skinware.tactile.regions import Box, Region, Regions
+    from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Taxels
+    from skinware.tactile.tracking import TrackingSettings
+
+__all__ = [
+    "AmplifierSettings",
+    "Baseline",
+    "BaselineSettings",
+    "BaselineStageSettings",
+    "Box",
+    "Calm",
+    "Chain",
+    "ChainSettings",
+    "Contact",
+    "ContactKind",
+    "ContactSet",
+    "Contacts",
+    "ContactsFrame",
+    "ContactsReader",
+    "Curve",
+    "CurveSettings",
+    "CurveTable",
+    "FilterSettings",
+    "Region",
+    "Regions",
+    "ScalerSettings",
+    "Signal",
+    "Taxels",
+    "TrackingSettings",
+    "fit_curve",
+    "neighbours_of_pairs",
+    "put_region",
+    "read_curves",
+    "read_regions",
+]
+
+_MODULES = (
+    "baseline",
+    "baseline_settings",
+    "contacts",
+    "tracking",
+    "neighbours",
+    "regions",
+    "region_files",
+    "stages",
+    "curves",
+    "chain",
+    "contacts_service",
+)
+"""Where the names are, what imports little first."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and no more: commands and the world to test in, which are here too, start fast."""
+    if name in __all__:
+        for module in map(importlib.import_module, (f"{__name__}.{module}" for module in _MODULES)):
+            if name in vars(module):
+                return vars(module)[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

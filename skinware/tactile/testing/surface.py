@@ -112,6 +112,18 @@ class Surface:
         """Number of patches."""
         return int(self.patch.max()) + 1 if len(self) else 0
 
+    def geometry(self, frame: str = "world", type_name: str = "pressure") -> Geometry:
+        """The places of the n taxels, whose uid are 0 to n - 1.
+
+        Args:
+            frame: name of the coordinate frame.
+            type_name: of the taxels.
+        """
+        n = len(self)
+        places = Geometry.unknown([type_name] * n, np.arange(n, dtype=np.uint64))
+        places.position_m[:], places.normal[:], places.frame[:] = self.position_m, self.normal, frame
+        return places
+
     def taxels(self, some: Taxels) -> ArrayI:
         """The numbers of some taxels.
 

@@ -89,10 +89,17 @@ def codes_of(levels: npt.NDArray[np.uint8], marks: npt.NDArray[np.uint8]) -> npt
 
 @dataclass(frozen=True)
 class Label:
-    """A word beside or above sensors, at a column of the terminal."""
+    """A word at a column of the terminal.
+
+    Attributes:
+        column: where it begins.
+        text: the word.
+        is_mark: it stands over sensors and marks something there, instead of beside or above them.
+    """
 
     column: int
     text: str
+    is_mark: bool = False
 
 
 @dataclass(frozen=True, eq=False)

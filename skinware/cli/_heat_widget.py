@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import numpy.typing as npt
 from textual import events
@@ -10,7 +12,7 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from skinware.cli._heat_map import Arrangement
+from skinware.cli._heat_map import Arrangement, Label
 from skinware.cli._painting import changed_lines, segments_of
 from skinware.cli._palette import Palette
 
@@ -30,24 +32,32 @@ class HeatMap(ScrollView, can_focus=False):
         self._palette = palette
         self._arrangement: Arrangement | None = None
         self._pixels: npt.NDArray[np.uint8] | None = None
+        self._marks: Mapping[int, Sequence[Label]] = {}
         self._strips: dict[int, Strip] = {}
 
-    def show(self, arrangement: Arrangement, pixels: npt.NDArray[np.uint8]) -> None:
+    def show(
+        self,
+        arrangement: Arrangement,
+        pixels: npt.NDArray[np.uint8],
+        marks: Mapping[int, Sequence[Label]],
+    ) -> None:
         """Draw what changed since the last time.
 
         Args:
             arrangement: where everything is.
             pixels: (2 * lines, columns) uint8, what ``arrangement.draw`` made; not changed afterwards.
+            marks: words over sensors, by line.
         """
         before = self._pixels if arrangement is self._arrangement else None
-        self._arrangement, self._pixels = arrangement, pixels
+        moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}
+        self._arrangement, self._pixels, self._marks = arrangement, pixels, marks
         if before is None:
             self._strips.clear()
             self.virtual_size = Size(arrangement.columns, arrangement.lines)
             self.refresh()
             return
         top = self.scroll_offset.y
-        for line in changed_lines(before, pixels):
+        for line in moved.union(changed_lines(before, pixels)):
             self._strips.pop(line, None)
             if top <= line < top + self.size.height:
                 self.refresh_line(line)
@@ -63,7 +73,8 @@ class HeatMap(ScrollView, can_focus=False):
         if arrangement is None or pixels is None or line >= arrangement.lines:
             return Strip.blank(0)
         upper, lower = pixels[2 * line : 2 * line + 2]
-        segments = segments_of(upper, lower, arrangement.labels.get(line, ()), self._palette)
+        labels = [*arrangement.labels.get(line, ()), *self._marks.get(line, ())]
+        segments = segments_of(upper, lower, labels, self._palette)
         strip = self._strips[line] = Strip(segments, arrangement.columns)
         return strip
 

@@ -119,10 +119,14 @@ class LiveDrivers:
 
     Args:
         namespace: where to look.
+
+    Attributes:
+        others: names of the services that are no drivers.
     """
 
     def __init__(self, namespace: Namespace) -> None:
         self.namespace = namespace
+        self.others: tuple[str, ...] = ()
         self._drivers: dict[str, LiveDriver] = {}
         self._next_look_ns = 0
 
@@ -145,6 +149,7 @@ class LiveDrivers:
                 if name not in self._drivers:
                     self._attach(name)
             self._drivers = dict(sorted(self._drivers.items()))
+            self.others = tuple(name for name in names if name not in self._drivers)
         return list(self._drivers.values())
 
     def poll(self, driver: LiveDriver) -> bool:

@@ -78,11 +78,12 @@ def segments_of(
     for label in labels:
         end = label.column + len(label.text)
         before, _, after = Segment.divide(segments, [label.column, end, max(end, len(pairs))])
-        segments = [*before, Segment(label.text, _LABEL), *after]
+        segments = [*before, Segment(label.text, _MARK if label.is_mark else _LABEL), *after]
     return segments
 
 
 _LABEL = Style.parse("#8a8a8a")
+_MARK = Style.parse("bold #ffffff on #27548a")
 
 
 @cache

@@ -15,6 +15,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
+from skinware.cli._contacts import LiveContacts, labels_of, lines_of, places_of
 from skinware.cli._format import NOT_FRESH, plural
 from skinware.cli._health import LIVE, life_of
 from skinware.cli._heat_widget import HeatMap
@@ -29,6 +30,8 @@ from skinware.tactile.regions import Regions
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
+_MOST_CONTACTS = 9
+"""Lines for them, where there is room."""
 _WIDTHS = (19, 10, 8, 6, 11, 5, 7, 60)
 _LEFT_COLUMNS = (0, 1, 7)
 _STATE_COLOURS = {
@@ -87,6 +90,7 @@ class SkinTop(App[None]):
     #title { width: 1fr; text-style: bold; }
     #scale { width: auto; }
     #map { height: 1fr; margin: 0 1; background: #121212; scrollbar-size-vertical: 1; }
+    #contacts { height: 20%; min-height: 2; max-height: 9; padding: 0 1; }
     #marks, #detail { height: 1; padding: 0 1; }
     #detail { color: #8a8a8a; }
     Footer { background: #22304f; }
@@ -120,6 +124,7 @@ class SkinTop(App[None]):
         super().__init__()
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
         self._drivers = LiveDrivers(namespace)
+        self._contacts = LiveContacts(namespace)
         self._duration_s = duration_s
         self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
         self._has_regions = regions is not None
@@ -131,6 +136,7 @@ class SkinTop(App[None]):
         self._title = Static(id="title", markup=False)
         self._scale = Static(id="scale", markup=False)
         self._heat_map = HeatMap(palette, id="map")
+        self._touched = Static(id="contacts", markup=False)
         self._marks = Static(id="marks", markup=False)
         self._detail = Static(id="detail", markup=False)
         self._rows: list[Row] = []
@@ -151,6 +157,8 @@ class SkinTop(App[None]):
                 yield self._title
                 yield self._scale
             yield self._heat_map
+            self._touched.display = False
+            yield self._touched
             yield self._marks
             yield self._detail
         yield Footer()
@@ -173,6 +181,7 @@ class SkinTop(App[None]):
         """Let go of the drivers."""
         for number in _ENDING_SIGNALS:
             asyncio.get_running_loop().remove_signal_handler(number)
+        self._contacts.close()
         self._drivers.close()
 
     # -- what the person does -----------------------------------------------------------------------------------
@@ -265,6 +274,7 @@ class SkinTop(App[None]):
                 self._drivers.poll(driver)
                 count += 1
                 rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
+            self._contacts.look(self._drivers.others)
         except NamespaceError as error:
             why = str(error)
         self._heading = f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}"
@@ -313,8 +323,12 @@ class SkinTop(App[None]):
             return
         self._must_draw = False
         picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
+        contacts = self._contacts.of(row.key.driver)
+        touched = places_of(contacts, frame.structure)
+        self._touched.display = contacts is not None
+        _say(self._touched, "\n".join(lines_of(touched, self._touched.size.height or _MOST_CONTACTS)))
         if picture.arrangement is not None:
-            self._heat_map.show(picture.arrangement, picture.pixels)
+            self._heat_map.show(picture.arrangement, picture.pixels, labels_of(touched, picture.arrangement))
         hidden = 0 if picture.arrangement is None else picture.arrangement.lines - size.height
         _say(self._title, picture.title + f" (PgUp, PgDn: {plural(hidden, 'more line')})" * (hidden > 0))
         _say(self._scale, picture.scale)

@@ -191,8 +191,8 @@ def plain_line(health: SkinHealth) -> str:
     return "  ".join([health.name, life, age, sensors, f"patches {patches}", *losses])
 
 
-def as_data(health: SkinHealth) -> dict[str, Any]:
-    """One driver as JSON prints it."""
+def as_data(health: SkinHealth, contacts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One driver as JSON prints it, with its contacts."""
     return {
         "driver": health.name,
         "state": health.life,
@@ -202,4 +202,5 @@ def as_data(health: SkinHealth) -> dict[str, Any]:
         "status": health.statuses,
         "patches": health.patches,
         "counters": health.counters,
+        "contacts": list(contacts),
     }

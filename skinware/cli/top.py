@@ -24,6 +24,7 @@ from skinware.cli._command import (
 )
 
 if TYPE_CHECKING:
+    from skinware.cli._contacts import LiveContacts
     from skinware.cli._live import LiveDrivers
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Regions
@@ -113,22 +114,24 @@ def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
     """Print a line per driver each second, until the time is over."""
+    from skinware.cli._contacts import LiveContacts
     from skinware.cli._live import LiveDrivers
 
     start_s = time.monotonic()
     end_s = None if duration_s is None else start_s + duration_s
-    drivers = LiveDrivers(namespace)
+    drivers, contacts = LiveDrivers(namespace), LiveContacts(namespace)
     try:
         lines_at_s = start_s
         while end_s is None or time.monotonic() < end_s:
             for driver in drivers.look():
                 drivers.poll(driver)
             if time.monotonic() >= lines_at_s:
-                _print_lines(drivers, as_json)
+                _print_lines(drivers, contacts, as_json)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
             next_s = time.monotonic() + _TAKE_PERIOD_S
             time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
     finally:
+        contacts.close()
         drivers.close()
 
 
@@ -138,16 +141,20 @@ def _on_terminal() -> bool:
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
-def _print_lines(drivers: LiveDrivers, as_json: bool) -> None:
+def _print_lines(drivers: LiveDrivers, contacts: LiveContacts, as_json: bool) -> None:
+    from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
 
-    healths = [driver.health() for driver in drivers.look()]
-    for health in healths:
+    found = drivers.look()
+    contacts.look(drivers.others)
+    for driver in found:
+        places = _contacts.places_of(contacts.of(driver.name), driver.reader.structure)
         if as_json:
-            print_json(as_data(health))
+            print_json(as_data(driver.health(), [_contacts.as_data(place) for place in places]))
         else:
-            click.echo(plain_line(health))
-    if not healths and not as_json:
+            for line in (plain_line(driver.health()), *map(_contacts.plain_text, places)):
+                click.echo(line)
+    if not found and not as_json:
         click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
 
 

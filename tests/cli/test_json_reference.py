@@ -32,6 +32,7 @@ from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
+from tests.cli.test_contacts import touched_skin
 from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
 from tests.commands import running
 from tests.finding.fakes import see_only
@@ -173,7 +174,6 @@ def test_a_driver_and_those_that_look_at_it(
             check("`ready` of a calmed driver", calm.wait_for("ready"))
             status = calm.wait_for("status", lambda status: bool(status["touched"]))
             check("`status`, `stopped` of a calmed driver", status, calm.stop())
-        check("`skin-top`", *printing(top, "--plain", "-T", "2"))
         check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
         status = driver.wait_for("status")
         check("`status`, `stopped`", status, driver.stop())
@@ -186,6 +186,11 @@ def test_patches_that_fall_silent() -> None:
         live = driver.wait_for("patches", lambda change: change["live"] == ["board 8"])
     check("`patches`", silent, live)
     assert "board 8 fell silent" in driver.errors
+
+
+def test_a_driver_and_its_contacts(printing: Print) -> None:
+    with touched_skin():
+        check("`skin-top`", *printing(top, "--plain", "-T", "0.01"))
 
 
 def test_bare_frames(printing: Print) -> None:

@@ -51,7 +51,17 @@ def test_json(capsys: pytest.CaptureFixture[str]) -> None:
         skin.publish(2)
         (line,) = lines(capsys, "--json", "-T", "0.01")
     told = json.loads(line)
-    assert told.keys() == {"driver", "state", "rate_hz", "age_ms", "sensors", "status", "patches", "counters"}
+    assert told.keys() == {
+        "driver",
+        "state",
+        "rate_hz",
+        "age_ms",
+        "sensors",
+        "status",
+        "patches",
+        "counters",
+        "contacts",
+    }
     assert (told["driver"], told["sensors"], told["status"]["fresh"]) == ("a", 24, 24)
 
 

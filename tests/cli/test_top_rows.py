@@ -59,7 +59,7 @@ def test_plain_lines_of_all_kinds(health: SkinHealth, words: str) -> None:
 
 
 def test_json_of_a_plain_line() -> None:
-    assert as_data(HEALTH) == {
+    assert as_data(HEALTH, []) == {
         "driver": "roboskin",
         "state": "live",
         "rate_hz": 20.0,
@@ -68,8 +68,9 @@ def test_json_of_a_plain_line() -> None:
         "status": {"fresh": 766, "stale": 2, "never_seen": 0},
         "patches": {"live": 4},
         "counters": {"frames": 5156, "lost": 0, "orphans": 3},
+        "contacts": [],
     }
-    nothing = as_data(replace(HEALTH, rate_hz=None, age_ns=None))
+    nothing = as_data(replace(HEALTH, rate_hz=None, age_ns=None), [])
     assert (nothing["rate_hz"], nothing["age_ms"]) == (None, None)
 
 

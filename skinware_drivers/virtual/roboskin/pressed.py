@@ -20,6 +20,7 @@ _FIRST_BOARD = 7
 _COUNTS_PER_N = 96
 """Of capacitance: 24 of the values on the wire at the usual shift of 2."""
 _FINGER_N, _FINGER_RADIUS_M = 5.0, 0.006
+_STROKE_M_S, _STROKE_S = 0.02, 4.6
 _RAMP_S = 0.5
 _CALM_S = 1.0
 _NEVER_S = 1e10
@@ -121,6 +122,8 @@ class PressedSkin:
                 begin_s=time_ns / NS_PER_S + _CALM_S + float(random.uniform(0, 1.4)),
                 end_s=_NEVER_S,
                 rise_s=_RAMP_S,
+                speed_m_s=_STROKE_M_S,
+                press_s=_STROKE_S,
             )
             self._fingers[ordinal] = finger
             self._world.gestures.append(finger)

@@ -1,6 +1,8 @@
-"""A picture of the real skin-top: waits until somebody presses board 7, and saves what is on the screen as SVG.
+"""A picture of the real skin-top: waits until somebody presses the skin, and saves what is on the screen as SVG.
 
-Usage: python tools/pictures/skin_top.py FILE.svg        (a driver must run; tools/picture starts one)
+Usage: python tools/pictures/skin_top.py FILE.svg NAMESPACE        (a driver must run there; tools/picture starts it)
+
+Beside contacts it draws the whole driver with them; otherwise board 7.
 """
 
 from __future__ import annotations
@@ -23,16 +25,30 @@ PATIENCE_S = 120.0
 _FONTS = "ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace"
 
 
-async def picture() -> str:
+async def picture(namespace: str) -> str:
     """The screen as SVG."""
-    app = SkinTop(Namespace(), palette=TRUE_COLOURS)
+    app = SkinTop(Namespace(namespace), palette=TRUE_COLOURS)
     async with app.run_test(size=SIZE) as pilot:
         async with asyncio.timeout(PATIENCE_S):
-            while app.query_one("#list", DataTable).row_count < 6:
+            while not app.query_one("#list", DataTable).row_count or not app._drivers.look()[0].frame:
                 await pilot.pause(0.1)
-            await pilot.press("down", "down")
-            await _pressed(app, pilot)
+            if app._drivers.others:
+                await _followed(app, pilot)
+            else:
+                await pilot.press("down", "down")
+                await _pressed(app, pilot)
         return plain(app.export_screenshot(title="skin-top"))
+
+
+async def _followed(app: SkinTop, pilot: Pilot[None]) -> None:
+    """Wait until nearly all sensors are at rest, and two contacts are there for a while."""
+    while True:
+        await pilot.pause(0.05)
+        (driver,) = app._drivers.look()
+        contacts = app._contacts.of(driver.name)
+        rested = driver.frame is not None and (driver.frame.status == 0).mean() > 0.98
+        if rested and contacts and len(contacts.contacts) == 2 and contacts.contacts.age_s.min() > 1.5:
+            return
 
 
 async def _pressed(app: SkinTop, pilot: Pilot[None]) -> None:
@@ -55,5 +71,5 @@ def plain(svg: str) -> str:
 
 if __name__ == "__main__":
     file = Path(sys.argv[1])
-    file.write_text(asyncio.run(picture()), encoding="utf-8")
+    file.write_text(asyncio.run(picture(sys.argv[2])), encoding="utf-8")
     print(f"{file}: {file.stat().st_size / 1000:.0f} kB")

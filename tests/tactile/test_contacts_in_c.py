@@ -1,0 +1,50 @@
+"""The C program of docs/tactile/contacts.md, compiled and run as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinware import Namespace
+from skinware.realtime import now_ns
+from skinware.tactile.contacts_service import ContactsWriter
+from tests.compiling import compiled
+from tests.core.test_c_how_to import lines_of
+from tests.tactile.skins import triangles
+from tests.tactile.test_contacts_service import structure
+
+PAGE = Path(__file__).parents[2] / "docs" / "tactile" / "contacts.md"
+
+
+@pytest.mark.parametrize("language", ["c99", "c++11"])
+def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
+    language: str, namespace: Namespace, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    (text,) = re.findall(r"^```c\n(.*?)^```", PAGE.read_text(), flags=re.M | re.S)
+    source = tmp_path / "contacts.c"
+    source.write_text(text)
+    program = compiled(source, language, tmp_path_factory)
+
+    def publish(writer: ContactsWriter, n: int, **loads: float) -> None:
+        value = [loads.get(f"t{taxel}", 0.0) for taxel in range(n)]
+        writer.publish(np.array(value), np.array(value) > 0, now_ns())
+
+    def at(taxel: int) -> str:
+        x, y, z = triangles(20, 20)[taxel].astype(np.float32).tolist()
+        return f"{x:.3f} {y:.3f} {z:.3f} m"
+
+    with ContactsWriter(structure(), namespace=namespace, rate_hz=0.1) as writer:
+        publish(writer, 400, t45=20.0)
+        with lines_of(program, namespace.name) as lines:
+            assert [next(lines), next(lines)] == ["1 contacts\n", f"  1: load 20 at {at(45)}\n"]
+            publish(writer, 400, t45=30.0, t390=5.5)
+            seen = [next(lines) for _ in range(3)]
+            assert seen == ["2 contacts\n", f"  1: load 30 at {at(45)}\n", f"  2: load 5.5 at {at(390)}\n"]
+            publish(writer, 400)
+            assert next(lines) == "0 contacts\n"
+            writer.restructure(structure(rows=3))
+            publish(writer, 60, t7=4.0)
+            assert [next(lines), next(lines)] == ["1 contacts\n", f"  1: load 4 at {at(7)}\n"]

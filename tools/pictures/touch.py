@@ -1,0 +1,198 @@
+"""The pictures of docs/tactile: what a baseline, contacts and regions make of a skin whose truth is known.
+
+Usage: python tools/pictures/touch.py FOLDER        (writes baseline.svg, contacts.svg and regions.svg there)
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware import Structure
+from skinware.sensor_types import PRESSURE
+from skinware.tactile import Baseline, Box, Contacts, Region, Regions
+from skinware.tactile.neighbours import neighbours
+from skinware.tactile.testing import Response, World, arm, grid
+
+ArrayF = npt.NDArray[np.float64]
+
+_WIDTH = 860
+_INK, _GREY, _PALE = "#1f2933", "#94a3b8", "#e5e9f0"
+_GREEN, _BLUE, _RED, _AMBER = "#15803d", "#1d4ed8", "#b91c1c", "#d97706"
+_THRESHOLD = 8
+"""Of a touch, for whoever tares once."""
+
+
+def baseline_picture() -> str:
+    """One taxel over four minutes of drift, touched twice: counts, baseline, and when it is shown as touched."""
+    world = World(grid(modules=4), seed=4, drift_per_min=6, wave=4, wave_s=150, response=Response(remainder=0.1))
+    taxel = 5
+    world.push(world.surface.position_m[taxel], 25, 60, 140)
+    world.push(world.surface.position_m[taxel], 12, 190, 193, rise_s=0.2)
+    block = world.record(240)
+    baseline = Baseline(world.surface.module, world.surface.patch)
+    calm = [baseline.update(sample.time_ns, sample.values, sample.usable) for sample in block]
+    counts = block.values[:, taxel].astype(float)
+    rows = slice(None, None, 10)
+    time_s = np.arange(len(block))[rows] / world.rate_hz
+    base = np.array([one.baseline[taxel] for one in calm])[rows]
+    shown = np.array([one.touched[taxel] for one in calm])
+    tared = counts - counts[: round(5 * world.rate_hz)].mean() > _THRESHOLD
+    truth = block.truth[:, taxel] > 1
+
+    left, right, top, height = 60, 20, 30, 230
+    low, high = 0.0, 60.0
+
+    def x(at_s: float | ArrayF) -> ArrayF:
+        return left + (_WIDTH - left - right) * np.asarray(at_s) / 240
+
+    def y(value: float | ArrayF) -> ArrayF:
+        return top + height * (1 - (np.asarray(value) - low) / (high - low))
+
+    parts = [_text(left, top - 10, "counts of one taxel, and its baseline", bold=True)]
+    for value in range(0, 61, 20):
+        parts.append(_line([left, _WIDTH - right], [float(y(value))] * 2, _PALE))
+        parts.append(_text(left - 8, float(y(value)) + 5, str(value), anchor="end"))
+    parts.append(_line(x(time_s), y(counts[rows]), _GREY))
+    known = np.isfinite(base)
+    parts.append(_line(x(time_s[known]), y(base[known]), _GREEN, width=2.5))
+    bars = (
+        ("touched, in truth", truth, _INK),
+        ("shown: the baseline", shown, _GREEN),
+        ("shown: 8 counts above a tare", tared, _RED),
+    )
+    bar_y = top + height + 34
+    for name, flags, colour in bars:
+        parts.append(_text(left, bar_y, name))
+        for begin, end in _runs(flags):
+            from_x, to_x = float(x(begin / world.rate_hz)), float(x(end / world.rate_hz))
+            size = f'width="{max(to_x - from_x, 1):.1f}" height="8"'
+            parts.append(f'<rect x="{from_x:.1f}" y="{bar_y + 6}" {size} fill="{colour}"/>')
+        parts.append(_line([left, _WIDTH - right], [bar_y + 14] * 2, _PALE))
+        bar_y += 36
+    parts += [
+        _text(float(x(60 * minute)), bar_y, f"{minute} min", anchor="middle" if minute < 4 else "end")
+        for minute in range(5)
+    ]
+    return _svg("A taxel that drifts while it is touched twice", bar_y + 14, parts)
+
+
+def contacts_picture() -> str:
+    """Two fingers on the arm: what each taxel showed at most, and the ways of the contacts."""
+    surface = arm()
+    world = World(surface, seed=2, drift_per_min=1)
+    world.stroke([(0.015, 0.0, 0.0225), (0.12, 0.004, 0.0225)], 60, 8, 13, radius_m=0.005)
+    world.stroke([(0.22, -0.012, 0.0125), (0.17, 0.012, 0.0125)], 60, 9, 13, radius_m=0.005)
+    places = surface.geometry("arm")
+    baseline, contacts = Baseline(surface.module, surface.patch), Contacts(len(places), neighbours(places), places)
+    peak = np.zeros(len(surface))
+    ways: dict[int, list[tuple[float, float, float]]] = {}
+    for sample in world.record(14):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        np.maximum(peak, calm.value, out=peak)
+        for contact in contacts.update(calm.value, calm.touched, sample.time_ns):
+            at_x, at_y, _ = contact.cop_m.tolist()
+            ways.setdefault(contact.id, []).append((at_x, at_y, contact.load))
+    above = surface.normal[:, 2] > 0.4
+    colours = [_shade(value / peak.max()) for value in peak]
+    parts, height = _taxels(surface.position_m, above, colours)
+    loads = {number: max(load for _, _, load in way) for number, way in ways.items()}
+    for number, way in ways.items():
+        load = loads[number]
+        if load < max(loads.values()) / 10:
+            continue  # a taxel that was let go a moment later than its neighbours
+        at = _on_page(np.array([[at_x, at_y] for at_x, at_y, now in way if now > load / 10]))
+        parts.append(_line(at[:, 0], at[:, 1], _RED, width=2))
+        last_x, last_y = at[-1].tolist()
+        parts.append(f'<circle cx="{last_x:.1f}" cy="{last_y:.1f}" r="5" fill="{_RED}"/>')
+        parts.append(_text(last_x + 10, last_y - 8, f"{number}: {load:.0f} counts", colour=_RED, bold=True))
+    return _svg("Contacts of two fingers on an arm, seen from above", height, parts)
+
+
+def regions_picture() -> str:
+    """The arm with two regions, seen from above."""
+    surface = arm()
+    n = len(surface)
+    structure = Structure(
+        types=[PRESSURE.measured(unit="counts")],
+        buses=["can0"],
+        patch_name=["board 7", "board 8", "board 9", "board 10"],
+        patch_bus=[0] * 4,
+        module_patch=np.arange(surface.n_modules) // 16,
+        module_kind=["triangle"] * surface.n_modules,
+        sensor_uid=np.arange(n),
+        sensor_type=[PRESSURE.id] * n,
+        sensor_module=surface.module,
+        dtype="u1",
+    ).placed(surface.geometry("arm"))
+    box = Box(frame="arm", centre_m=(0.115, 0.0, 0.0), size_m=(0.05, 0.1, 0.1))
+    regions = Regions([Region("wrist", box=(box,)), Region("hand", patch=("board 10",))])
+    colour_of = {"wrist": _AMBER, "hand": _BLUE}
+    colours = np.full(n, _PALE, object)
+    for name, index in regions.of(structure, "pressure").items():
+        colours[index] = colour_of[name]
+    parts, height = _taxels(surface.position_m, surface.normal[:, 2] > 0.4, colours.tolist())
+    words = {"wrist": 'box = [{ frame = "arm", ... }]', "hand": 'patch = ["board 10"]'}
+    for place, (name, colour) in enumerate(colour_of.items()):
+        parts.append(_text(40 + 330 * place, 24, f"{name}: {words[name]}", colour=colour, bold=True))
+    return _svg("Two regions of an arm, seen from above", height, parts)
+
+
+def _on_page(xy_m: ArrayF) -> ArrayF:
+    """(m, 2) where places of the arm are on the page, px."""
+    scale, middle = 3300.0, 135.0
+    return np.column_stack([40 + scale * xy_m[:, 0], middle - scale * xy_m[:, 1]])
+
+
+def _taxels(position_m: ArrayF, seen: npt.NDArray[np.bool_], colours: Sequence[str]) -> tuple[list[str], int]:
+    """Circles for the taxels that are seen, and the height of the page."""
+    at = _on_page(position_m[:, :2])
+    circles = [
+        f'<circle cx="{at[taxel, 0]:.1f}" cy="{at[taxel, 1]:.1f}" r="7" fill="{colours[taxel]}" stroke="{_GREY}"/>'
+        for taxel in np.flatnonzero(seen).tolist()
+    ]
+    return circles, 260
+
+
+def _shade(part: float) -> str:
+    """From pale to green."""
+    pale, green = (np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in (_PALE, "#22c55e"))
+    red, green_, blue = (pale + (green - pale) * min(max(part, 0.0), 1.0)).round().astype(int).tolist()
+    return f"#{red:02x}{green_:02x}{blue:02x}"
+
+
+def _runs(flags: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Begin and end of every stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]
+
+
+def _line(x: Sequence[float] | ArrayF, y: Sequence[float] | ArrayF, colour: str, width: float = 1) -> str:
+    points = " ".join(f"{at_x:.1f},{at_y:.1f}" for at_x, at_y in zip(np.asarray(x), np.asarray(y), strict=True))
+    return f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="{width}"/>'
+
+
+def _text(x: float, y: float, words: str, *, colour: str = _INK, bold: bool = False, anchor: str = "start") -> str:
+    weight = ' font-weight="bold"' if bold else ""
+    escaped = words.replace("&", "&amp;").replace("<", "&lt;")
+    return f'<text x="{x:.1f}" y="{y:.1f}" fill="{colour}" text-anchor="{anchor}"{weight}>{escaped}</text>'
+
+
+def _svg(title: str, height: float, parts: Sequence[str]) -> str:
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height:g}" font-family="sans-serif"'
+        f' font-size="14" role="img">\n<title>{title}</title>\n'
+        f'<rect width="{_WIDTH}" height="{height:g}" rx="8" fill="#ffffff"/>\n'
+    )
+    return head + "\n".join(parts) + "\n</svg>\n"
+
+
+PICTURES = {"baseline": baseline_picture, "contacts": contacts_picture, "regions": regions_picture}
+
+if __name__ == "__main__":
+    for name, picture in PICTURES.items():
+        (Path(sys.argv[1]) / f"{name}.svg").write_text(picture(), encoding="utf-8")

@@ -2,7 +2,8 @@
 
 An input is a script: which skin it is, and then frames, good ones and arbitrary bytes, with any stamp, ends of batches,
 time that passes, and what happens beside the wire. Nothing of it may raise anything, and both paths do the same.
-Some inputs go through C alone: there, lengths are any that the row of a batch can hold.
+Some inputs go through C alone: there, lengths are any that the row of a batch can hold. Others begin in the kernel, at
+sockets and lines that C reads (flow_fuzzing.py).
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from skinware_drivers.layout import (
 from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.testing.both_paths import Pair, Publishing, Way
 from skinware_drivers.testing.clock import HandClock
+from tests.native import flow_fuzzing
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths
 from tests.native.traffic import identifier_of
 from tests.serial.framings import EXAMPLES, Example
@@ -165,13 +167,16 @@ def _framings() -> dict[str, Example]:
 
 
 def run(clock: HandClock, data: bytes) -> int:
-    """Run one input, on a skin or (one of four) on a serial line; how many frames it published.
+    """Run one input, on a skin, on a serial line or through the kernel; how many frames it published.
 
     Raises:
-        AssertionError: the paths differ.
+        AssertionError: the paths differ, or something was not counted.
     """
     script = Script(data)
-    if script.number(4) == 0:
+    where = script.number(4)
+    if where == 1:
+        return flow_fuzzing.run(clock, script)
+    if where == 0:
         framings = _framings()
         run_on_line(framings[sorted(framings)[script.number(len(framings))]], data[2:])
         return 0

@@ -31,6 +31,7 @@ from skinware.structure import Structure
 from skinware.tactile.baseline_settings import BaselineSettings
 from skinware.tactile.drift import Drift
 from skinware.tactile.resting import RestingMeasurement
+from skinware.tactile.sag import Sag
 from skinware.tactile.touches import Touches
 
 UNUSABLE = Status.NEVER_SEEN | Status.STALE | Status.MASKED | Status.NOT_CONNECTED
@@ -118,6 +119,7 @@ class Baseline:
         self.refused_share: float = 0.0
         self._touches = Touches(np.asarray(module, np.intp), neighbours)
         self._drift = Drift(self._patch)
+        self._sag = Sag(np.asarray(module, np.intp), self._patch)
         self._measurement: RestingMeasurement | None = None
         self._all_held = False
         self._time_ns: int | None = None
@@ -260,6 +262,7 @@ class Baseline:
             common_tau_s=self._settings.common_tau_s,
             limit=self._on,
         )
+        self._sag.sink(-self._drift.alone)
         above = now - self._base
         touched = self._touches.touched & ~self._ending(above)
         value = np.where(touched, above if self._signed else np.maximum(above, 0), np.float32(0))
@@ -358,6 +361,10 @@ class Baseline:
     def _follow_touches(self, deviation: Floats, live: Flags, passed_s: float) -> Flags:
         """(n,) which taxels are held."""
         load = np.abs(deviation) if self._signed else deviation
+        if not self._signed:
+            up = self._sag.come_back(deviation, self._touches.touched & live, self._off, passed_s)
+            self._base += up
+            deviation -= up
         self._touches.judge(load, live, self._on, self._off)
         if not self._all_held:
             over = self._touches.over(load, live, self._on, passed_s, self._settings)
@@ -378,7 +385,10 @@ class Baseline:
             return
         below = free & (deviation < -self._on)
         self._below_s = np.where(below, self._below_s + np.float32(passed_s), np.float32(0))
-        self._put(np.flatnonzero(self._below_s >= max(self._settings.recover_s, 1e-9)), deviation)
+        recovers = self._below_s >= max(self._settings.recover_s, 1e-9)
+        if recovers.any():
+            self._sag.sink(np.where(recovers, -deviation, np.float32(0)))
+            self._put(np.flatnonzero(recovers), deviation)
 
     def _put(self, taxels: npt.NDArray[np.intp], deviation: Floats) -> None:
         """Put baselines where the values are."""

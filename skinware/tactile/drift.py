@@ -37,6 +37,7 @@ class Drift:
         product: (n,) float32, sum of own times common drift of the stretches before.
         square: (n,) float32, sum of the squares of common drift.
         lag: (n,) float32, what each has yet to follow beside the common drift, over some seconds.
+        alone: (n,) float32, how far each baseline moved beside the common drift in the last step.
     """
 
     def __init__(self, patch: npt.NDArray[np.intp]) -> None:
@@ -48,6 +49,7 @@ class Drift:
         self.product: Floats = np.zeros(len(patch), np.float32)
         self.square: Floats = np.zeros(len(patch), np.float32)
         self.lag: Floats = np.zeros(len(patch), np.float32)
+        self.alone: Floats = np.zeros(len(patch), np.float32)
         self._typical: Floats = np.ones(len(patch), np.float32)
         self._unlevelled_s = 0.0
 
@@ -79,7 +81,8 @@ class Drift:
         followed = self.factor * common
         change = followed * common_share
         rest = deviation - followed
-        change += rest * (own_share * free)
+        self.alone = rest * (own_share * (free & usable))
+        change += self.alone
         change *= usable
         self.lag += (rest - self.lag) * (common_share * free)
         self.own += change * free

@@ -1,0 +1,55 @@
+"""A cover that sinks round a contact, over the borders of modules, is no touch when it comes back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skinware.tactile import Baseline
+from skinware.tactile.testing import Response, World, triangles
+
+LOAD = 60
+
+
+def sagging(seed: int) -> World:
+    """Twelve triangles side by side, 9 counts of sag 12 mm round a firm press."""
+    return World(triangles(12), seed=seed, rate_hz=20, drift_per_min=0.5, response=Response(sag=0.15))
+
+
+@pytest.mark.parametrize("seconds", [4, 30])
+@pytest.mark.parametrize("seed", range(4))
+def test_modules_round_a_contact_are_at_rest_when_it_is_over(seed: int, seconds: float) -> None:
+    world = sagging(seed)
+    surface = world.surface
+    taxel = int(np.random.default_rng(seed).integers(len(surface)))
+    world.push(surface.position_m[taxel], LOAD, 10, 10 + seconds, rise_s=0.1, radius_m=0.004)
+    baseline = Baseline(surface.module, surface.patch)
+    for sample in world.frames(30 + seconds):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        time_s = (sample.time_ns - 1_000_000_000) / 1e9
+        if 10.3 < time_s < 10 + seconds - 0.2:
+            assert calm.touched[taxel]
+        if time_s > 11 + seconds:
+            assert not calm.touched.any(), f"{time_s:.2f} s: {np.flatnonzero(calm.touched)}"
+
+
+def test_a_touch_where_the_cover_has_sunk_is_seen_and_outlives_the_contact_that_made_it_sink() -> None:
+    world = sagging(1)
+    surface = world.surface
+    firm = 45
+    away_m = np.linalg.norm(surface.position_m - surface.position_m[firm], axis=1)
+    sunk = int(np.abs(away_m - 0.022).argmin())
+    assert surface.module[sunk] != surface.module[firm]
+    world.push(surface.position_m[firm], LOAD, 10, 30, rise_s=0.1, radius_m=0.004)
+    world.push(surface.position_m[sunk], 30, 20, 40, rise_s=0.1)
+    baseline = Baseline(surface.module, surface.patch)
+    seen, over = [], []
+    for sample in world.frames(60):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        time_s = (sample.time_ns - 1_000_000_000) / 1e9
+        if 20.3 < time_s < 39.8:
+            seen.append(bool(calm.touched[sunk]))
+        if time_s > 42:
+            over.append(bool(calm.touched.any()))
+    assert all(seen)
+    assert not any(over)

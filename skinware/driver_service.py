@@ -215,22 +215,31 @@ class DriverReader(ServiceReader[DriverFrame]):
     def _describe(self, attached: segments.Segment) -> Structure:
         if bytes(attached.header["kind"]) != KIND.encode():
             raise BadServiceFile(f"service {self.name!r} is not a driver: it has no sensors")
-        columns = {column.name: column for column in attached.layout.slot}
-        tables = attached.static_columns()
-        try:
-            structure = Structure.from_columns(tables, columns["values"].dtype)
-            _names(tables, "driver_type")
-            counters = [len(_names(tables, f"{what}_counter_name")) for what in ("bus", "patch")]
-            for name, (dtype, count) in _frame_columns(structure, *counters).items():
-                if name not in columns and name not in _REQUIRED:
-                    continue
-                column = columns[name]
-                if column.count != count or column.dtype != dtype:
-                    found = f"{column.count} {name} of {column.dtype}"
-                    raise StructureError(f"{found} where the structure has {count} of {np.dtype(dtype)}")
-        except (ValueError, TypeError, LookupError, OverflowError) as error:  # StructureError is a ValueError
-            raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
-        return structure
+        return structure_of(attached)
+
+
+def structure_of(segment: segments.Segment) -> Structure:
+    """The structure of a generation of a driver.
+
+    Raises:
+        BadServiceFile: its tables contradict each other or its columns.
+    """
+    columns = {column.name: column for column in segment.layout.slot}
+    tables = segment.static_columns()
+    try:
+        structure = Structure.from_columns(tables, columns["values"].dtype)
+        _names(tables, "driver_type")
+        counters = [len(_names(tables, f"{what}_counter_name")) for what in ("bus", "patch")]
+        for name, (dtype, count) in _frame_columns(structure, *counters).items():
+            if name not in columns and name not in _REQUIRED:
+                continue
+            column = columns[name]
+            if column.count != count or column.dtype != dtype:
+                found = f"{column.count} {name} of {column.dtype}"
+                raise StructureError(f"{found} where the structure has {count} of {np.dtype(dtype)}")
+    except (ValueError, TypeError, LookupError, OverflowError) as error:  # StructureError is a ValueError
+        raise BadServiceFile(f"{segment.path}: {error}; not attached") from None
+    return structure
 
 
 def _frame_columns(

@@ -89,6 +89,14 @@ class PeerGone(RequestError):
     """The service's writer is dead, or died or was restarted while the request was under way."""
 
 
+class BadRecording(SkinwareError):
+    """A file is not a recording that this version can read, or so damaged that nothing of it can be used."""
+
+
+class MissingExtra(SkinwareError, ImportError):
+    """Packages that only some need are not installed; the message says how to install them."""
+
+
 class DriverError(SkinwareError):
     """A driver's own code failed; the message names bus, hook and cause.
 

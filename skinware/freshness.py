@@ -28,23 +28,23 @@ def is_fresh(
     status: npt.NDArray[np.uint8],
     time_ns: npt.NDArray[np.int64],
     *,
-    at_ns: int,
+    at_ns: int | npt.NDArray[np.int64],
     max_age_ns: int,
     alive: bool = True,
 ) -> npt.NDArray[np.bool_]:
     """Which of n sensors are fresh.
 
     Args:
-        status: (n,) bits of :class:`skinware.Status`.
-        time_ns: (n,) time of each sensor's data (that of its module), 0: never seen.
+        status: (..., n) bits of :class:`skinware.Status`.
+        time_ns: (..., n) time of each sensor's data (that of its module), 0: never seen.
         at_ns: the moment at which they are looked at, on the clock of ``time_ns``.
         max_age_ns: the age beyond which nothing is fresh; see ``age_limit_ns``.
         alive: the driver lived when the frame was taken.
 
     Returns:
-        (n,) bool.
+        (..., n) bool.
     """
     if not alive:
-        return np.zeros(len(status), bool)
+        return np.zeros(status.shape, bool)
     fresh: npt.NDArray[np.bool_] = (status == 0) & (time_ns > 0) & (time_ns >= at_ns - max_age_ns)
     return fresh

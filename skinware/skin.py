@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Collection, Iterator
 from typing import Any, Self
 
@@ -27,7 +26,6 @@ __all__ = ["DriverCallback", "Skin", "SkinLayout", "Snapshot"]
 log = logging.getLogger("skinware.skin")
 
 _DISCOVERY_NS = NS_PER_S // 5
-_POLL_NS = 1_000_000
 _REFUSED_FOR_NS, _NEVER_NS = 10 * NS_PER_S, 1 << 62
 
 DriverCallback = Callable[[str, Structure], object]
@@ -157,7 +155,7 @@ class Skin:
             if time_ns >= deadline_ns:
                 raise ServiceTimeout(self._why_nothing_came(too_old))
             if not slept:
-                _sleep_on(words, min(time_ns + WAIT_SLICE_NS, deadline_ns))
+                futex.sleep_on(words, min(time_ns + WAIT_SLICE_NS, deadline_ns))
 
     def _look_in_c(self, known: Snapshot | None, deadline_ns: int) -> tuple[bool, Snapshot | None]:
         """Whether C had a look for anything newer and waited for it, and a snapshot if it found it."""
@@ -396,18 +394,6 @@ def _call(callback: DriverCallback | None, name: str, structure: Structure) -> N
         callback(name, structure)
     except Exception:
         log.exception("what was to be called about driver %r failed; the skin goes on", name)
-
-
-def _sleep_on(words: list[tuple[futex.Word, int]], until_ns: int) -> None:
-    """Sleep until any of the futex words changes or the time comes; may return early."""
-    remaining_ns = max(0, until_ns - now_ns())
-    if len(words) == 1:
-        word, expected = words[0]
-        word.wait(expected, remaining_ns)
-    elif not words:
-        time.sleep(remaining_ns / NS_PER_S)
-    elif not futex.wait_any(words[: futex.MAX_WORDS], until_ns):
-        time.sleep(min(remaining_ns, _POLL_NS) / NS_PER_S)
 
 
 def __getattr__(name: str) -> Any:

@@ -252,15 +252,15 @@ class Structure:
         """Physical values of all sensors of a type.
 
         Args:
-            values: (n_sensors,) raw values of a whole frame.
+            values: (..., n_sensors) raw values of a whole frame, or of many.
             type_name: which sensors to take.
 
         Returns:
-            (n,) float32 in the type's unit, in the order of ``index(type_name)``; float64 if the raw values are
+            (..., n) float32 in the type's unit, in the order of ``index(type_name)``; float64 if the raw values are
             int32, which have more digits than float32 holds.
         """
         sensor_type = self.type(type_name)
-        raw = values[self.index(type_name)]
+        raw = values[..., self.index(type_name)]
         if self.dtype == np.int32:
             exact: npt.NDArray[np.float64] = raw.astype(np.float64)
             return exact * sensor_type.scale + sensor_type.offset

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import inspect
 import os
 import re
 import resource
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import chdir
@@ -16,10 +18,12 @@ from tempfile import TemporaryDirectory
 import pytest
 from serial.tools import list_ports
 
+import skinware.recording
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter, errors
 from skinware.errors import SkinwareError
 from skinware.memory import _fences
 from skinware.realtime import Profile
+from skinware.recording import open as open_recording
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.link import Link, Match
@@ -79,6 +83,20 @@ def NamespaceError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
     namespace.create()
     namespace.path.chmod(0o777)
     return DriverReader("roboskin")
+
+
+@produces
+def BadRecording(_: pytest.MonkeyPatch) -> object:  # noqa: N802
+    with TemporaryDirectory() as folder, chdir(folder):
+        path = Path("walk.mcap")
+        path.write_text("time,pressure")
+        return open_recording(path)
+
+
+@produces
+def MissingExtra(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
+    monkeypatch.setitem(sys.modules, "mcap", None)
+    return importlib.reload(skinware.recording)
 
 
 @produces

@@ -6,6 +6,7 @@ import ctypes
 import os
 import platform
 import struct
+import time
 from collections.abc import Sequence
 from errno import EAGAIN, EINTR, ENOSYS, ETIMEDOUT
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import PlatformError
-from skinware.realtime import NS_PER_S
+from skinware.realtime import NS_PER_S, now_ns
 
 _SYS_FUTEX = {"x86_64": 202, "aarch64": 98, "riscv64": 98}
 _SYS_FUTEX_WAITV = 449  # the same number on every architecture, Linux 5.16
@@ -24,6 +25,8 @@ _EVERYBODY = 2**31 - 1
 _CLOCK_MONOTONIC = 1
 MAX_WORDS = 128
 """The most words one ``wait_any`` can take (FUTEX_WAITV_MAX)."""
+_POLL_NS = 1_000_000
+"""Where the kernel cannot wait for several words."""
 
 _syscall = ctypes.CDLL(None, use_errno=True).syscall
 _sleep = ctypes.CDLL(None).syscall  # without the GIL, and without the errno, which costs as much as the call
@@ -128,3 +131,20 @@ def wait_any(words: Sequence[tuple[Word, int]], deadline_ns: int) -> bool:
         if number not in (EAGAIN, EINTR, ETIMEDOUT):
             raise OSError(number, os.strerror(number))
     return True
+
+
+def sleep_on(words: Sequence[tuple[Word, int]], until_ns: int) -> None:
+    """Sleep until any of some words changes or the time comes; may return early.
+
+    Args:
+        words: with what is expected in each; none, and any number.
+        until_ns: CLOCK_MONOTONIC ns.
+    """
+    remaining_ns = max(0, until_ns - now_ns())
+    if len(words) == 1:
+        word, expected = words[0]
+        word.wait(expected, remaining_ns)
+    elif not words:
+        time.sleep(remaining_ns / NS_PER_S)
+    elif not wait_any(words[:MAX_WORDS], until_ns):
+        time.sleep(min(remaining_ns, _POLL_NS) / NS_PER_S)

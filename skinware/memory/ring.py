@@ -7,7 +7,7 @@ sleeps: load the wake word; fence; look at latest and state. docs/reference/shar
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,24 @@ SEQUENCE, ACQUIRED, PUBLISHED, FLAGS = range(4)  # 8-byte words of a slot's head
 _HEADER_WORDS = file_layout.SLOT.itemsize // 8
 
 
+class FrameSource(Protocol):
+    """What a frame is of: a generation that is read live, or one that was recorded."""
+
+    context: object
+
+    @property
+    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
+        """(shape, dtype, offset in the slot) of every column, by name."""
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+
+    @property
+    def period_ns(self) -> int:
+        """The writer's nominal period, 0 if it has none."""
+
+
 class Frame:
     """One published frame: a private copy, or (from ``view``) the ring's own memory.
 
@@ -44,7 +62,7 @@ class Frame:
 
     def __init__(
         self,
-        ring: RingReader[Any],
+        source: FrameSource,
         data: bytearray | memoryview,
         in_ring: memoryview | None = None,
         start: int = 0,
@@ -53,10 +71,10 @@ class Frame:
         self._start = start
         self._in_ring = in_ring
         self._header = memoryview(data)[start:].cast("Q") if in_ring is None else in_ring.tolist()
-        self._columns = ring.columns
-        self.context: object = ring.context
-        self.generation: int = ring.generation
-        self.period_ns: int = ring.period_ns
+        self._columns = source.columns
+        self.context: object = source.context
+        self.generation: int = source.generation
+        self.period_ns: int = source.period_ns
         self.stale: bool = False
 
     @property
@@ -96,6 +114,11 @@ class Frame:
             return True
         fence()
         return bool(self._in_ring[SEQUENCE] == self.sequence)
+
+    @property
+    def slot(self) -> memoryview:
+        """Its bytes as they stand in the ring: the slot's header and its columns."""
+        return memoryview(self._data)[self._start :]
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """One column of the frame, a view of its memory.

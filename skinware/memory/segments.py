@@ -27,6 +27,7 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
+_HEAD_LEAST = file_layout.COLUMN_OFFSET
 _COUNT = struct.Struct("<Q")
 _HEAD_BYTES = file_layout.COLUMN_OFFSET + file_layout.COLUMN.itemsize * file_layout.MAX_COLUMNS
 
@@ -67,6 +68,11 @@ class Segment:
     def published(self) -> int:
         """Frames that this generation and those before it published."""
         return self.published_before + int(self.view(file_layout.LATEST_OFFSET, np.dtype("<u8"), 1)[0])
+
+    @property
+    def head(self) -> bytes:
+        """The file up to its slots: header, control words, statistics, column table and static columns."""
+        return self.data[: self.layout.slot_offset].tobytes()
 
     def slot_formats(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
         """(shape, dtype, offset in the slot) of every column of a slot, by name."""
@@ -283,6 +289,26 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     except BaseException:
         descriptor.close()
         raise
+    return segment
+
+
+def recorded(head: bytes, name: str) -> Segment:
+    """A generation of which only the head is there (:attr:`Segment.head`): all but its slots and its writer.
+
+    Args:
+        head: its bytes.
+        name: for messages.
+
+    Raises:
+        BadServiceFile: they are not a head that can be read safely.
+    """
+    size = int(np.frombuffer(head, file_layout.HEADER, 1)["file_size"][0]) if len(head) >= _HEAD_LEAST else len(head)
+    header, layout = file_layout.parse(head, name, size)
+    if layout.slot_offset != len(head):
+        raise BadServiceFile(f"{name}: a head of {len(head)} bytes, not of {layout.slot_offset}")
+    data = np.frombuffer(head, np.uint8)
+    segment = Segment(name, header, layout, data, Descriptor(-1), (0, 0), Schema())
+    segment.schema = from_file(layout, segment.static_columns(), name)
     return segment
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from skinware.errors import Overrun
+from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.futex import Word
 from skinware.memory.ring import FrameT, RingReader
 from skinware.realtime import now_ns
 from skinware.service._attachment import GENERATION_ENDED
-from skinware.service._reader import ServiceReader
+from skinware.service._reader import Position, ServiceReader
 
 
 def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
@@ -27,6 +27,11 @@ class Tap(ServiceReader[FrameT]):
         return bool(self._ring.state & GENERATION_ENDED)
 
     @property
+    def head(self) -> bytes:
+        """Of the file that is being read: all up to its slots."""
+        return self._ring.segment.head
+
+    @property
     def inode(self) -> tuple[int, int]:
         """Device and number of the file that is being read."""
         return self._ring.segment.inode
@@ -35,6 +40,11 @@ class Tap(ServiceReader[FrameT]):
     def period_ns(self) -> int:
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
+
+    @property
+    def slack_ns(self) -> int:
+        """How long it takes the writer to go round its ring at its nominal rate, 0 if it has none."""
+        return self._ring.period_ns * self._ring.slot_count
 
     def ring_in_c(self) -> RingReader[FrameT]:
         """The ring, whose next turns are left to C, where there is C."""
@@ -47,6 +57,32 @@ class Tap(ServiceReader[FrameT]):
         if now_ns() >= self._accounts.due_ns:
             self._settle()
             self._accounts.end_turn(None)
+
+    @property
+    def last_taken(self) -> Position | None:
+        """Position of the frame that was taken last."""
+        return self._last
+
+    def begin_in_order(self, *, with_first: bool) -> None:
+        """Read in order from now on.
+
+        Args:
+            with_first: begin with the first frame of the generation at hand, otherwise with the one that is its newest
+                now. What is overwritten before it is taken is lost.
+        """
+        self._accounts.begin_loop("in order")
+        self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
+
+    def next_in_order(self) -> FrameT | None:
+        """The frame after the one that was taken last, over generations; None if it is not there yet. Never waits.
+
+        Raises:
+            StructureChanged, Overrun, Closed: as ``in_order``.
+        """
+        try:
+            return self._read_in_order(0)
+        except ServiceTimeout:
+            return None
 
     def newest(self) -> FrameT:
         """A copy of the newest frame of the generation at hand.

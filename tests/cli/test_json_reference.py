@@ -16,6 +16,7 @@ from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWrite
 from skinware.cli._command import exit_status
 from skinware.cli.info import command as info
 from skinware.cli.press import command as press
+from skinware.cli.recover import command as recover
 from skinware.cli.regions import command as regions
 from skinware.cli.top import command as top
 from skinware.realtime import now_ns
@@ -243,6 +244,16 @@ def test_regions(printing: Print, tmp_path: Path) -> None:
         paint.press_enter()
         check("`skin-regions paint`", ready, going_on, paint.wait_for("done"))
         check("`skin-regions list`", *printing(regions, "list", str(file)))
+
+
+def test_a_recording(printing: Print, tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    with publishing(FakeSkin("torso")):
+        with running("skin-record", "torso", "-o", str(file)) as record:
+            ready = record.wait_for("ready")
+            status = record.wait_for("status", lambda status: bool(status["messages"]))
+            check("`skin-record`", ready, status, record.stop())
+    check("`skin-recover`", *printing(recover, str(file)))
 
 
 class _Stop:

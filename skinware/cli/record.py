@@ -1,0 +1,212 @@
+"""``skin-record``: record everything that is published."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import re
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+)
+
+if TYPE_CHECKING:
+    from skinware.recording.files import Target
+    from skinware.recording.recorder import Recorder
+
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kMG]?i?)B?")
+_TIME = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min)?")
+
+
+def size(text: str) -> int:
+    """A number of bytes: ``500MB``, ``2GiB``; for ``click.option(type=...)``.
+
+    Raises:
+        click.BadParameter: it is not one.
+    """
+    found = _SIZE.fullmatch(text)
+    if not found or found[2] not in _UNITS or not float(found[1]):
+        raise click.BadParameter(f"{text!r} is not a size: give bytes, or a number with kB, MB, GB, MiB or GiB.")
+    return round(float(found[1]) * _UNITS[found[2]])
+
+
+def past(text: str) -> float:
+    """A time: ``60``, ``60s``, ``5min``; likewise.
+
+    Raises:
+        click.BadParameter: it is not one.
+    """
+    found = _TIME.fullmatch(text)
+    if not found or not float(found[1]):
+        raise click.BadParameter(f"{text!r} is not a time: give seconds, or minutes as in 5min.")
+    return float(found[1]) * (60 if found[2] == "min" else 1)
+
+
+@click.command(
+    "skin-record",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-record                          all that runs or comes, until Ctrl-C",
+        "skin-record torso -o walk.mcap -T 60  one driver, one minute",
+        "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
+        "skin-record --last 60s               kill -USR1 saves the last minute",
+    ),
+)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="The new file.  [default: skin-DATE-TIME.mcap]",
+)
+@click.option("-T", "duration_s", metavar="SECONDS", type=seconds, help="End after SECONDS.")
+@click.option(
+    "--split", "split_size", metavar="SIZE", type=size, help="Begin another file after SIZE (1GB): FILE-001 ..."
+)
+@click.option(
+    "--max-size", metavar="SIZE", type=size, help="End at SIZE; with --split, remove the oldest files beyond it."
+)
+@click.option(
+    "--last",
+    "last_s",
+    metavar="TIME",
+    type=past,
+    help="Keep only the last TIME (60s, 5min), in memory; saved on SIGUSR1 and at the end.",
+)
+@namespace_option
+@json_option
+@version_option
+def command(
+    names: tuple[str, ...],
+    output: Path | None,
+    duration_s: float | None,
+    split_size: int | None,
+    max_size: int | None,
+    last_s: float | None,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Record drivers and services NAME..., or all there are and come, with all counters and states.
+
+    Frames that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
+    the last 0.3 s is in the file; skin-recover then makes it whole.
+
+    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
+    """
+    from skinware.memory.namespace import Namespace, check_name
+    from skinware.recording.recorder import Recorder
+
+    if last_s is not None and (split_size or max_size):
+        raise click.UsageError("--last keeps the past in memory: --split and --max-size are for files")
+    for name in names:
+        check_name(name, "service")
+    place = Namespace(namespace)
+    path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
+    target = _target(path, split_size, max_size, last_s)
+    recorder = Recorder(target, names=names or None, namespace=place)
+    report = _Report(recorder, target, path, as_json)
+    report.ready(names, place.name)
+    failed = True
+    with _signals(recorder):
+        try:
+            recorder.run(duration_s, report.status)
+            failed = False
+        finally:
+            report.stopped(failed)
+
+
+def _target(path: Path, split_size: int | None, max_size: int | None, last_s: float | None) -> Target:
+    from skinware.recording.files import Files, Past
+
+    if path.exists():
+        raise FileExistsError(errno.EEXIST, "exists already: give another name, or remove it", str(path))
+    if last_s is not None:
+        return Past(path, last_s)
+    return Files(path, split_size=split_size, max_size=max_size)
+
+
+class _Report:
+    """What is told of a recording while it runs, and at its end."""
+
+    def __init__(self, recorder: Recorder, target: Target, path: Path, as_json: bool) -> None:
+        self._recorder, self._target, self._path, self._as_json = recorder, target, path, as_json
+        self._begin_s = time.monotonic()
+        self._before: dict[str, int] = {}
+
+    def ready(self, names: tuple[str, ...], namespace: str) -> None:
+        """Recording begins."""
+        if self._as_json:
+            print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})
+        else:
+            what = ", ".join(names) or "all drivers and services"
+            click.echo(f"recording {what} of namespace {namespace!r} into {self._path} (Ctrl-C ends)")
+
+    def status(self) -> None:
+        """How it goes, once a second."""
+        messages = self._recorder.messages
+        if self._as_json:
+            with contextlib.suppress(BrokenPipeError):
+                print_json({"event": "status", **self._figures(messages)})
+            return
+        rates = [
+            f"{name.split('/')[2]} {count - self._before.get(name, 0)}/s"
+            for name, count in messages.items()
+            if name.endswith("/frame")
+        ]
+        self._before = messages
+        lost = f", lost {self._recorder.lost}" if self._recorder.lost else ""
+        passed = time.strftime("%H:%M:%S", time.gmtime(time.monotonic() - self._begin_s))
+        click.echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{lost}")
+
+    def stopped(self, failed: bool) -> None:
+        """It has ended; the files are complete."""
+        messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
+        if self._as_json:
+            with contextlib.suppress(BrokenPipeError):
+                print_json({"event": "stopped", "file": (files or [""])[-1], "files": files, **self._figures(messages)})
+            return
+        for name, count in messages.items():
+            click.echo(f"{name}: {count} messages")
+        lost = f"{self._recorder.lost} frames lost" if self._recorder.lost else "nothing lost"
+        ended = "ended early" if failed else "complete"
+        click.echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB, {lost}")
+
+    def _figures(self, messages: dict[str, int]) -> dict[str, Any]:
+        return {"messages": messages, "lost": self._recorder.lost, "bytes": self._target.size}
+
+
+@contextlib.contextmanager
+def _signals(recorder: Recorder) -> Iterator[None]:
+    """SIGINT and SIGTERM end it in good order; SIGUSR1 saves what is only in memory."""
+    handlers = {
+        signal.SIGINT: lambda *_: recorder.stop(),
+        signal.SIGTERM: lambda *_: recorder.stop(),
+        signal.SIGUSR1: lambda *_: recorder.save(),
+    }
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

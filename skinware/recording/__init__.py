@@ -1,0 +1,42 @@
+"""Recordings of skins: everything that was published, in one MCAP file, and how to read it.
+
+::
+
+    import skinware.recording
+
+    with skinware.recording.open("walk.mcap") as recording:
+        torso = recording["torso"].read()
+        pressure = torso.physical("pressure")  # (frames, sensors) float32, at torso.time_s
+        for snapshot in recording.snapshots():  # as skinware.Skin gives them
+            ...
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from skinware.errors import MissingExtra
+
+if find_spec("mcap") is None or find_spec("zstandard") is None:
+    raise MissingExtra("recordings need packages that are not installed: pip install 'skinware[record]'")
+
+from skinware.recording.frames import RecordedDriverFrame, RecordedFrame, RecordedSnapshot
+from skinware.recording.reading import Recording
+from skinware.recording.series import Series
+from skinware.recording.tracks import Track
+
+__all__ = ["RecordedDriverFrame", "RecordedFrame", "RecordedSnapshot", "Recording", "Series", "Track", "open"]
+
+
+def open(path: str | Path) -> Recording:  # noqa: A001, as of gzip and others
+    """Open a recording.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        BadRecording: it is not a recording, or one of a newer version.
+        OSError: it cannot be read.
+    """
+    return Recording(path)

@@ -1,0 +1,267 @@
+"""Frames as bytes: what changed since the frame before, as few bits of it as there are.
+
+A message of a frame, all little-endian::
+
+    HEADER                     48 bytes
+    codes    u1[n_columns]     how each column is coded; columns as in the service's column table
+    sizes    <u4[n_columns]    bytes of each
+    ...                        those bytes, column after column
+
+The words of a column are its numbers; a column that has no integers or floats of 1 to 8 bytes is taken as words of one
+byte. For each word there is a difference to the same word of the frame before (``HEADER.after``; of a key frame: to
+0): for integers modulo 2**bits and zigzag-coded (0, -1, 1, -2 ... become 0, 1, 2, 3 ...), for all others by exclusive
+or. The code says in its lower four bits what follows of the differences: 0: nothing, all are 0; 1 to 8: so many byte
+planes, the lowest first, of which plane k has byte k of every difference; 15: four differences of two bits a byte, the
+first the lowest. Its bit ``PACKED`` says that those bytes are packed by DEFLATE (raw, RFC 1951).
+
+Noise of a few counts is one plane, whose values have no order: symbols of different length are all that helps, and any
+search for repetitions costs time and bytes. So numbers of up to four bytes are packed by Huffman codes only (and runs).
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadRecording
+from skinware.memory.file_layout import SLOT, Column
+from skinware.memory.ring import Frame
+
+HEADER = np.dtype(
+    [
+        ("generation", "<u8"),
+        ("sequence", "<u8"),
+        ("acquired_ns", "<i8"),
+        ("published_ns", "<i8"),
+        ("flags", "<u8"),
+        ("after", "<u8"),
+    ]
+)
+"""``after``: sequence of the frame that this one is the difference to; 0: a key frame, which needs no other."""
+
+PACKED = 0x80
+_TWO_BITS = 15
+_PACKED_FROM = 1024
+"""Bytes of a column from which on it is packed by itself; smaller ones are left to the chunk."""
+_HEADER = struct.Struct("<6Q")
+
+Words = npt.NDArray[np.unsignedinteger[Any]]
+
+
+@dataclass(frozen=True)
+class CodedColumn:
+    """How a column of a slot is coded.
+
+    Attributes:
+        name: of the column.
+        offset: in the slot, bytes.
+        words: dtype of its words, unsigned.
+        count: of words.
+        is_integer: differences are those of integers, not exclusive ors.
+    """
+
+    name: str
+    offset: int
+    words: np.dtype[Any]
+    count: int
+    is_integer: bool
+
+    @staticmethod
+    def of(column: Column) -> CodedColumn:
+        """How a column of a service's column table is coded."""
+        dtype = column.dtype
+        if dtype.kind in "uif" and dtype.itemsize in (1, 2, 4, 8):
+            return CodedColumn(
+                column.name, column.offset, np.dtype(f"<u{dtype.itemsize}"), column.count, dtype.kind != "f"
+            )
+        return CodedColumn(column.name, column.offset, np.dtype("u1"), column.count * dtype.itemsize, False)
+
+    def words_of(self, slot: memoryview) -> Words:
+        """(count,) its words in a slot, in place."""
+        return np.frombuffer(slot, self.words, self.count, self.offset)
+
+
+class Encoder:
+    """Codes the frames of one generation, in order.
+
+    Args:
+        columns: of its slots.
+    """
+
+    def __init__(self, columns: Sequence[CodedColumn]) -> None:
+        self._columns = columns
+        self._before: Frame | None = None
+
+    def next_is_key(self) -> None:
+        """The next frame is a key frame."""
+        self._before = None
+
+    def encode(self, frame: Frame) -> bytes:
+        """The message of a frame, which is kept until the next one."""
+        before = None if self._before is None else self._before.slot
+        after = 0 if self._before is None else self._before.sequence
+        slot = frame.slot
+        header = _HEADER.pack(
+            frame.generation, frame.sequence, frame.acquired_ns, frame.published_ns, frame.flags, after
+        )
+        codes, parts, sizes = bytearray(), [], []
+        for column in self._columns:
+            words = column.words_of(slot)
+            change = _change(words, None if before is None else column.words_of(before), column.is_integer)
+            code, part = _coded(change, column)
+            codes.append(code)
+            parts.append(part)
+            sizes.append(len(part))
+        self._before = frame
+        return b"".join([header, codes, struct.pack(f"<{len(sizes)}I", *sizes), *parts])
+
+
+def _change(words: Words, before: Words | None, is_integer: bool) -> Words:
+    if not is_integer:
+        return words if before is None else words ^ before
+    change = words if before is None else words - before
+    bits = 8 * change.itemsize
+    signed = change.view(f"<i{change.itemsize}")
+    zigzag: Words = ((signed << 1) ^ (signed >> (bits - 1))).view(words.dtype)
+    return zigzag
+
+
+def _coded(change: Words, column: CodedColumn) -> tuple[int, bytes]:
+    """The code of a column, and its bytes."""
+    greatest = int(change.max(initial=0))
+    if not greatest:
+        return 0, b""
+    if greatest < 4:
+        code, data = _TWO_BITS, _in_two_bits(change)
+    else:
+        code = (greatest.bit_length() + 7) // 8
+        data = change.view(np.uint8).reshape(-1, change.itemsize)[:, :code].T.tobytes()
+    if len(data) < _PACKED_FROM:
+        return code, data
+    strategy = zlib.Z_DEFAULT_STRATEGY
+    if column.is_integer and column.words.itemsize <= 4:
+        strategy = zlib.Z_RLE if 1 < code < _TWO_BITS else zlib.Z_HUFFMAN_ONLY  # upper planes are zero for long
+    packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
+    return code | PACKED, packer.compress(data) + packer.flush()
+
+
+def _in_two_bits(change: Words) -> bytes:
+    fours = np.zeros(-(-len(change) // 4) * 4, np.uint8)
+    fours[: len(change)] = change
+    first, second, third, fourth = fours.reshape(-1, 4).T
+    return (first | second << 2 | third << 4 | fourth << 6).tobytes()
+
+
+class Run:
+    """Messages of frames of one generation, the first of a key frame and each of the others after the one before it.
+
+    Args:
+        messages: of n frames.
+        columns: of the generation's slots.
+
+    Attributes:
+        headers: (n,) of :data:`HEADER`.
+
+    Raises:
+        BadRecording: they are not such messages.
+    """
+
+    def __init__(self, messages: Sequence[bytes | memoryview], columns: Sequence[CodedColumn]) -> None:
+        self._messages, self._columns = messages, columns
+        fixed = np.dtype([("header", HEADER), ("codes", "u1", (len(columns),)), ("sizes", "<u4", (len(columns),))])
+        if any(len(message) < fixed.itemsize for message in messages):
+            raise BadRecording("a frame is shorter than its header")
+        starts = np.frombuffer(b"".join([message[: fixed.itemsize] for message in messages]), fixed)
+        self.headers: npt.NDArray[np.void] = starts["header"].copy()
+        self._codes = starts["codes"]
+        self._sizes = starts["sizes"].astype(np.int64)
+        self._ends = fixed.itemsize + np.cumsum(self._sizes, axis=1)
+        if not np.array_equal(self._ends[:, -1], [len(message) for message in messages]):
+            raise BadRecording("a frame is longer or shorter than its columns")
+
+    def decode(self, number: int, into: Words) -> None:
+        """Write the words of a column.
+
+        Args:
+            number: of the column.
+            into: (n, count) of its words' dtype; rows may lie apart.
+
+        Raises:
+            BadRecording: its bytes are not what they should be.
+        """
+        column = self._columns[number]
+        change = np.zeros((len(self._messages), column.count), column.words)
+        for row, message in enumerate(self._messages):
+            code, end = int(self._codes[row, number]), int(self._ends[row, number])
+            if code:
+                _decode(code, message[end - int(self._sizes[row, number]) : end], change[row])
+        if column.is_integer:
+            change = (change >> 1) ^ (0 - (change & 1))
+            np.cumsum(change, axis=0, dtype=column.words, out=into)
+        else:
+            np.bitwise_xor.accumulate(change, axis=0, out=into)
+
+    def decode_slots(self, stride: int) -> npt.NDArray[np.uint8]:
+        """(n, stride) the slots of the frames, as they were in the ring."""
+        slots = np.zeros((len(self._messages), stride), np.uint8)
+        heads = slots[:, : SLOT.itemsize].view(SLOT)[:, 0]
+        for name in ("sequence", "acquired_ns", "published_ns", "flags"):
+            heads[name] = self.headers[name]
+        for number, column in enumerate(self._columns):
+            end = column.offset + column.count * column.words.itemsize
+            self.decode(number, slots[:, column.offset : end].view(column.words))
+        return slots
+
+
+def _decode(code: int, data: bytes | memoryview, into: Words) -> None:
+    """The differences of one column of one frame, written into zeros.
+
+    Raises:
+        BadRecording: the bytes do not fit.
+    """
+    planes = code & 15
+    count = len(into)
+    size = -(-count // 4) if planes == _TWO_BITS else planes * count
+    if code & PACKED:
+        try:
+            data = zlib.decompressobj(-15).decompress(data, size + 1)
+        except zlib.error as error:
+            raise BadRecording(f"a column cannot be unpacked ({error})") from None
+    if len(data) != size or not (planes == _TWO_BITS or planes <= into.itemsize):
+        raise BadRecording("a column has not as many bytes as it should")
+    in_bytes = np.frombuffer(data, np.uint8)
+    if planes == _TWO_BITS:
+        fours = np.stack([in_bytes >> shift & 3 for shift in (0, 2, 4, 6)], axis=1)
+        into[:] = fours.ravel()[:count]
+    elif count:
+        into.view(np.uint8).reshape(count, -1)[:, :planes] = in_bytes.reshape(planes, count).T
+
+
+def runs(messages: Sequence[bytes | memoryview]) -> Iterator[tuple[int, slice]]:
+    """Divide the messages of one service, in the order in which they were recorded, into runs.
+
+    What comes before the first key frame, or after a frame that is missing, is left out: nothing tells its values.
+
+    Returns:
+        (generation, which messages) of each run.
+    """
+    begin, generation, sequence = None, 0, 0
+    for number, message in enumerate(messages):
+        header = _HEADER.unpack_from(message) if len(message) >= _HEADER.size else None
+        after = -1 if header is None else header[-1]
+        if begin is not None and header is not None and after == sequence and header[0] == generation:
+            sequence = header[1]
+            continue
+        if begin is not None:
+            yield generation, slice(begin, number)
+            begin = None
+        if header is not None and after == 0:
+            begin, generation, sequence = number, header[0], header[1]
+    if begin is not None:
+        yield generation, slice(begin, len(messages))

@@ -1,0 +1,96 @@
+"""One generation of a recorded service: all that is told once, as it stood in the service's file before its slots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware import driver_service
+from skinware.errors import BadRecording, BadServiceFile
+from skinware.memory import segments
+from skinware.memory.schema import Schema
+from skinware.recording.codec import CodedColumn
+
+
+class Generation:
+    """What the frames of a generation are made of; frames that were recorded carry it as their source.
+
+    Args:
+        head: the bytes of the service's file up to its slots.
+        name: of the service.
+
+    Attributes:
+        head: the same bytes.
+        name: of the service.
+        coded: how the columns of its slots are coded.
+        context: what its frames carry: the structure of a driver; None of other services.
+
+    Raises:
+        BadRecording: the head cannot be read.
+    """
+
+    def __init__(self, head: bytes, name: str) -> None:
+        self.head, self.name = head, name
+        try:
+            self._segment = segments.recorded(head, f"service {name!r}")
+            self.context: object = driver_service.structure_of(self._segment) if self.is_driver else None
+        except BadServiceFile as error:
+            raise BadRecording(str(error).removesuffix("; not attached")) from None
+        self.coded: tuple[CodedColumn, ...] = tuple(CodedColumn.of(column) for column in self._segment.layout.slot)
+        self._columns = self._segment.slot_formats()
+
+    @property
+    def generation(self) -> int:
+        """Its number."""
+        return self._segment.generation
+
+    @property
+    def kind(self) -> str:
+        """What the service's columns mean: ``driver``, ``data``."""
+        return bytes(self._segment.header["kind"]).decode()
+
+    @property
+    def is_driver(self) -> bool:
+        """Whether it is one of a driver."""
+        return self.kind == driver_service.KIND
+
+    @property
+    def period_ns(self) -> int:
+        """The writer's nominal period, 0 if it has none."""
+        return int(self._segment.header["period_ns"])
+
+    @property
+    def digest(self) -> bytes:
+        """Equal for generations whose columns and tables are equal."""
+        return bytes(self._segment.header["digest"])
+
+    @property
+    def published_before(self) -> int:
+        """Frames that the generations before it published."""
+        return self._segment.published_before
+
+    @property
+    def schema(self) -> Schema:
+        """dtype, shape, unit and description of every column of a frame."""
+        return self._segment.schema
+
+    @property
+    def slot_count(self) -> int:
+        """Slots of the ring."""
+        return self._segment.layout.slot_count
+
+    @property
+    def slot_stride(self) -> int:
+        """Bytes of a slot."""
+        return self._segment.layout.slot_stride
+
+    @property
+    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
+        """(shape, dtype, offset in the slot) of every column, by name."""
+        return self._columns
+
+    def static(self) -> dict[str, npt.NDArray[Any]]:
+        """The static columns, read-only."""
+        return self._segment.static_columns()

@@ -1,0 +1,277 @@
+"""What is in an MCAP file of ours, however damaged it is.
+
+A whole file ends with a summary that says where its chunks are. In any other, chunks are found by their signature and
+not by going from record to record, so that a damaged length, or bytes that are missing, cost no chunk but their own.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema
+
+from skinware.errors import BadRecording
+from skinware.recording.mcap_writing import COMPRESSION, MAGIC
+
+_CHUNK = struct.Struct("<BQQQQII4sQ")  # opcode, length, start, end, uncompressed size, CRC, length of "zstd", it, size
+_SIGNATURE = struct.pack("<I", len(COMPRESSION)) + COMPRESSION.encode()
+_SIGNATURE_AT = _CHUNK.size - 8 - len(_SIGNATURE)
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_FOOTER = struct.Struct("<BQQQI")
+_LARGEST_CHUNK = 1 << 30
+"""Bytes of its contents. What claims more is damaged."""
+
+
+class Damaged(Exception):
+    """A chunk, or the summary, is not as it was written."""
+
+
+class Message(NamedTuple):
+    """One message.
+
+    Attributes:
+        channel_id: of its channel.
+        sequence: of the message.
+        time_ns: when it was published, wall clock.
+        data: of it.
+    """
+
+    channel_id: int
+    sequence: int
+    time_ns: int
+    data: memoryview
+
+
+@dataclass(frozen=True)
+class ChunkPlace:
+    """Where a chunk is.
+
+    Attributes:
+        offset: of its record in the file.
+        start_ns, end_ns: times of its first and last message, wall clock.
+        size: bytes of its contents.
+        compressed_at, compressed_size: where its contents are in the file.
+        crc: of its contents.
+        channel_ids: of its messages; None where nobody told.
+    """
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    size: int
+    compressed_at: int
+    compressed_size: int
+    crc: int
+    channel_ids: frozenset[int] | None = None
+
+    @property
+    def end(self) -> int:
+        """Where the record ends in the file."""
+        return self.compressed_at + self.compressed_size
+
+
+@dataclass
+class ChunkContents:
+    """What is in a chunk.
+
+    Attributes:
+        channels, schemas: by id.
+        messages: in the order in which they were written.
+    """
+
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    messages: list[Message] = field(default_factory=list)
+
+
+class McapSource:
+    """An MCAP file that is read.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        is_whole: it ends with a summary that fits it.
+        chunks: where its chunks are, in the order of the file; where there was no summary to tell, only those that
+            are whole.
+        channels: by id.
+        damaged: chunks that were found to be damaged.
+
+    Raises:
+        BadRecording: it is no such file.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with path.open("rb") as file:
+            try:
+                self._map = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ)
+            except ValueError:
+                raise BadRecording(f"{path}: empty, so not a recording") from None
+        self._data = memoryview(self._map)
+        self.channels: dict[int, Channel] = {}
+        self.damaged: int = 0
+        try:
+            self.chunks: list[ChunkPlace] = self._told_by_summary()
+            self.is_whole: bool = True
+        except Damaged:
+            self.chunks, self.is_whole = list(self._whole_ones()), False
+        if not self.chunks and self._data[: len(MAGIC)] != MAGIC:
+            self.close()
+            raise BadRecording(f"{path}: not a recording (not an MCAP file)")
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return len(self._map)
+
+    def contents(self, place: ChunkPlace) -> ChunkContents:
+        """What is in a chunk.
+
+        Raises:
+            Damaged: it is not as it was written.
+        """
+        try:
+            compressed = self._data[place.compressed_at : place.end]
+            data = zstandard.ZstdDecompressor().decompress(compressed, max_output_size=place.size)
+        except (zstandard.ZstdError, MemoryError) as error:
+            raise Damaged(f"its contents cannot be decompressed ({error})") from None
+        if len(data) != place.size or (place.crc and zlib.crc32(data) != place.crc):
+            raise Damaged("its contents do not fit their checksum")
+        return _parsed(data)
+
+    def close(self) -> None:
+        """Close the file. What was read from it stays. Idempotent."""
+        self._data.release()
+        self._map.close()
+
+    def _told_by_summary(self) -> list[ChunkPlace]:
+        """Where the summary says that chunks are.
+
+        Raises:
+            Damaged: there is none, or it does not fit the file.
+        """
+        end = len(self._data) - len(MAGIC)
+        footer_at = end - _FOOTER.size
+        if footer_at < len(MAGIC) or self._data[end:] != MAGIC or self._data[: len(MAGIC)] != MAGIC:
+            raise Damaged("no end")
+        opcode, length, start, _, crc = _FOOTER.unpack_from(self._data, footer_at)
+        if opcode != Opcode.FOOTER or length != _FOOTER.size - 9 or not len(MAGIC) <= start <= footer_at:
+            raise Damaged("no footer")
+        if crc and zlib.crc32(self._data[start : end - 4]) != crc:
+            raise Damaged("the summary does not fit its checksum")
+        places = []
+        for kind, record in _records(self._data[start:footer_at]):
+            if kind == Opcode.CHUNK_INDEX:
+                index = _read(ChunkIndex, record)
+                place = self._chunk_at(index.chunk_start_offset, frozenset(index.message_index_offsets))
+                if place is None:
+                    raise Damaged("a chunk is not where the summary says")
+                places.append(place)
+            elif kind == Opcode.CHANNEL:
+                channel = _read(Channel, record)
+                self.channels[channel.id] = channel
+        return places
+
+    def _whole_ones(self) -> Iterator[ChunkPlace]:
+        """The chunks that are undamaged, wherever they are."""
+        at = 0
+        while (signature := self._map.find(_SIGNATURE, at)) >= 0:
+            at = signature + 1  # of one that is damaged, the length may be too: others may begin within it
+            place = self._chunk_at(signature - _SIGNATURE_AT)
+            if place is None:
+                continue
+            try:
+                contents = self.contents(place)
+            except Damaged:
+                self.damaged += 1
+            else:
+                self.channels |= contents.channels
+                at = place.end
+                yield replace(place, channel_ids=frozenset(message.channel_id for message in contents.messages))
+
+    def _chunk_at(self, offset: int, channel_ids: frozenset[int] | None = None) -> ChunkPlace | None:
+        """A chunk, if there is one that is complete."""
+        if not 0 <= offset <= len(self._data) - _CHUNK.size:
+            return None
+        opcode, length, start_ns, end_ns, size, crc, name_length, name, compressed_size = _CHUNK.unpack_from(
+            self._data, offset
+        )
+        compressed_at = offset + _CHUNK.size
+        if (
+            opcode != Opcode.CHUNK
+            or name_length != len(COMPRESSION)
+            or name != COMPRESSION.encode()
+            or length != _CHUNK.size - _RECORD.size + compressed_size
+            or compressed_at + compressed_size > len(self._data)
+            or size > _LARGEST_CHUNK
+        ):
+            return None
+        return ChunkPlace(offset, start_ns, end_ns, size, compressed_at, compressed_size, crc, channel_ids)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self.close()
+
+
+def _parsed(data: bytes) -> ChunkContents:
+    contents = ChunkContents()
+    for opcode, record in _records(memoryview(data)):
+        if opcode == Opcode.MESSAGE:
+            if len(record) < _MESSAGE.size:
+                raise Damaged("a message is shorter than its header")
+            channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
+            contents.messages.append(Message(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
+        elif opcode == Opcode.CHANNEL:
+            channel = _read(Channel, record)
+            contents.channels[channel.id] = channel
+        elif opcode == Opcode.SCHEMA:
+            schema = _read(Schema, record)
+            contents.schemas[schema.id] = schema
+    return contents
+
+
+def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """The records of a part of a file: (opcode, contents).
+
+    Raises:
+        Damaged: they do not fill it.
+    """
+    at = 0
+    while at < len(data):
+        if at + _RECORD.size > len(data):
+            raise Damaged("a record ends too early")
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise Damaged("a record ends too early")
+        yield opcode, data[at : at + length]
+        at += length
+
+
+def _read(kind: Any, record: memoryview) -> Any:
+    """A record as one of mcap's.
+
+    Raises:
+        Damaged: it is not one.
+    """
+    try:
+        return kind.read(ReadDataStream(BytesIO(record)))
+    except (McapError, struct.error, UnicodeDecodeError) as error:
+        raise Damaged(f"a record cannot be read ({error})") from None

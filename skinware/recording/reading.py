@@ -1,0 +1,242 @@
+"""Recordings, read: frame by frame, as snapshots, or as whole columns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+from skinware.errors import BadRecording, ConfigurationError
+from skinware.realtime import NS_PER_S
+from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
+from skinware.recording.generation import Generation
+from skinware.recording.mcap_reading import ChunkContents, Damaged, McapSource
+from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of
+from skinware.recording.tracks import Track
+from skinware.skin_layout import SkinLayout
+
+_GONE = ("closed", "dead")
+
+
+@dataclass
+class _Service:
+    """Numbers of a service's channels (0: none), and its generations by number."""
+
+    frame_channel: int = 0
+    head_channel: int = 0
+    generations: dict[int, Generation] = field(default_factory=dict)
+
+
+class Recording:
+    """A recording. Not for several threads at once.
+
+    Chunks that are damaged are left out; ``problems`` says so.
+
+    Args:
+        path: of the file.
+
+    Attributes:
+        path: of the file.
+        is_whole: it was ended in good order; others are read too, only more slowly (``skin-recover``).
+        start_ns, end_ns: time of its first and last message, wall clock.
+
+    Raises:
+        BadRecording: it is not a recording, or one of a newer version.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path: Path = Path(path)
+        self._source = McapSource(self.path)
+        self.is_whole: bool = self._source.is_whole
+        self.start_ns: int = min((place.start_ns for place in self._source.chunks), default=0)
+        self.end_ns: int = max((place.end_ns for place in self._source.chunks), default=0)
+        self._topics: dict[str, int] = {}
+        self._problems: dict[str, None] = {}
+        self._damaged: set[int] = set()
+        try:
+            self._services = self._find_services()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def services(self) -> tuple[str, ...]:
+        """Names of all services of which there are frames, drivers among them."""
+        return tuple(sorted(self._services))
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """Names of those that are drivers."""
+        return tuple(name for name in self.services if self[name].is_driver)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last."""
+        return (self.end_ns - self.start_ns) / NS_PER_S
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """What happened to the services, in order, each with its ``time_s``: see "Recordings" in the documentation."""
+        return list(self._json(EVENTS))
+
+    @property
+    def clock(self) -> list[dict[str, Any]]:
+        """Both clocks of the machine at the same moments, once a second."""
+        return list(self._json(CLOCK))
+
+    @property
+    def lost(self) -> int:
+        """Frames that were published meanwhile, and could not be recorded."""
+        return sum(int(event.get("count", 0)) for event in self._json(EVENTS) if event.get("event") == "lost")
+
+    @property
+    def problems(self) -> list[str]:
+        """What was found to be wrong with the file so far; all of it after all of it was read."""
+        damaged = self._source.damaged + len(self._damaged)
+        told = [f"{damaged} chunk{'s' * (damaged > 1)} damaged and left out"] if damaged else []
+        return [*told, *self._problems]
+
+    def __getitem__(self, name: str) -> Track:
+        """What was recorded of a service.
+
+        Raises:
+            ConfigurationError: nothing was; the message lists what there is.
+        """
+        if name not in self._services:
+            there_are = ", ".join(self.services) or "none"
+            raise ConfigurationError(f"no service {name!r} in {self.path}; there are: {there_are}")
+        service = self._services[name]
+        return Track(self, name, service.frame_channel, service.generations)
+
+    def snapshots(
+        self, drivers: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+    ) -> Iterator[RecordedSnapshot]:
+        """What :class:`skinware.Skin` would have given: a snapshot whenever a driver published, in order.
+
+        A driver joins with its first frame, and leaves when it was closed or died.
+
+        Args:
+            drivers: names; None: all.
+            start_s: where to begin, s since the recording began.
+            end_s: where to end, likewise; default: with the last.
+        """
+        tracks = [self[name] for name in (self.drivers if drivers is None else drivers)]
+        newest: dict[str, RecordedDriverFrame] = {}
+        layout = SkinLayout((), ())
+        for contents in self.chunks({self._topics.get(EVENTS, 0), *(track.channel for track in tracks)}, 0.0, end_s):
+            for time_s, service, frame in self._in_order(contents, tracks):
+                if frame is None:
+                    newest.pop(service, None)
+                    continue
+                newest[service] = frame
+                layout = _layout(newest, layout)
+                if time_s >= start_s and (end_s is None or time_s < end_s):
+                    frames = tuple(newest[driver] for driver in layout.drivers)
+                    yield RecordedSnapshot(layout, frames, frame.published_ns, time_s)
+
+    def _in_order(
+        self, contents: ChunkContents, tracks: Sequence[Track]
+    ) -> list[tuple[float, str, RecordedDriverFrame | None]]:
+        """(time, driver, frame) of some drivers in a chunk, by time; without a frame where one is gone."""
+        found: list[tuple[float, str, RecordedDriverFrame | None]] = []
+        for track in tracks:
+            for time_s, frame in track.frames_in(contents):
+                if isinstance(frame, RecordedDriverFrame):
+                    found.append((time_s, track.name, frame))
+        for message in contents.messages:
+            if message.channel_id == self._topics.get(EVENTS):
+                event = _event(message.data)
+                if event.get("event") in _GONE:
+                    found.append(((message.time_ns - self.start_ns) / NS_PER_S, str(event.get("service")), None))
+        return sorted(found, key=lambda one: one[0])
+
+    def close(self) -> None:
+        """Close the file; what was read stays. Idempotent."""
+        self._source.close()
+
+    def chunks(
+        self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
+    ) -> Iterator[ChunkContents]:
+        """The chunks in which there may be messages of some channels, of a time; for tracks."""
+        for place in self._source.chunks:
+            has_some = place.channel_ids is None or not place.channel_ids.isdisjoint(channels)
+            begins_in_time = end_s is None or place.start_ns < self.start_ns + round(end_s * NS_PER_S)
+            if has_some and begins_in_time and place.end_ns >= self.start_ns + round(start_s * NS_PER_S):
+                try:
+                    yield self._source.contents(place)
+                except Damaged:
+                    self._damaged.add(place.offset)
+
+    def note(self, problem: str) -> None:
+        """Something that is wrong with the file; for tracks."""
+        self._problems[problem] = None
+
+    # -- what there is ------------------------------------------------------------------------------------------
+
+    def _find_services(self) -> dict[str, _Service]:
+        services: dict[str, _Service] = {}
+        for channel in self._source.channels.values():
+            newer = newer_format(channel)
+            if newer is not None:
+                raise BadRecording(f"{self.path}: recorded by a newer version ({newer}): update skinware to read it")
+            self._topics[channel.topic] = channel.id
+            found = service_of(channel)
+            if found is not None:
+                service = services.setdefault(found[0], _Service())
+                if found[1] == FRAME:
+                    service.frame_channel = channel.id
+                elif found[1] == GENERATION:
+                    service.head_channel = channel.id
+        if self._source.channels and not services and CLOCK not in self._topics:
+            raise BadRecording(f"{self.path}: an MCAP file, but not a recording of a skin")
+        self._read_heads(services)
+        return {name: service for name, service in services.items() if service.frame_channel}
+
+    def _read_heads(self, services: dict[str, _Service]) -> None:
+        by_channel = {service.head_channel: name for name, service in services.items() if service.head_channel}
+        for contents in self.chunks(by_channel):
+            for message in contents.messages:
+                name = by_channel.get(message.channel_id)
+                if name is None:
+                    continue
+                try:
+                    generation = Generation(bytes(message.data), name)
+                except BadRecording as error:
+                    self.note(str(error))
+                else:
+                    services[name].generations.setdefault(generation.generation, generation)
+
+    def _json(self, topic: str) -> Iterator[dict[str, Any]]:
+        channel = self._topics.get(topic, 0)
+        for contents in self.chunks({channel}):
+            for message in contents.messages:
+                if message.channel_id == channel:
+                    yield {**_event(message.data), "time_s": (message.time_ns - self.start_ns) / NS_PER_S}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Recording {self.path}: {', '.join(self.services) or 'nothing'}, {self.duration_s:.1f} s>"
+
+
+def _layout(newest: dict[str, RecordedDriverFrame], before: SkinLayout) -> SkinLayout:
+    """The layout of some frames; the same one as before if nothing changed."""
+    drivers = tuple(sorted(newest))
+    structures = tuple(newest[name].structure for name in drivers)
+    same = drivers == before.drivers and all(a is b for a, b in zip(structures, before.structures, strict=True))
+    return before if same else SkinLayout(drivers, structures)
+
+
+def _event(data: memoryview) -> dict[str, Any]:
+    try:
+        event = json.loads(bytes(data))
+    except ValueError:
+        return {}
+    return event if isinstance(event, dict) else {}

@@ -1,0 +1,266 @@
+"""Records all frames of all services.
+
+One thread takes frames from the rings, which must not wait; another codes, compresses and writes them. Where that one
+cannot keep up (a slow disk), frames wait in memory; where that is full, they are not taken, and counted as lost.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from skinware.memory import segments
+from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
+from skinware.recording.codec import CodedColumn, Encoder
+from skinware.recording.collecting import Collector
+from skinware.recording.files import Head, Target
+from skinware.recording.mcap_writing import OpenChunk
+from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
+
+_CHUNK_NS = NS_PER_S // 4
+"""A chunk is closed so long after its first message: that much is lost with a killed recorder."""
+_CHUNK_BYTES = 8 << 20
+_CLOCK_NS = NS_PER_S
+_MOST_WAITING = 128 << 20
+"""Bytes of frames that wait to be written."""
+_LONGEST_REST_NS = 10_000_000
+
+
+@dataclass(frozen=True)
+class _Began:
+    service: str
+    head: bytes
+
+
+@dataclass(frozen=True)
+class _Took:
+    service: str
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class _Happened:
+    event: dict[str, Any]
+
+
+class _Save:
+    """What is only in memory is wanted."""
+
+
+class _End:
+    """That was all."""
+
+
+class Recorder:
+    """Records until it is stopped.
+
+    Args:
+        target: where the recording goes; the recorder completes it.
+        names: of services; None: all there are and come.
+        namespace: where they are.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        names: Collection[str] | None = None,
+        namespace: Namespace | str | None = None,
+    ) -> None:
+        self._target = target
+        self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
+        self._bytes_given = 0
+        self._coder = _Coder(target, self._jobs)
+        self._collector = Collector(Namespace.of(namespace), names, self)
+        self._stopping = False
+
+    @property
+    def lost(self) -> int:
+        """Frames that were published meanwhile and could not be taken."""
+        return self._collector.lost
+
+    @property
+    def services(self) -> list[str]:
+        """Names of those that were found so far."""
+        return self._collector.services
+
+    @property
+    def messages(self) -> dict[str, int]:
+        """Messages of each channel that are written."""
+        names = self._coder.channels.names()
+        return {names[channel]: count for channel, count in sorted(self._target.counts.items())}
+
+    def run(self, duration_s: float | None = None, tell: Callable[[], object] = lambda: None) -> None:
+        """Record until ``stop``, until the time is over, or until the target is full.
+
+        Args:
+            duration_s: how long; None: without end.
+            tell: called once a second.
+
+        Raises:
+            OSError: the recording cannot be written any more. What was written is complete.
+        """
+        end_ns = None if duration_s is None else now_ns() + round(duration_s * NS_PER_S)
+        tell_ns = now_ns() + NS_PER_S
+        self._coder.start()
+        try:
+            with short_turns():
+                while not (self._stopping or self._coder.failure or self._target.is_full):
+                    if end_ns is not None and now_ns() >= end_ns:
+                        break
+                    if now_ns() >= tell_ns:
+                        tell_ns = max(tell_ns + NS_PER_S, now_ns())
+                        tell()
+                    taken = self._bytes_waiting < _MOST_WAITING and self._collector.take()
+                    if taken:  # those that come soon are taken together
+                        time.sleep(min(_LONGEST_REST_NS, self._collector.slack_ns // 4) / NS_PER_S)
+                    self._collector.wait(WAIT_SLICE_NS // 5)
+                if not self._coder.failure:
+                    self._collector.take()
+        finally:
+            self._jobs.put(_End())
+            self._coder.join()
+            self._collector.close()
+        if self._coder.failure:
+            raise self._coder.failure
+
+    def stop(self) -> None:
+        """End the recording; from any thread, and from a signal handler."""
+        self._stopping = True
+
+    def save(self) -> None:
+        """Write what is only in memory (:class:`skinware.recording.files.Past`); likewise."""
+        self._jobs.put(_Save())
+
+    # -- what the collector tells ---------------------------------------------------------------------------------
+
+    def began(self, service: str, head: bytes) -> None:
+        """See :class:`skinware.recording.collecting.Listener`."""
+        self._jobs.put(_Began(service, head))
+
+    def took(self, service: str, frame: Frame) -> None:
+        """Likewise."""
+        self._bytes_given += len(frame.slot)
+        self._jobs.put(_Took(service, frame))
+
+    def happened(self, event: dict[str, Any]) -> None:
+        """Likewise."""
+        self._jobs.put(_Happened(event))
+
+    @property
+    def _bytes_waiting(self) -> int:
+        return self._bytes_given - self._coder.bytes_done
+
+
+@dataclass
+class _Stream:
+    """The frames of one service as they are coded."""
+
+    head: Head
+    encoder: Encoder
+
+
+class _Coder(threading.Thread):
+    """Codes frames, fills chunks, and hands them to the target when they are due."""
+
+    def __init__(self, target: Target, jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End]) -> None:
+        super().__init__(name="skinware recorder")
+        self.channels = Channels()
+        self.bytes_done = 0
+        self.failure: Exception | None = None
+        self._target, self._jobs = target, jobs
+        self._streams: dict[str, _Stream] = {}
+        self._chunk = OpenChunk()
+        self._heads: set[Head] = set()
+        self._due_ns = 0
+        self._next_clock_ns = now_ns()
+        self._offset_ns = 0
+
+    def run(self) -> None:
+        """Until there is nothing more to do, or nothing can be done."""
+        try:
+            while self._work():
+                pass
+            self._close_chunk()
+        except Exception as error:  # noqa: BLE001, whoever records is told
+            self.failure = error
+        try:
+            self._target.finish()
+        except OSError as error:
+            self.failure = self.failure or error
+
+    def _work(self) -> bool:
+        """One job; False: that was the last."""
+        if now_ns() >= self._next_clock_ns:
+            self._tell_time()
+        if not self._chunk.is_empty and (now_ns() >= self._due_ns or self._chunk.size > _CHUNK_BYTES):
+            self._close_chunk()
+        until_ns = self._next_clock_ns if self._chunk.is_empty else min(self._due_ns, self._next_clock_ns)
+        try:
+            job = self._jobs.get(timeout=max(0, until_ns - now_ns()) / NS_PER_S)
+        except queue.Empty:
+            return True
+        match job:
+            case _Took(service, frame):
+                self._add_frame(self._streams[service], service, frame)
+                self.bytes_done += len(frame.slot)
+            case _Began(service, head):
+                self._begin(service, head)
+            case _Happened(event):
+                self._add_json(EVENTS, event)
+            case _Save():
+                self._close_chunk()
+                self._target.save()
+            case _End():
+                return False
+        return True
+
+    def _begin(self, service: str, head: bytes) -> None:
+        before = self._streams.get(service)
+        number = 1 if before is None else before.head.sequence + 1
+        channel, schema = self.channels.of_service(service, GENERATION)
+        columns = segments.recorded(head, service).layout.slot
+        encoder = Encoder([CodedColumn.of(column) for column in columns])
+        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder)
+
+    def _add_frame(self, stream: _Stream, service: str, frame: Frame) -> None:
+        channel, schema = self.channels.of_service(service, FRAME)
+        if not self._chunk.has(channel):
+            stream.encoder.next_is_key()
+        self._heads.add(stream.head)
+        time_ns = frame.published_ns + self._offset_ns
+        self._add(channel, schema, frame.sequence, time_ns, stream.encoder.encode(frame))
+
+    def _add_json(self, topic: str, data: dict[str, Any]) -> None:
+        channel, schema = self.channels.of_all(topic)
+        self._add(channel, schema, 0, now_ns() + self._offset_ns, json.dumps(data).encode())
+
+    def _add(self, channel: Any, schema: Any, sequence: int, time_ns: int, data: bytes) -> None:
+        if self._chunk.is_empty:
+            self._due_ns = now_ns() + _CHUNK_NS
+        self._chunk.add(channel, schema, sequence, time_ns, data)
+
+    def _tell_time(self) -> None:
+        self._next_clock_ns = now_ns() + _CLOCK_NS
+        monotonic_ns, realtime_ns = now_ns(), time.time_ns()
+        self._offset_ns = realtime_ns - monotonic_ns
+        self._add_json(CLOCK, {"monotonic_ns": monotonic_ns, "realtime_ns": realtime_ns, "boot": _boot()})
+
+    def _close_chunk(self) -> None:
+        if self._chunk.is_empty:
+            return
+        chunk, heads = self._chunk.close(), self._heads
+        self._chunk, self._heads = OpenChunk(), set()
+        self._target.add(chunk, heads)
+
+
+def _boot() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

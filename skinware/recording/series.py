@@ -1,0 +1,110 @@
+"""Recorded frames as whole columns: arrays of (time, sensor)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import StructureError
+from skinware.freshness import age_limit_ns, is_fresh
+from skinware.realtime import NS_PER_S
+from skinware.recording.generation import Generation
+from skinware.structure import Structure
+
+
+class Series:
+    """n frames of one service, whose columns and tables are the same in all of them.
+
+    Args:
+        origin: one of their generations.
+        headers: (n,) of :data:`skinware.recording.codec.HEADER`.
+        time_s: (n,) when each was published, s since the recording began.
+        columns: (n, ...) by name.
+
+    Attributes:
+        time_s: as given.
+        generation: (n,) uint64, which incarnation of the service each frame belongs to.
+        sequence: (n,) uint64, number of each within it; a gap are frames that were lost.
+        acquired_ns: (n,) int64, newest time stamp of the data in each, CLOCK_MONOTONIC of the machine that recorded.
+        published_ns: (n,) int64, when the writer handed it out, likewise.
+    """
+
+    def __init__(
+        self,
+        origin: Generation,
+        headers: npt.NDArray[np.void],
+        time_s: npt.NDArray[np.float64],
+        columns: Mapping[str, npt.NDArray[Any]],
+    ) -> None:
+        self._origin, self._columns = origin, columns
+        self.time_s = time_s
+        self.generation: npt.NDArray[np.uint64] = headers["generation"]
+        self.sequence: npt.NDArray[np.uint64] = headers["sequence"]
+        self.acquired_ns: npt.NDArray[np.int64] = headers["acquired_ns"]
+        self.published_ns: npt.NDArray[np.int64] = headers["published_ns"]
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @property
+    def structure(self) -> Structure:
+        """The structure of the driver.
+
+        Raises:
+            StructureError: it is not a driver.
+        """
+        if not self._origin.is_driver:
+            raise StructureError(f"service {self._origin.name!r} is not a driver: it has no sensors")
+        return cast(Structure, self._origin.context)
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """(n, ...) one column of all frames.
+
+        Raises:
+            KeyError: no such column, or it was not read.
+        """
+        try:
+            return self._columns[name]
+        except KeyError:
+            there_are = f"there are {', '.join(self._columns)}"
+            known = "was not read" if name in self._origin.columns else "is not there"
+            raise KeyError(f"column {name!r} {known}; {there_are}") from None
+
+    # -- by type ------------------------------------------------------------------------------------------------
+
+    def raw(self, type_name: str) -> npt.NDArray[Any]:
+        """(n, sensors) raw counts of all sensors of a type, in the order of ``structure.index``.
+
+        Raises:
+            StructureError: no such type here; the same for all that take a type.
+        """
+        return self.column("values")[:, self.structure.index(type_name)]
+
+    def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
+        """(n, sensors) float32 values in the type's unit; float64 where raw values are int32."""
+        return self.structure.physical(self.column("values"), type_name)
+
+    def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
+        """(n, sensors) uint8, bits of :class:`skinware.Status`."""
+        return self.column("status")[:, self.structure.index(type_name)]
+
+    def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
+        """(n, sensors) int64: time of the data of each sensor (of its module), 0: never seen."""
+        return self.column("module_time_ns")[:, self.structure.module_of(type_name)]
+
+    def fresh(self, type_name: str, *, max_age_s: float | None = None) -> npt.NDArray[np.bool_]:
+        """(n, sensors) bool: which could be trusted when their frame was published.
+
+        Args:
+            type_name: which sensors.
+            max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverFrame.fresh`.
+        """
+        max_age_ns = age_limit_ns(self._origin.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S)
+        at_ns = self.published_ns[:, np.newaxis]
+        return is_fresh(self.status_of(type_name), self.time_ns(type_name), at_ns=at_ns, max_age_ns=max_age_ns)
+
+    def __repr__(self) -> str:
+        return f"<Series of {len(self)} frames of {self._origin.name!r}: {', '.join(self._columns)}>"

@@ -1,0 +1,87 @@
+"""The channels of a recording: their names, encodings and schemas."""
+
+from __future__ import annotations
+
+import json
+
+from mcap.records import Channel, Schema
+
+FORMAT = 1
+ENCODING = f"skinware/{FORMAT}"
+"""Of messages with frames and with generations. A file with a higher number needs a newer version of this package."""
+_FAMILY = "skinware/"
+FRAME, GENERATION = "frame", "generation"
+EVENTS, CLOCK = "/skin/events", "/skin/clock"
+
+_EVENT = {
+    "type": "object",
+    "properties": {
+        "event": {"type": "string", "description": "found, live, paused, closed, dead, restarted, lost, unreadable"},
+        "service": {"type": "string"},
+        "time_ns": {"type": "integer", "description": "CLOCK_MONOTONIC"},
+        "count": {"type": "integer", "description": "of lost: how many frames"},
+        "before": {"type": "integer", "description": "of lost: sequence of the frame after them"},
+        "why": {"type": "string", "description": "of unreadable"},
+    },
+}
+_CLOCK = {
+    "type": "object",
+    "properties": {
+        "monotonic_ns": {"type": "integer", "description": "CLOCK_MONOTONIC, the time of frames"},
+        "realtime_ns": {"type": "integer", "description": "CLOCK_REALTIME at the same moment, the time of messages"},
+        "boot": {"type": "string", "description": "which start of the machine the first one counts from"},
+    },
+}
+_FRAME_TEXT = b"""\
+One frame: u8 generation, u8 sequence, i8 acquired_ns, i8 published_ns, u8 flags, u8 after, little-endian; a byte for
+each column, how it is coded; u4 of each, its size; what changed in each since frame `after`."""
+_GENERATION_TEXT = b"""\
+The file of a service in shared memory (version 1.0), up to its slots: header, column table, static columns."""
+
+SCHEMAS = {
+    FRAME: Schema(1, _FRAME_TEXT, ENCODING, "skinware.Frame"),
+    GENERATION: Schema(2, _GENERATION_TEXT, ENCODING, "skinware.Generation"),
+    EVENTS: Schema(3, json.dumps(_EVENT).encode(), "jsonschema", "skinware.Event"),
+    CLOCK: Schema(4, json.dumps(_CLOCK).encode(), "jsonschema", "skinware.Clock"),
+}
+
+
+class Channels:
+    """The channels of a file, numbered as they are needed."""
+
+    def __init__(self) -> None:
+        self._channels: dict[str, Channel] = {}
+
+    def of_service(self, name: str, what: str) -> tuple[Channel, Schema]:
+        """The channel of a service's frames, or of its generations."""
+        return self._of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
+
+    def of_all(self, topic: str) -> tuple[Channel, Schema]:
+        """The channel of events, or of the clock."""
+        return self._of(topic, "json", SCHEMAS[topic])
+
+    def names(self) -> dict[int, str]:
+        """Topics by number."""
+        return {channel.id: topic for topic, channel in self._channels.items()}
+
+    def _of(self, topic: str, encoding: str, schema: Schema) -> tuple[Channel, Schema]:
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = Channel(len(self._channels) + 1, topic, encoding, {}, schema.id)
+            self._channels[topic] = channel
+        return channel, schema
+
+
+def service_of(channel: Channel) -> tuple[str, str] | None:
+    """(name of the service, what of it) of a channel of ours; None of any other."""
+    parts = channel.topic.split("/")
+    if channel.message_encoding != ENCODING or len(parts) != 4 or parts[3] not in (FRAME, GENERATION):
+        return None
+    return parts[2], parts[3]
+
+
+def newer_format(channel: Channel) -> str | None:
+    """The encoding of a channel that needs a newer version of this package; None of any other."""
+    encoding = channel.message_encoding
+    number = encoding.removeprefix(_FAMILY)
+    return encoding if encoding.startswith(_FAMILY) and number.isdigit() and int(number) > FORMAT else None

@@ -1,0 +1,196 @@
+"""What was recorded of one service."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadRecording, StructureError
+from skinware.realtime import NS_PER_S
+from skinware.recording.codec import HEADER, Run, runs
+from skinware.recording.frames import RecordedFrame, frames_of
+from skinware.recording.generation import Generation
+from skinware.recording.mcap_reading import ChunkContents
+from skinware.recording.series import Series
+from skinware.structure import Structure
+
+_FOR_DRIVERS = ("values", "status", "module_time_ns")
+
+
+class ChunkSource(Protocol):
+    """Where the chunks of a recording come from."""
+
+    path: Path
+    start_ns: int
+
+    def chunks(
+        self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
+    ) -> Iterator[ChunkContents]:
+        """The chunks in which there may be messages of some channels, of a time."""
+
+    def note(self, problem: str) -> None:
+        """Something is wrong with the file."""
+
+
+class Track:
+    """What was recorded of one service.
+
+    Attributes:
+        name: of the service.
+        generations: those of which frames were recorded, or that were told, in order.
+    """
+
+    def __init__(self, recording: ChunkSource, name: str, channel: int, generations: dict[int, Generation]) -> None:
+        self._recording = recording
+        self.name: str = name
+        self.channel: int = channel
+        self._generations = generations
+
+    @property
+    def generations(self) -> tuple[Generation, ...]:
+        """Its generations, in order."""
+        return tuple(self._generations[number] for number in sorted(self._generations))
+
+    @property
+    def is_driver(self) -> bool:
+        """Whether it is a driver."""
+        return any(generation.is_driver for generation in self._generations.values())
+
+    @property
+    def parts(self) -> tuple[Track, ...]:
+        """One for each time that its columns or tables changed; their frames are one after the other."""
+        parts: list[dict[int, Generation]] = []
+        for generation in self.generations:
+            if not parts or next(iter(parts[-1].values())).digest != generation.digest:
+                parts.append({})
+            parts[-1][generation.generation] = generation
+        return tuple(Track(self._recording, self.name, self.channel, part) for part in parts)
+
+    @property
+    def structure(self) -> Structure:
+        """The structure of a driver.
+
+        Raises:
+            StructureError: it is not a driver, or had several.
+        """
+        origin = self._only_origin()
+        if not isinstance(origin.context, Structure):
+            raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
+        return origin.context
+
+    def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[RecordedFrame]:
+        """Every frame, in order; those of a driver are driver frames.
+
+        Args:
+            start_s: where to begin, s since the recording began.
+            end_s: where to end, likewise; default: with the last.
+        """
+        for contents in self._recording.chunks({self.channel}, start_s, end_s):
+            for time_s, frame in self.frames_in(contents):
+                if time_s >= start_s and (end_s is None or time_s < end_s):
+                    yield frame
+
+    def frames_in(self, contents: ChunkContents) -> Iterator[tuple[float, RecordedFrame]]:
+        """The frames in a chunk, each with its time, s since the recording began."""
+        for part in self._decodable(contents):
+            yield from zip(part.time_s.tolist(), frames_of(part.generation, part.run), strict=True)
+
+    def read(
+        self, columns: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+    ) -> Series:
+        """Whole columns of all frames.
+
+        Args:
+            columns: names; default: all, of a driver values, status and times.
+            start_s: where to begin, s since the recording began.
+            end_s: where to end, likewise; default: with the last.
+
+        Raises:
+            StructureError: the columns or tables changed in between: read the ``parts`` one by one.
+            KeyError: no such column.
+        """
+        origin = self._only_origin()
+        names = tuple(columns) if columns is not None else _FOR_DRIVERS if origin.is_driver else tuple(origin.columns)
+        numbers = {column.name: number for number, column in enumerate(origin.coded)}
+        for name in names:
+            if name not in numbers:
+                raise KeyError(f"no column {name!r}; there are {', '.join(numbers)}")
+        headers, times, arrays = [np.zeros(0, HEADER)], [np.zeros(0)], [[_nothing(origin, name)] for name in names]
+        for part in self._runs(start_s, end_s):
+            rows = _rows(part.time_s, start_s, end_s)
+            headers.append(part.run.headers[rows])
+            times.append(part.time_s[rows])
+            for name, of_column in zip(names, arrays, strict=True):
+                of_column.append(part.column(numbers[name], rows))
+        joined = {name: np.concatenate(of_column) for name, of_column in zip(names, arrays, strict=True)}
+        return Series(origin, np.concatenate(headers), np.concatenate(times), joined)
+
+    def _only_origin(self) -> Generation:
+        origins = self.generations
+        if not origins:
+            raise BadRecording(f"{self._recording.path}: what the frames of {self.name!r} are made of is lost")
+        if len({origin.digest for origin in origins}) > 1:
+            raise StructureError(
+                f"service {self.name!r} changed its columns or tables during the recording: use its parts"
+            )
+        return origins[0]
+
+    def _runs(self, start_s: float, end_s: float | None) -> Iterator[_PartOfChunk]:
+        for contents in self._recording.chunks({self.channel}, start_s, end_s):
+            yield from self._decodable(contents)
+
+    def _decodable(self, contents: ChunkContents) -> Iterator[_PartOfChunk]:
+        """The frames of this service in a chunk, as far as their generation is known."""
+        messages = [message for message in contents.messages if message.channel_id == self.channel]
+        for number, which in runs([message.data for message in messages]):
+            generation = self._generations.get(number)
+            if generation is None:
+                continue
+            try:
+                run = Run([message.data for message in messages[which]], generation.coded)
+            except BadRecording as error:
+                self._recording.note(f"{self.name}: {error}")
+                continue
+            times_ns = np.array([message.time_ns for message in messages[which]], np.int64)
+            yield _PartOfChunk(generation, run, (times_ns - self._recording.start_ns) / NS_PER_S)
+
+    def __repr__(self) -> str:
+        return f"<Track of {self.name!r}>"
+
+
+class _PartOfChunk(NamedTuple):
+    """Frames of one generation that stand in one chunk.
+
+    Attributes:
+        generation, run: they.
+        time_s: (n,) of each, s since the recording began.
+    """
+
+    generation: Generation
+    run: Run
+    time_s: npt.NDArray[np.float64]
+
+    def column(self, number: int, rows: slice) -> npt.NDArray[Any]:
+        """(n, ...) some rows of a column."""
+        coded = self.generation.coded[number]
+        shape, dtype, _ = self.generation.columns[coded.name]
+        words = np.empty((len(self.time_s), coded.count), coded.words)
+        self.run.decode(number, words)
+        wanted = words[rows]
+        return wanted.view(np.uint8).view(dtype).reshape(len(wanted), *shape)
+
+
+def _nothing(generation: Generation, name: str) -> npt.NDArray[Any]:
+    """A column of no frames."""
+    shape, dtype, _ = generation.columns[name]
+    return np.zeros((0, *shape), dtype)
+
+
+def _rows(time_s: npt.NDArray[np.float64], start_s: float, end_s: float | None) -> slice:
+    """The rows within a time, from the first to the last of them."""
+    wanted = np.flatnonzero((time_s >= start_s) & (time_s < (np.inf if end_s is None else end_s)))
+    return slice(int(wanted[0]), int(wanted[-1]) + 1) if len(wanted) else slice(0)

@@ -1,0 +1,216 @@
+"""skin-record and skin-recover as people and scripts use them; and what a killed recorder leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import skinware.recording
+from skinware import DriverReader, Namespace
+from skinware.cli._command import exit_status
+from skinware.cli.record import command as record
+from skinware.cli.record import past, size
+from skinware.cli.recover import command as recover
+from skinware.memory.announcement import living_readers, sweep
+from skinware.recording.mcap_writing import MAGIC
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
+from tests.commands import BIN, PATIENCE_S, running
+from tests.recording.rig import contents_of
+
+KILLS = 3
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespace, number: int) -> None:
+    file = tmp_path / "skin.mcap"
+    with running("skin-record", "-o", str(file)) as recorder:
+        ready = recorder.wait_for("ready")
+        assert (ready["file"], ready["namespace"], ready["names"]) == (str(file), namespace.name, [])
+        with publishing(FakeSkin("torso")) as skin:
+            recorder.wait_for("status", lambda status: status["messages"].get("/skin/torso/frame", 0) > 20)
+        stopped = recorder.stop(number)
+        assert recorder.process.returncode == 0
+    assert stopped["event"] == "stopped"
+    assert (stopped["file"], stopped["files"], stopped["lost"]) == (str(file), [str(file)], 0)
+    assert stopped["messages"]["/skin/torso/frame"] == skin.writer.sequence
+    assert stopped["bytes"] == file.stat().st_size
+    with skinware.recording.open(file) as opened:
+        assert opened.is_whole
+        assert opened["torso"].read(["status"]).sequence.tolist() == list(range(1, skin.writer.sequence + 1))
+
+
+def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with publishing(FakeSkin("torso")):
+        assert exit_status(record, ["torso", "-T", "2.2"]) == 0
+    (file,) = tmp_path.iterdir()
+    out = capsys.readouterr().out
+    assert out.startswith(
+        f"recording torso of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
+    )
+    assert " MB, nothing lost\n" in out
+    assert "/skin/torso/frame: " in out
+    data = file.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    assert exit_status(recover, ["cut.mcap"]) == 0
+    assert capsys.readouterr().out.endswith("cut.recovered.mcap: written; 0 damaged chunks left out\n")
+    assert exit_status(recover, [file.name, "-o", "again.mcap"]) == 0
+    assert capsys.readouterr().out.endswith("again.mcap: written; it was whole\n")
+
+
+def test_a_signal_saves_the_past(tmp_path: Path) -> None:
+    file = tmp_path / "fall.mcap"
+    with publishing(FakeSkin("torso")), running("skin-record", "--last", "5s", "-o", str(file)) as recorder:
+        recorder.wait_for("status", lambda status: "/skin/torso/frame" in status["messages"])
+        assert not file.exists()
+        recorder.process.send_signal(signal.SIGUSR1)
+        wait_until(file.exists)
+        assert recorder.stop()["files"] == [str(file), str(tmp_path / "fall-2.mcap")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["-o", "there.mcap"], 1, "there.mcap: exists already: give another name, or remove it"),
+        (["-o", "nowhere/x.mcap"], 1, "nowhere/x.mcap: No such file or directory"),
+        (["-o", "/proc/x.mcap"], 1, "/proc/x.mcap: No such file or directory"),
+        (["-o", "x.mcap", "to rso"], 2, "service name 'to rso'"),
+        (["-o", "x.mcap", "--split", "much"], 2, "'much' is not a size"),
+        (["-o", "x.mcap", "--last", "0"], 2, "'0' is not a time"),
+        (["-o", "x.mcap", "--last", "5s", "--split", "1MB"], 2, "--last keeps the past in memory"),
+    ],
+)
+def test_mistakes_are_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("there.mcap").write_text("mine")
+    assert exit_status(record, arguments) == code
+    errors = capsys.readouterr().err
+    assert words in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["there.mcap"]
+    assert Path("there.mcap").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("contents", "words"),
+    [
+        (None, "x.mcap: No such file or directory"),
+        (b"", "empty, so not a recording"),
+        (b"hello world, hello world", "not a recording (not an MCAP file)"),
+        (MAGIC, "nothing in it can be used"),
+    ],
+)
+def test_what_cannot_be_recovered_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], contents: bytes | None, words: str
+) -> None:
+    file = tmp_path / "x.mcap"
+    if contents is not None:
+        file.write_bytes(contents)
+    before = list(tmp_path.iterdir())
+    assert exit_status(recover, [str(file)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line
+    assert list(tmp_path.iterdir()) == before
+
+
+def test_a_file_that_may_not_grow_ends_the_recording_with_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    limit = 40_000
+    with publishing(FakeSkin("torso")) as skin:
+        done = subprocess.run(
+            [BIN / "skin-record", "-o", file, "--json"],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        )
+        end = skin.writer.sequence
+    assert done.returncode == 1
+    assert done.stderr == f"skin-record: {file}: File too large\n"
+    assert json.loads(done.stdout.splitlines()[-1])["event"] == "stopped"
+    assert 0 < file.stat().st_size <= limit
+    with skinware.recording.open(file) as opened:
+        sequence = opened["torso"].read(["status"]).sequence
+        assert 20 < len(sequence) < end
+        assert sequence.tolist() == list(range(int(sequence[0]), int(sequence[-1]) + 1))
+
+
+@pytest.mark.parametrize("sensors", ["few", "many"])
+def test_a_kill_costs_no_frame_that_was_written_and_little_time(tmp_path: Path, sensors: str) -> None:
+    structure = fake_structure(*((2, 4) if sensors == "few" else (64, 16)))
+    seen: dict[tuple[int, int], dict[str, bytes]] = {}
+    stop = threading.Event()
+
+    def look() -> None:
+        with DriverReader("torso") as reader:
+            for frame in reader.in_order():
+                seen[frame.position] = contents_of(frame)
+                if stop.is_set():
+                    return
+
+    with publishing(FakeSkin("torso", structure), 50):
+        thread = threading.Thread(target=look)
+        thread.start()
+        try:
+            for number in range(KILLS):
+                file = tmp_path / f"{number}.mcap"
+                with running("skin-record", "-o", str(file)) as recorder:
+                    recorder.wait_for("status", lambda status: "/skin/torso/frame" in status["messages"])
+                    time.sleep(random.uniform(0, 0.5))
+                    killed_ns = time.monotonic_ns()
+                    recorder.stop(signal.SIGKILL)
+                whole = tmp_path / f"{number}.whole.mcap"
+                assert exit_status(recover, [str(file), "-o", str(whole)]) == 0
+                with skinware.recording.open(whole) as opened:
+                    frames = list(opened["torso"].frames())
+                wait_until(lambda frames=frames: frames[-1].position in seen)  # type: ignore[misc]
+                known = [frame for frame in frames if frame.position in seen]
+                assert len(known) > 20
+                assert all(contents_of(frame) == seen[frame.position] for frame in known)
+                assert [f.sequence for f in frames] == list(range(frames[0].sequence, frames[-1].sequence + 1))
+                assert (
+                    frames[-1].published_ns > killed_ns - 5e9
+                )  # 0.3 s where nothing else runs: see tools/bench record
+        finally:
+            stop.set()
+            thread.join()
+            sweep(Namespace())  # what the killed recorders told as readers
+
+
+def test_sizes_and_times() -> None:
+    assert [size(text) for text in ("1", "2kB", "1.5MB", "1GiB", "3 MiB", "2G")] == [
+        1,
+        2000,
+        1_500_000,
+        1 << 30,
+        3 << 20,
+        2 * 10**9,
+    ]
+    assert [past(text) for text in ("60", "60s", "0.5s", "5min")] == [60, 60, 0.5, 300]
+
+
+def test_recorders_are_readers_that_others_see(tmp_path: Path) -> None:
+    with publishing(FakeSkin("torso")), running("skin-record", "-o", str(tmp_path / "x.mcap")) as recorder:
+        recorder.wait_for("status", lambda status: "/skin/torso/frame" in status["messages"])
+        wait_until(lambda: any(reader.kind == "in order" for reader in living_readers(Namespace())))
+        (reader,) = living_readers(Namespace())
+        assert (reader.pid, reader.service) == (recorder.process.pid, "torso")
+        assert os.path.basename(reader.program) == "skin-record"

@@ -1,0 +1,121 @@
+"""Recordings damaged at random, and what must still be read of them. tools/fuzz runs it for longer."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import skinware.recording
+from skinware.errors import BadRecording, SkinwareError
+from skinware.recording.mcap_reading import McapSource
+from skinware.recording.topics import FRAME, service_of
+from tests.recording.rig import contents_of
+
+Frames = dict[tuple[str, int, int], dict[str, bytes]]
+"""Contents of frames by service, generation and sequence."""
+
+
+def damaged(data: bytes, generator: random.Random) -> tuple[bytes, list[range]]:
+    """The same bytes with a little damage, and which of the old ones are gone or changed."""
+    out, gone = bytearray(data), []
+    for _ in range(generator.randint(1, 4)):
+        at, count = generator.randrange(len(out)), int(2 ** generator.uniform(0, 10))
+        match generator.choice(("bits", "noise", "zeros", "cut")):
+            case "bits":
+                out[at] ^= 1 << generator.randrange(8)
+                gone.append(range(at, at + 1))
+            case "noise":
+                out[at : at + count] = generator.randbytes(len(out[at : at + count]))
+                gone.append(range(at, at + count))
+            case "zeros":
+                out[at : at + count] = bytes(len(out[at : at + count]))
+                gone.append(range(at, at + count))
+            case "cut":
+                gone.append(range(at, len(data)))
+                del out[at:]
+                if not out:
+                    break
+    if generator.random() < 0.2 and out:  # bytes that are missing move all that follow
+        at, count = generator.randrange(len(out)), generator.randint(1, 300)
+        gone.append(range(at, at + count))
+        del out[at : at + count]
+    return bytes(out), gone
+
+
+def frames_of(file: Path) -> Frames:
+    """All that can be read, frame by frame and as columns, which must be the same."""
+    found: Frames = {}
+    with skinware.recording.open(file) as opened:
+        for name in opened.services:
+            for frame in opened[name].frames():
+                found[name, frame.generation, frame.sequence] = contents_of(frame)
+            for part in opened[name].parts:
+                series = part.read()
+                assert all(
+                    found[name, int(generation), int(sequence)]["times"][8:16] == published.tobytes()
+                    for generation, sequence, published in zip(
+                        series.generation, series.sequence, series.published_ns, strict=True
+                    )
+                )
+        assert sum(1 for _ in opened.snapshots()) <= len(found)
+        assert all("\n" not in problem for problem in opened.problems)
+    return found
+
+
+class Original:
+    """A recording before it is damaged, with what is in which of its chunks.
+
+    Args:
+        file: it.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.data = file.read_bytes()
+        self.frames = frames_of(file)
+        self._chunks: list[tuple[range, set[tuple[str, int]], set[str]]] = []
+        with McapSource(file) as source:
+            for place in source.chunks:
+                frames, heads = set(), set()
+                for message in source.contents(place).messages:
+                    found = service_of(source.channels[message.channel_id])
+                    if found is not None and found[1] == FRAME:
+                        frames.add((found[0], message.sequence))
+                    elif found is not None:
+                        heads.add(found[0])
+                self._chunks.append((range(place.offset, place.end), frames, heads))
+
+    def expected(self, gone: list[range]) -> set[tuple[str, int]]:
+        """(service, sequence) of the frames whose chunk is undamaged, if their generation is told in another such."""
+        whole = [
+            (frames, heads)
+            for place, frames, heads in self._chunks
+            if not any(part.start < place.stop and place.start < part.stop for part in gone)
+        ]
+        told = {name for _, heads in whole for name in heads}
+        return {frame for frames, _ in whole for frame in frames if frame[0] in told}
+
+    def check(self, generator: random.Random, file: Path) -> int:
+        """Damage it and look; how many frames were read."""
+        data, gone = damaged(self.data, generator)
+        file.write_bytes(data)
+        refused = ""
+        try:
+            found = frames_of(file)
+        except BadRecording as error:
+            found, refused = {}, str(error)
+        assert "\n" not in refused
+        assert all(self.frames[position] == contents for position, contents in found.items())
+        missing = self.expected(gone) - {(name, sequence) for name, _, sequence in found}
+        assert not missing, f"{len(missing)} frames of undamaged chunks: {refused}"
+        return len(found)
+
+
+def recover_too(file: Path, target: Path) -> Frames:
+    """What is in a damaged file after it was made whole; nothing if that is not possible."""
+    from skinware.recording.recovery import recover
+
+    try:
+        recover(file, target)
+    except SkinwareError:
+        return {}
+    return frames_of(target)

@@ -1,0 +1,147 @@
+"""One recording, read in every way, and files that are none."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import skinware.recording
+from skinware.errors import BadRecording, ConfigurationError, StructureError
+from skinware.recording.mcap_writing import MAGIC
+from tests.recording.rig import two_drivers_and_a_service
+
+
+@pytest.fixture
+def path(tmp_path: Path, made: dict[str, bytes]) -> Path:
+    """Two drivers and a service, one and a half seconds long; made by the first test that wants it."""
+    file = tmp_path / "skin.mcap"
+    if not made:
+        two_drivers_and_a_service(file)
+        made["skin"] = file.read_bytes()
+    file.write_bytes(made["skin"])
+    return file
+
+
+def test_columns_frames_and_snapshots_tell_the_same(path: Path) -> None:
+    with skinware.recording.open(path) as opened:
+        torso = opened["torso"]
+        series, frames = torso.read(), list(torso.frames())
+        assert len(series) == len(frames) == 75
+        n_pressure = int((torso.structure.sensor_type == torso.structure.type("pressure").id).sum())
+        assert series.physical("pressure").shape == (75, n_pressure)
+        assert series.physical("pressure").dtype == np.float32
+        assert opened["arm"].read().physical("pressure").dtype == np.float64
+        for row, frame in enumerate(frames):
+            assert isinstance(frame, skinware.recording.RecordedDriverFrame)
+            for of_series, of_frame in (
+                (series.raw("pressure"), frame.raw("pressure")),
+                (series.physical("temperature"), frame.physical("temperature")),
+                (series.status_of("pressure"), frame.status_of("pressure")),
+                (series.time_ns("pressure"), frame.time_ns("pressure")),
+                (series.fresh("pressure"), frame.fresh("pressure")),
+            ):
+                assert np.array_equal(of_series[row], of_frame)
+            assert (series.sequence[row], series.generation[row]) == (frame.sequence, frame.generation)
+            assert (series.acquired_ns[row], series.published_ns[row]) == (frame.acquired_ns, frame.published_ns)
+            assert frame.age_ns == frame.published_ns - frame.acquired_ns
+        assert (np.diff(series.time_s) > 0).all()
+        assert 0 < series.fresh("pressure").mean() < 1
+
+        snapshots = list(opened.snapshots())
+        assert len(snapshots) == 75 + len(opened["arm"].read())
+        assert snapshots[-1].layout.drivers == ("arm", "torso")
+        both = [snapshot for snapshot in snapshots if len(snapshot.frames) == 2]
+        times_s = np.array([snapshot.time_s for snapshot in snapshots])
+        assert (np.diff(times_s) > -0.05).all()  # across chunks, two drivers may be a look of the recorder apart
+        assert both[-1].raw("pressure").shape[0] == n_pressure + opened["arm"].read().raw("pressure").shape[1]
+        assert both[-1].fresh("pressure").any()
+        assert both[-1].layout is both[-2].layout
+        (only_arm,) = {snapshot.layout.drivers for snapshot in opened.snapshots(["arm"])}
+        assert only_arm == ("arm",)
+
+
+def test_a_part_of_the_time(path: Path) -> None:
+    with skinware.recording.open(path) as opened:
+        whole, part = opened["torso"].read(), opened["torso"].read(start_s=0.4, end_s=0.8)
+        wanted = (whole.time_s >= 0.4) & (whole.time_s < 0.8)
+        assert 5 < wanted.sum() < 70
+        assert np.array_equal(part.column("values"), whole.column("values")[wanted])
+        assert [f.sequence for f in opened["torso"].frames(start_s=0.4, end_s=0.8)] == whole.sequence[wanted].tolist()
+        times = [snapshot.time_s for snapshot in opened.snapshots(start_s=0.4, end_s=0.8)]
+        assert 0.4 <= min(times) <= max(times) < 0.8
+        assert len(opened["torso"].read(start_s=1e6)) == 0
+        assert opened["torso"].read(start_s=1e6).physical("pressure").shape[0] == 0
+
+
+def test_the_tools_of_others_read_it(path: Path) -> None:
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        topics = {channel.topic: channel.id for channel in summary.channels.values()}
+        assert summary.statistics.channel_message_counts[topics["/skin/torso/frame"]] == 75
+        messages = list(reader.iter_messages(topics=["/skin/torso/frame"]))
+        assert [message.sequence for _, _, message in messages] == list(range(1, 76))
+        assert reader.get_header().profile == "skinware"
+
+
+def test_what_there_is_not(path: Path) -> None:
+    with skinware.recording.open(path) as opened:
+        with pytest.raises(ConfigurationError, match=r"no service 'leg' .* there are: arm, pose, torso"):
+            opened["leg"]
+        with pytest.raises(StructureError, match="no sensor type 'force'"):
+            opened["torso"].read().physical("force")
+        with pytest.raises(StructureError, match="'pose' is not a driver"):
+            opened["pose"].read().physical("pressure")
+        with pytest.raises(KeyError, match="no column 'x'; there are values"):
+            opened["torso"].read(["x"])
+        with pytest.raises(KeyError, match="'bus_load' was not read; there are values"):
+            opened["torso"].read().column("bus_load")
+
+
+def test_files_that_are_no_recordings(tmp_path: Path) -> None:
+    def refused(data: bytes | None, words: str) -> None:
+        file = tmp_path / "x.mcap"
+        if data is not None:
+            file.write_bytes(data)
+        with pytest.raises(BadRecording, match=words) as raised:
+            skinware.recording.open(file)
+        assert "\n" not in str(raised.value)
+
+    refused(b"", "empty, so not a recording")
+    refused(b"hello", r"not a recording \(not an MCAP file\)")
+    refused(os.urandom(200_000), r"not a recording \(not an MCAP file\)")
+    with pytest.raises(FileNotFoundError):
+        skinware.recording.open(tmp_path / "nothing.mcap")
+    with pytest.raises(IsADirectoryError):
+        skinware.recording.open(tmp_path)
+    for encoding, words in (("json", "not a recording of a skin"), ("skinware/2", r"newer version \(skinware/2\)")):
+        with (tmp_path / "x.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            channel = writer.register_channel("/skin/torso/frame", encoding, 0)
+            writer.add_message(channel, 1, b"{}", 1)
+            writer.finish()  # type: ignore[no-untyped-call]
+        refused(None, words)
+
+
+def test_an_interrupted_writer_of_nothing_is_an_empty_recording(tmp_path: Path) -> None:
+    file = tmp_path / "x.mcap"
+    file.write_bytes(MAGIC)
+    with skinware.recording.open(file) as opened:
+        assert (opened.services, opened.is_whole, opened.duration_s) == ((), False, 0.0)
+
+
+def test_without_the_packages_it_says_which_extra_is_needed() -> None:
+    code = "import sys; sys.modules['mcap'] = None\nimport skinware.recording"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "pip install 'skinware[record]'" in done.stderr.splitlines()[-1]

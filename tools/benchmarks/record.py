@@ -1,0 +1,221 @@
+"""Recording: what it costs, how large it is, and what a killed recorder leaves; of the recorder as people start it.
+
+tools/bench record [cost|kills|read] [--seconds S] [--kills N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from processes import Processes, answer, own_namespace
+
+import skinware.recording
+from skinware import DriverWriter, Structure
+from skinware.memory.statistics import BUCKETS
+from skinware.realtime import Periodic, now_ns
+from skinware.recording.recovery import recover
+from skinware.sensor_types import PRESSURE
+
+RATE_HZ = 100
+SMALL, LARGE = 768, 30_848
+PER_MODULE, PER_PATCH = 16, 16
+NOISE = 2.0
+SHARE = 0.05
+LEVELS = 20.0
+"""Noise of every sensor, and how far the levels of untouched sensors are apart, counts; share of those that change by
+one in each frame of a quiet skin."""
+BUS_COUNTERS, PATCH_COUNTERS = 12, 8
+
+
+def structure_of(sensors: int) -> Structure:
+    modules = sensors // PER_MODULE
+    patches = -(-modules // PER_PATCH)
+    return Structure(
+        types=[PRESSURE.measured(unit="counts")],
+        buses=["can0"],
+        patch_name=[f"board {n}" for n in range(patches)],
+        patch_bus=[0] * patches,
+        module_patch=np.arange(modules) // PER_PATCH,
+        module_kind=["triangle"] * modules,
+        sensor_uid=np.arange(sensors),
+        sensor_type=[PRESSURE.id] * sensors,
+        sensor_module=np.arange(sensors) // PER_MODULE,
+        dtype="u2",
+    )
+
+
+def drive(pipe: Connection, namespace: str, sensors: int, pattern: str) -> None:
+    """Publish a skin at 100 Hz until the other end says enough; then how many frames."""
+    structure = structure_of(sensors)
+    generator = np.random.default_rng(1)
+    level = np.round(generator.normal(2100, LEVELS, sensors)).astype(np.int64)
+    noise = np.round(generator.normal(0, NOISE, (64, sensors))).astype(np.int64)
+    place = np.arange(sensors)
+    names = [f"counter {n}" for n in range(max(BUS_COUNTERS, PATCH_COUNTERS))]
+    with DriverWriter(
+        "large",
+        structure,
+        namespace=namespace,
+        rate_hz=RATE_HZ,
+        bus_counters=names[:BUS_COUNTERS],
+        patch_counters=names[:PATCH_COUNTERS],
+    ) as writer:
+        first = writer.begin()
+        for column in first.values():
+            column[:] = 0
+        writer.commit(now_ns())
+        pipe.send("ready")
+        timer, number = Periodic(RATE_HZ), 0
+        values: npt.NDArray[np.int64] = level
+        while not pipe.poll():
+            timer.wait()
+            number += 1
+            columns = writer.begin(from_last=True)
+            if pattern == "analogue":
+                touch = 400 * np.exp(-(((place - number * 20 % sensors) / 60.0) ** 2))
+                values = level + noise[generator.integers(64)] + touch.astype(np.int64)
+            else:
+                values = values + (generator.random(sensors) < SHARE) * generator.choice((-1, 1), sensors)
+            columns["values"][:] = values
+            time_ns = now_ns()
+            patch_ns = generator.integers(0, 5_000_000, structure.n_patches)
+            columns["module_time_ns"][:] = (
+                time_ns - patch_ns[structure.module_patch] - place[: structure.n_modules] % 16 * 1000
+            )
+            columns["bus_counters"][:] += 500
+            columns["patch_counters"].reshape(-1, PATCH_COUNTERS)[:, :2] += 16
+            for counts, of_patches in (("patch_interval_counts", 24), ("patch_age_counts", 20)):
+                columns[counts].reshape(-1, BUCKETS)[:, of_patches] += np.uint64(16)
+            writer.commit(time_ns)
+        pipe.send((writer.sequence, timer.missed))
+
+
+@contextmanager
+def driving(namespace: str, sensors: int, pattern: str) -> Iterator[Connection]:
+    with Processes() as processes:
+        pipe = processes.start(drive, namespace, sensors, pattern)
+        answer(pipe, 30)
+        try:
+            yield pipe
+        finally:
+            pipe.send("enough")
+            answer(pipe, 30)
+
+
+@contextmanager
+def recording(namespace: str, file: Path) -> Iterator[subprocess.Popen[str]]:
+    command = [str(Path(sys.executable).parent / "skin-record"), "-o", str(file), "--namespace", namespace, "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if json.loads(line).get("messages", {}).get("/skin/large/frame"):
+                break
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def cost(seconds: float, folder: Path) -> None:
+    """Processor time, bytes a frame and losses, by skin and pattern."""
+    print(f"{RATE_HZ} Hz, {seconds:g} s each; load {os.getloadavg()[0]:.1f}")
+    for sensors in (LARGE, SMALL):
+        for pattern in ("analogue", "quiet"):
+            with own_namespace() as namespace:
+                file = folder / f"{sensors}-{pattern}.mcap"
+                with driving(namespace.name, sensors, pattern), recording(namespace.name, file) as process:
+                    begin_s, used_s, size = time.monotonic(), cpu_s(process.pid), file.stat().st_size
+                    time.sleep(seconds)
+                    share = (cpu_s(process.pid) - used_s) / (time.monotonic() - begin_s)
+                    process.send_signal(signal.SIGINT)
+                    assert process.stdout is not None
+                    told = json.loads(process.stdout.read().splitlines()[-1])
+            frames = told["messages"]["/skin/large/frame"]
+            kb = told["bytes"] / frames / 1e3
+            print(
+                f"  {sensors:6} sensors, {pattern:<8}  {100 * share:5.1f} % of a core  {kb:6.2f} kB a frame"
+                f"  {frames} frames, {told['lost']} lost  (file grew from {size / 1e6:.1f} MB)",
+                flush=True,
+            )
+            read(file)
+
+
+def read(file: Path) -> None:
+    """How fast a recording is read, and made whole."""
+    begin_s = time.perf_counter()
+    with skinware.recording.open(file) as opened:
+        series = opened["large"].read(["values"])
+        columns_s = time.perf_counter() - begin_s
+        begin_s, frames = time.perf_counter(), sum(1 for _ in opened["large"].frames())
+        frames_s = time.perf_counter() - begin_s
+    begin_s = time.perf_counter()
+    recover(file, file.with_suffix(".whole.mcap"))
+    recover_s = time.perf_counter() - begin_s
+    raw_mb = len(series) * series.column("values").shape[1] * 3.5 / 1e6
+    print(
+        f"         read: values of all frames {1e3 * columns_s / len(series):.2f} ms a frame, as frames"
+        f" {1e3 * frames_s / frames:.2f}; made whole at {raw_mb / recover_s:.0f} MB/s of raw frames",
+        flush=True,
+    )
+
+
+def kills(count: int, folder: Path) -> None:
+    """What is missing at the end of a recording whose recorder was killed at a random moment."""
+    for sensors in (LARGE, SMALL):
+        missing: list[float] = []
+        with own_namespace() as namespace, driving(namespace.name, sensors, "analogue"):
+            for number in range(count):
+                file = folder / f"killed-{sensors}-{number}.mcap"
+                with recording(namespace.name, file) as process:
+                    time.sleep(random.uniform(0, 1.0))
+                    killed_ns = now_ns()
+                    process.kill()
+                    process.wait()
+                whole = file.with_suffix(".whole.mcap")
+                recover(file, whole)
+                with skinware.recording.open(whole) as opened:
+                    last_ns = int(opened["large"].read(["status"]).published_ns[-1])
+                missing.append((killed_ns - last_ns) / 1e9)
+                file.unlink()
+                whole.unlink()
+        p50, most = np.median(missing), max(missing)
+        print(f"  {sensors:6} sensors, {count} kills: missing p50 {p50:.3f} s, most {most:.3f} s", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", nargs="?", choices=["cost", "kills"])
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--kills", type=int, default=50)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        if options.what in (None, "cost"):
+            cost(options.seconds, Path(folder))
+        if options.what in (None, "kills"):
+            kills(options.kills, Path(folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,66 @@
+"""Recordings of every driver's emulated hardware, damaged at random: no crash, and every undamaged chunk is read.
+
+``python tools/fuzzing/recordings.py [NAME ...] [--damages 1000] [--seed N]``. Exit status 1 if it is otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from importlib.metadata import entry_points
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from skinware import Namespace
+from skinware_drivers.registry import DRIVERS
+from tests.commands import running
+from tests.recording.damaging import Original
+
+
+def record(driver: str, file: Path) -> None:
+    """Two seconds of a driver on the bus `virtual`."""
+    with running("skin-driver", "--driver", driver, "--bus", "virtual") as source:
+        source.wait_for("ready")
+        with running("skin-record", "-o", str(file), "-T", "2") as recorder:
+            recorder.wait_for("stopped")
+
+
+def main() -> None:
+    ours = sorted(e.name for e in entry_points(group=DRIVERS) if e.value.startswith("skinware_drivers."))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", default=ours, help="drivers; default: all that ship")
+    parser.add_argument("--damages", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=time.time_ns())
+    options = parser.parse_args()
+    os.environ["SKINWARE_NAMESPACE"] = f"damage-{os.getpid()}"
+    failed = 0
+    try:
+        for name in options.names:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "skin.mcap"
+                record(name, file)
+                original, generator, read, worst = Original(file), random.Random(options.seed), 0, 1.0
+                for number in range(options.damages):
+                    try:
+                        found = original.check(generator, Path(folder) / "damaged.mcap")
+                    except Exception as error:  # noqa: BLE001, a crash is what is sought
+                        failed += 1
+                        print(f"{name}, damage {number} of seed {options.seed}: {type(error).__name__}: {error}")
+                        continue
+                    read += found
+                    worst = min(worst, found / len(original.frames))
+                share = read / (options.damages * len(original.frames))
+                print(f"{name}: {len(original.frames)} frames, {100 * share:.1f} % read, at worst {100 * worst:.1f} %")
+    finally:
+        shutil.rmtree(Namespace().path, ignore_errors=True)
+    sys.exit(failed > 0)
+
+
+if __name__ == "__main__":
+    main()

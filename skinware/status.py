@@ -22,6 +22,8 @@ class Status(enum.IntFlag):
     """Switched off by configuration."""
     SUSPECT = 64
     """Some event makes the value doubtful (for example, the hardware moved its own baseline)."""
+    UNHEALTHY = 128
+    """What the sensor has shown for minutes makes the value doubtful (stuck, noisy, dead ...): told by skin-calm."""
 
 
 class PatchState(enum.IntEnum):

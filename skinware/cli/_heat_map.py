@@ -19,7 +19,7 @@ from skinware.status import Status
 from skinware.structure import Structure
 
 LEVELS = 16
-FRESH, STALE, OUT_OF_RANGE, SUSPECT, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(9)
+FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(10)
 FIRST_WITHOUT_VALUE = NO_ACK
 """From this mark on, the level means nothing and is not drawn. ``UNMOVED``: never moved in a wipe test."""
 BACKGROUND = 255
@@ -49,6 +49,7 @@ _MARK_BITS = (
     (NO_ACK, Status.NO_ACK),
     (STALE, Status.STALE),
     (SUSPECT, Status.SUSPECT),
+    (UNHEALTHY, Status.UNHEALTHY),
     (OUT_OF_RANGE, Status.OUT_OF_RANGE),
 )
 """Which mark wins where a sensor has several bits: the first."""
@@ -57,7 +58,6 @@ _MARK_BITS = (
 def marks_of(status: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """(n,) uint8: the one mark that each sensor is drawn with."""
     marks = np.full(len(status), FRESH, np.uint8)
-    marks[status != 0] = SUSPECT  # a bit that this version does not know
     for mark, bit in reversed(_MARK_BITS):
         marks[(status & np.uint8(bit)) != 0] = mark
     return marks

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     epilog=examples(
         "skin-calm torso                        skin-top --namespace calm shows it",
         "skin-calm torso --config chain.toml    with a filter, or in N",
+        "skin-calm torso --regions parts.toml   and where to what touches its parts moves",
         "skin-calm torso --into quiet           into another namespace",
     ),
 )
@@ -58,6 +59,22 @@ if TYPE_CHECKING:
     show_default=True,
     help="Name of the service of its contacts, beside it; empty: none.",
 )
+@click.option(
+    "--regions",
+    "region_files",
+    multiple=True,
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="File with regions, whose motion is published beside the contacts; repeat it for several.",
+)
+@click.option("--motion", metavar="NAME", default="motion", show_default=True, help="Name of the service of motion.")
+@click.option(
+    "--health",
+    metavar="NAME",
+    default="health",
+    show_default=True,
+    help="Name of the service of its sensors' health, beside it; empty: none, and no sensor is marked.",
+)
 @click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 @namespace_option
 @json_option
@@ -69,6 +86,9 @@ def command(
     config: Path | None,
     state_path: Path | None,
     contacts: str,
+    region_files: tuple[Path, ...],
+    motion: str,
+    health: str,
     group: str | None,
     namespace: str | None,
     as_json: bool,
@@ -78,21 +98,24 @@ def command(
 
     The first seconds it measures what untouched sensors read. It goes on when the driver restarts or changes; what it
     learned is kept for 10 minutes over a restart of its own. Programs may ask it to tare, hold and change settings.
-    Beside the driver it publishes its contacts, of pressure sensors if there are any.
+    Beside the driver it publishes its contacts, of pressure sensors if there are any, and the health of its sensors:
+    stuck, noisy, clipped, dead and weak ones have the status UNHEALTHY (skin-info --health tells why).
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
     from skinware.memory.namespace import Namespace, check_name
+    from skinware.tactile.calm_contacts import WatchedRegions
     from skinware.tactile.calm_service import CalmService
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.chain_state import default_path
+    from skinware.tactile.region_files import read_regions
 
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="skin-calm: %(message)s", stream=sys.stderr
     )
     check_name(name, "driver")
-    if contacts:
-        check_name(contacts, "service")
+    for service_name in filter(None, (contacts, motion, health)):
+        check_name(service_name, "service")
     settings = ChainSettings.calm() if config is None else ChainSettings.read(config)
     source, target = Namespace(namespace), Namespace(into)
     service = CalmService(
@@ -103,6 +126,8 @@ def command(
         group=group,
         state_path=state_path or default_path(target.name, name),
         contacts=contacts or None,
+        watched=WatchedRegions(read_regions(*region_files), motion) if region_files else None,
+        health=health or None,
         on_ready=lambda: _tell_ready(service, as_json),
     )
     if name not in source.services():
@@ -133,12 +158,12 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         return
     structure = chain.structure
     units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
-    contacts = service.contacts.name if service.contacts is not None and service.contacts.type_name else ""
+    beside = _services_beside(service)
     if as_json:
         ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
         types = {t.name: int((structure.sensor_type == t.id).sum()) for t in structure.types}
-        where = {"namespace": service.namespace.name, "into": service.into.name, "contacts": contacts}
+        where = {"namespace": service.namespace.name, "into": service.into.name, **beside}
         stages = [{"type": name, "stage": stage.name} for name, of_type in chain.stages.items() for stage in of_type]
         print_json(
             {**ready, **counts, "types": types, "units": units, **where, "stages": stages, "restored": service.restored}
@@ -149,8 +174,19 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
         ]
         restored = f"; goes on with {service.restored} baselines" if service.restored else ""
         click.echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
-        beside = f" and the service {contacts!r}" if contacts else ""
-        click.echo(f"publishing it{beside} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+        there = ", ".join(filter(None, beside.values()))
+        there = f" and, beside it, {there}" if there else ""
+        click.echo(f"publishing it{there} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+
+
+def _services_beside(service: CalmService) -> dict[str, str]:
+    """Names of the services of contacts, motion and health; empty: there is none."""
+    contacts, health = service.contacts, service.health
+    return {
+        "contacts": contacts.name if contacts is not None and contacts.type_name else "",
+        "motion": contacts.motion_name if contacts is not None else "",
+        "health": health.name if health is not None else "",
+    }
 
 
 def _tell_status(service: CalmService) -> None:

@@ -58,18 +58,24 @@ _LIFE_COLOURS = {
     epilog=examples(
         "skin-info                       everything in this namespace",
         "skin-info roboskin --sensors    every sensor of one driver, in frame order",
+        "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm finds them",
         "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
     ),
 )
 @click.argument("name", required=False)
 @click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
 @click.option(
+    "--health",
+    is_flag=True,
+    help="List sensors that are stuck, noisy, clipped, dead or weak, here and in the namespace calm.",
+)
+@click.option(
     "--watch", is_flag=True, help="Update every second; many patches share a line where the terminal is too low."
 )
 @namespace_option
 @json_option
 @version_option
-def command(name: str | None, sensors: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
+def command(name: str | None, sensors: bool, health: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
     """Show all drivers with their buses and patches, other services, and their readers.
 
     With NAME: only that driver or service.
@@ -77,7 +83,13 @@ def command(name: str | None, sensors: bool, watch: bool, namespace: str | None,
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
-    if sensors:
+    if health:
+        from skinware.cli._sensor_health import show
+
+        if sensors or watch:
+            raise click.UsageError("--health stands alone: without --sensors and --watch")
+        show([place] if namespace else [place, Namespace("calm")], name, as_json)
+    elif sensors:
         if name is None:
             raise click.UsageError("--sensors lists one driver: give its NAME")
         _show_sensors(place, name, as_json)

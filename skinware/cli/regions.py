@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import select
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,17 +22,12 @@ from skinware.cli._command import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import numpy as np
     import numpy.typing as npt
 
     from skinware.driver_service import DriverFrame, DriverReader
-    from skinware.memory.namespace import Namespace
 
 _TELL_EVERY_S = 1.0
-_WAIT_S = 0.1
-_SILENT_S = 5.0
 
 
 @click.group("skin-regions", context_settings=CONTEXT_SETTINGS)
@@ -112,6 +106,7 @@ def paint(
 
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
+    from skinware.cli._driver_frames import reader_of
     from skinware.memory.namespace import Namespace
     from skinware.tactile.region_files import put_region
     from skinware.tactile.regions import Region
@@ -119,7 +114,7 @@ def paint(
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
     _refuse_early(file, name, force)
-    with _reader(Namespace(namespace), driver) as reader:
+    with reader_of(Namespace(namespace), driver, "--driver") as reader:
         painter = _Painter(reader, type_name, as_json)
         stroked, in_region = painter.paint(duration_s)
         uid = reader.structure.sensor_uid[reader.structure.index(painter.type_name)][in_region]
@@ -143,23 +138,6 @@ def _refuse_early(file: Path, name: str, force: bool) -> None:
         raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
 
 
-def _reader(namespace: Namespace, driver: str | None) -> DriverReader:
-    """Of the driver, or of the only one that runs."""
-    from skinware.driver_service import DriverReader
-    from skinware.errors import ConfigurationError, ServiceNotFound
-    from skinware.skin import Skin
-
-    if driver is None:
-        with Skin(namespace) as skin:
-            drivers = skin.refresh().drivers
-        if not drivers:
-            raise ServiceNotFound(f"no driver runs in namespace {namespace.name!r}")
-        if len(drivers) > 1:
-            raise ConfigurationError(f"several drivers run: choose one with --driver: {', '.join(drivers)}")
-        driver = drivers[0]
-    return DriverReader(driver, namespace=namespace)
-
-
 class _Painter:
     """Gathers what is touched.
 
@@ -176,25 +154,25 @@ class _Painter:
         self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
         self._index = reader.structure.index(self.type_name)
         self._rest = Rest(reader.structure)
-        self._newest: DriverFrame | None = None
 
     def paint(self, duration_s: float | None) -> tuple[int, npt.NDArray[np.bool_]]:
         """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
         import numpy as np
 
+        from skinware.cli._driver_frames import after, frames_until
         from skinware.cli._rest import SETTLING_S
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.painting import without_holes
 
-        for frame in self._frames(SETTLING_S):
+        for frame in frames_until(self._reader, after(SETTLING_S)):
             self._touched(frame)
         stroked = np.zeros(len(self._reader.structure.module_of(self.type_name)), bool)
         self._say("ready", f"stroke the region{' and press Enter' if duration_s is None else ''}", stroked)
-        tell_s = time.monotonic() + _TELL_EVERY_S
-        for frame in self._frames(duration_s):
+        is_due = after(_TELL_EVERY_S)
+        for frame in frames_until(self._reader, _enter_pressed if duration_s is None else after(duration_s)):
             stroked |= self._touched(frame)
-            if time.monotonic() >= tell_s:
-                tell_s += _TELL_EVERY_S
+            if is_due():
+                is_due = after(_TELL_EVERY_S)
                 self._say("painting", f"{stroked.sum()} sensors", stroked)
         geometry = self._reader.structure.geometry
         if geometry is None:
@@ -215,31 +193,20 @@ class _Painter:
         touched: npt.NDArray[np.bool_] = fresh[self._index] & (change > threshold(self._rest.noise(self.type_name)))
         return touched
 
-    def _frames(self, duration_s: float | None) -> Iterator[DriverFrame]:
-        """Frames until the end of the time, or Enter."""
-        from skinware.errors import ServiceTimeout
-
-        end_s = None if duration_s is None else time.monotonic() + duration_s
-        heard_s = time.monotonic()
-        while end_s is None or time.monotonic() < end_s:
-            if end_s is None and select.select([sys.stdin], [], [], 0)[0]:
-                sys.stdin.readline()
-                return
-            try:
-                self._newest = self._reader.read(newer_than=self._newest, timeout_s=_WAIT_S)
-            except ServiceTimeout:
-                if time.monotonic() - heard_s > _SILENT_S:
-                    raise
-                continue
-            heard_s = time.monotonic()
-            yield self._newest
-
     def _say(self, event: str, text: str, stroked: npt.NDArray[np.bool_]) -> None:
         if self._as_json:
             told = {"driver": self._reader.name, "type": self.type_name}
             print_json({"event": event, **(told if event == "ready" else {}), "touched": int(stroked.sum())})
         else:
             click.echo(text)
+
+
+def _enter_pressed() -> bool:
+    """Whether somebody has pressed Enter; takes the line."""
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True
 
 
 def main() -> None:

@@ -106,6 +106,7 @@ typedef enum skinware_result {
 #define SKINWARE_STATUS_NOT_CONNECTED 16u /* the hardware says that no transducer is connected */
 #define SKINWARE_STATUS_MASKED 32u        /* switched off by configuration */
 #define SKINWARE_STATUS_SUSPECT 64u       /* something happened that makes the value doubtful */
+#define SKINWARE_STATUS_UNHEALTHY 128u    /* stuck, noisy, dead ... for minutes: the value is doubtful */
 
 /* What a bus is doing (column "bus_state" of a driver). Treat an unknown state as "not live". */
 #define SKINWARE_BUS_CONNECTING 0u

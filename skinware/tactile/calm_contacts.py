@@ -1,8 +1,9 @@
-"""Contacts beside a calmed driver: found in what comes out of its chain, and published in the same namespace."""
+"""Contacts beside a calmed driver, and the motion of its regions: found in what comes out of its chain."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +14,25 @@ from skinware.structure import Structure
 from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE
 from skinware.tactile.chain import BaselineStage, Chain
 from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.motion_service import NAME, MotionWriter
+from skinware.tactile.regions import Regions
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
 _FIRST_CHOICE = "pressure"
+
+
+@dataclass(frozen=True)
+class WatchedRegions:
+    """Regions whose motion is published.
+
+    Attributes:
+        regions: them.
+        name: of the service.
+    """
+
+    regions: Regions
+    name: str = NAME
 
 
 class CalmContacts:
@@ -27,6 +43,7 @@ class CalmContacts:
         driver: name of the driver.
         into: namespace of the calmed driver.
         group: whose members may read it.
+        watched: regions whose motion is published beside it; None: none.
 
     Attributes:
         type_name: sensors whose contacts are published; empty: none, for the driver has no such sensors, or another
@@ -34,12 +51,26 @@ class CalmContacts:
         count: number of contacts in the newest frame.
     """
 
-    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        driver: str,
+        into: Namespace,
+        group: str | None = None,
+        watched: WatchedRegions | None = None,
+    ) -> None:
         self.name, self.type_name, self.count = name, "", 0
+        self._watched = watched
         self._driver, self._into, self._group = driver, into, group
         self._chain: Chain | None = None
         self._stage: BaselineStage | None = None
         self._writer: ContactsWriter | None = None
+        self._motion: MotionWriter | None = None
+
+    @property
+    def motion_name(self) -> str:
+        """Name of the service of motion; empty: there is none."""
+        return "" if self._motion is None else self._motion.name
 
     def follow(self, chain: Chain, rate_hz: float | None) -> None:
         """Go on with another chain, of other sensors.
@@ -65,6 +96,7 @@ class CalmContacts:
         except (ConfigurationError, NameInUse) as error:  # places without neighbours; another program's contacts
             self._give_up(error)
         self.type_name = type_name if self._writer is not None else ""
+        self._follow_regions(chain.structure, rate_hz)
 
     def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
         """Find the contacts of the next frame, and publish them.
@@ -79,9 +111,13 @@ class CalmContacts:
         index = self._chain.structure.index(self.type_name)
         usable = (status[index] & UNUSABLE) == 0
         try:
-            self.count = len(self._writer.publish(values[index], self._stage.touched & usable, acquired_ns))
+            found = self._writer.publish(values[index], self._stage.touched & usable, acquired_ns)
+            if self._motion is not None:
+                self._motion.publish(found, values[index], acquired_ns)
         except NameInUse as error:
             self._give_up(error)
+        else:
+            self.count = len(found)
 
     def publish_none(self, time_ns: int) -> None:
         """Say that nothing is touched: the driver is dead."""
@@ -90,10 +126,12 @@ class CalmContacts:
             self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
 
     def close(self) -> None:
-        """Withdraw the service. Idempotent."""
-        if self._writer is not None:
-            self._writer.close()
-        self._writer, self.type_name, self.count = None, "", 0
+        """Withdraw the services. Idempotent."""
+        for writer in (self._motion, self._writer):
+            if writer is not None:
+                writer.close()
+        self._motion = self._writer = None
+        self.type_name, self.count = "", 0
 
     def _made(self, structure: Structure, type_name: str, rate_hz: float | None) -> ContactsWriter:
         return ContactsWriter(
@@ -106,10 +144,32 @@ class CalmContacts:
             group=self._group,
         )
 
+    def _follow_regions(self, structure: Structure, rate_hz: float | None) -> None:
+        """Publish the motion of the regions of another structure."""
+        if self._motion is not None:
+            self._motion.close()
+            self._motion = None
+        if self._watched is None or self._writer is None:
+            return
+        try:
+            self._motion = MotionWriter(
+                structure,
+                self.type_name,
+                self._watched.regions,
+                self._writer.frames,
+                driver=self._driver,
+                name=self._watched.name,
+                namespace=self._into,
+                rate_hz=rate_hz,
+                group=self._group,
+            )
+        except (ConfigurationError, NameInUse) as error:  # no region of such sensors; another program's motion
+            log.warning("no motion of %r: %s", self._driver, str(error))
+
     def _give_up(self, error: Exception) -> None:
         """Calm values are worth more than contacts: go on without these."""
         self.close()
         log.warning("no contacts of %r: %s", self._driver, str(error))
 
 
-__all__ = ["CalmContacts"]
+__all__ = ["CalmContacts", "WatchedRegions"]

@@ -29,10 +29,11 @@ from skinware.service import Request
 from skinware.service.messages import ACQUIRE
 from skinware.status import PatchState, Status
 from skinware.structure import Structure
+from skinware.tactile import contacts_service, health_service
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.calm_contacts import CalmContacts
+from skinware.tactile.calm_contacts import CalmContacts, WatchedRegions
+from skinware.tactile.calm_health import CalmHealth
 from skinware.tactile.chain import Chain, ChainSettings
-from skinware.tactile.contacts_service import NAME
 from skinware.tactile.learned_state import LearnedState
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -55,12 +56,15 @@ class CalmService:
         group: whose members may read it.
         state_path: file for what was learned; None: it is not kept.
         contacts: name of the service of its contacts, in the namespace of the calmed driver; None: there is none.
+        watched: regions whose motion is published beside the contacts; None: none.
+        health: name of the service of its sensors' health, likewise; None: nobody looks after it.
         on_ready: called when the first frame was published, and whenever the structure is another.
 
     Attributes:
         frames: that were taken.
         restored: sensors that went on with what the file had.
         contacts: of what touches it; None: they are not wanted.
+        health: of its sensors; None: it is not wanted.
 
     Raises:
         ConfigurationError: both namespaces are the same, or a bad name.
@@ -75,7 +79,9 @@ class CalmService:
         into: Namespace | str = "calm",
         group: str | None = None,
         state_path: Path | None = None,
-        contacts: str | None = NAME,
+        contacts: str | None = contacts_service.NAME,
+        watched: WatchedRegions | None = None,
+        health: str | None = health_service.NAME,
         on_ready: Callable[[], object] = lambda: None,
     ) -> None:
         self.name = name
@@ -85,7 +91,10 @@ class CalmService:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
         self.restored = 0
-        self.contacts: CalmContacts | None = CalmContacts(contacts, name, self.into, group) if contacts else None
+        self.contacts: CalmContacts | None = (
+            CalmContacts(contacts, name, self.into, group, watched) if contacts else None
+        )
+        self.health: CalmHealth | None = CalmHealth(health, name, self.into, group) if health else None
         self._settings = settings or ChainSettings.calm()
         self._group, self._on_ready = group, on_ready
         self._learned = LearnedState(state_path)
@@ -163,7 +172,7 @@ class CalmService:
                     report()
         finally:
             self._learned.close(self._chain)
-            for end in (self.contacts, self._writer, self._reader):
+            for end in (self.contacts, self.health, self._writer, self._reader):
                 if end is not None:
                     end.close()
 
@@ -184,6 +193,7 @@ class CalmService:
             "refused": {name: baseline.refused_share for name, baseline in baselines.items()},
             "touched": dict(self._touched),
             "contacts": 0 if self.contacts is None else self.contacts.count,
+            "faulty": 0 if self.health is None else self.health.faulty,
         }
 
     @property
@@ -254,6 +264,8 @@ class CalmService:
         except Paused:
             return
         chain.step(frame, columns["values"], columns["status"])
+        if self.health is not None:
+            self.health.step(columns["status"], frame.acquired_ns)
         for name in self._copied:
             columns[name][:] = frame.column(name)
         self._touched = {
@@ -329,6 +341,8 @@ class CalmService:
         own = set(self._writer.column_offsets()) - {"values", "status"}
         if self.contacts is not None:
             self.contacts.follow(chain, rate_hz)
+        if self.health is not None:
+            self.health.follow(chain)
         self._copied = sorted(own & set(self._reader.schema.columns))
         self._not_told = sorted(own - set(self._copied))
         self._chain, self._counters, self._is_ready = chain, counters, False

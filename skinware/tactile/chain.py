@@ -41,7 +41,7 @@ from skinware.driver_frame import DriverFrame
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE, Baseline
+from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE, Baseline, Calm
 from skinware.tactile.baseline_settings import BaselineSettings
 from skinware.tactile.curves import CurveTable, read_curves
 from skinware.tactile.stages import (
@@ -90,12 +90,15 @@ class BaselineStage(Stage):
 
     Attributes:
         baseline: it.
-        touched: (n,) bool, which taxels are, in the newest frame.
+        before: the taxels as it gets them.
+        given: (n,) float32, the values that it got with the newest frame.
+        calm: what it made of them; None before the first frame.
     """
 
     name = "baseline"
 
     def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
+        self.before = taxels
         before = taxels.type
         signed = before.name.startswith(SIGNED_TYPES)
         span = before.maximum - before.minimum
@@ -103,12 +106,19 @@ class BaselineStage(Stage):
             taxels, type=replace(before, minimum=-span if signed else 0.0, maximum=span), resolution=0.0
         )
         self.baseline = Baseline(taxels.module, taxels.patch, settings, resolution=taxels.resolution, signed=signed)
-        self.touched: npt.NDArray[np.bool_] = np.zeros(len(taxels), bool)
+        self.given: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self.calm: Calm | None = None
+
+    @property
+    def touched(self) -> npt.NDArray[np.bool_]:
+        """(n,) bool, which taxels are, in the newest frame."""
+        return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 
     def step(self, signal: Signal) -> None:
         """See :class:`Stage`."""
-        calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
-        signal.values, self.touched = calm.value, calm.touched
+        self.given = signal.values
+        self.calm = calm = self.baseline.update(signal.time_ns, signal.values, signal.usable, jumped=signal.jumped)
+        signal.values = calm.value
         signal.forced |= calm.forced
         signal.unknown |= np.isnan(calm.baseline)
 

@@ -198,6 +198,11 @@ class ContactsWriter:
         """Name of the service."""
         return self._service.name
 
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Names of the coordinate frames that contacts are in."""
+        return self._contacts.frames
+
     def publish(self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 

@@ -43,7 +43,8 @@ def test_the_worst_that_is_known_of_a_sensor_is_shown() -> None:
             Status.MASKED | Status.NO_ACK,
             Status.NEVER_SEEN | Status.STALE,
             Status.NOT_CONNECTED | Status.NEVER_SEEN,
-            128,
+            Status.UNHEALTHY | Status.OUT_OF_RANGE,
+            Status.UNHEALTHY | Status.SUSPECT,
         ],
         np.uint8,
     )
@@ -57,7 +58,8 @@ def test_the_worst_that_is_known_of_a_sensor_is_shown() -> None:
         heat.MASKED,
         heat.NEVER_SEEN,
         heat.NOT_CONNECTED,
-        heat.SUSPECT,  # a bit that only a later version knows
+        heat.UNHEALTHY,
+        heat.SUSPECT,
     ]
 
 

@@ -35,6 +35,7 @@ from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.cli.test_contacts import touched_skin
 from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
+from tests.cli.test_sensor_health import looked_after
 from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device
@@ -175,6 +176,7 @@ def test_a_driver_and_those_that_look_at_it(
             check("`ready` of a calmed driver", calm.wait_for("ready"))
             status = calm.wait_for("status", lambda status: bool(status["touched"]))
             check("`status`, `stopped` of a calmed driver", status, calm.stop())
+        check("`skin-wipe`", *wiping())
         check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
         status = driver.wait_for("status")
         check("`status`, `stopped`", status, driver.stop())
@@ -231,6 +233,19 @@ def test_robots_files(printing: Print, tmp_path: Path) -> None:
     (tmp_path / "torso.txt").write_text(positions([TRIANGLE] * 32))
     text = printing(import_, "icub", str(tmp_path))
     check("`skin-import icub`", *text, *printing(import_, "icub", str(tmp_path), "-o", str(tmp_path / "out")))
+
+
+def wiping() -> list[Any]:
+    """What is told of a wipe that ends before everything was touched."""
+    with running("skin-wipe", "roboskin", "-T", "1.5") as wipe:
+        told = [wipe.wait_for(event) for event in ("ready", "wiping", "done")]
+        wipe.stop()
+    return told
+
+
+def test_health(printing: Print, namespace: Namespace) -> None:
+    with looked_after(namespace):
+        check("`skin-info --health`", *printing(info, "--health"))
 
 
 def test_regions(printing: Print, tmp_path: Path) -> None:

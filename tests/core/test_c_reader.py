@@ -6,6 +6,7 @@ import json
 import math
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -17,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware import DriverReader, DriverWriter, ServiceWriter, get_include
+from skinware import DriverReader, DriverWriter, ServiceWriter, Status, get_include
 from tests.compiling import LANGUAGES, compiled
 from tests.core.c_programs import SOURCE, Talk, ended, run, structure, write_flat_out
 from tests.core.workers import PROCESSES, running
@@ -45,6 +46,12 @@ def test_the_header_needs_nothing_and_warns_of_nothing(
     command = [LANGUAGES[language][0], f"-std={standard}", *options, f"-I{get_include()}"]
     subprocess.run([*command, str(user), str(implementation), "-o", str(tmp_path / "user")], check=True)
     subprocess.run([str(tmp_path / "user")], check=True)
+
+
+def test_the_header_has_the_bits_of_a_status() -> None:
+    text = Path(get_include(), "skinware.h").read_text()
+    bits = re.findall(r"#define SKINWARE_STATUS_(\w+) (\d+)u ", text)
+    assert {name: int(value) for name, value in bits} == {bit.name: int(bit) for bit in Status}
 
 
 def test_the_header_is_in_the_wheel(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -161,8 +161,8 @@ def test_two_calmed_drivers_need_two_names(into: Namespace, caplog: pytest.LogCa
         with calming(into, "leg", contacts="leg_contacts"):
             with ContactsReader("leg_contacts", namespace=into, timeout_s=10) as contacts:
                 assert contacts.source.driver == "leg"
-        with calming(into, "leg", contacts=None):
-            assert sorted(into.services()) == ["arm", "contacts", "leg"]
+        with calming(into, "leg", contacts=None, health=None):
+            assert sorted(into.services()) == ["arm", "contacts", "health", "leg"]
 
 
 def test_a_driver_that_feels_no_pressure_has_no_contacts(into: Namespace) -> None:
@@ -186,7 +186,7 @@ def test_the_command_tells_of_its_contacts(into: Namespace, tmp_path: Path, monk
             assert command.wait_for("status")["contacts"] == 0
         with running("skin-calm", "fake", "--into", into.name, "--contacts", "") as command:
             assert command.wait_for("ready")["contacts"] == ""
-            assert into.services() == ["fake"]
+            assert sorted(into.services()) == ["fake", "health"]
         with ContactsWriter(skin.structure, namespace=into, name="mine"):
             with running("skin-calm", "fake", "--into", into.name, "--contacts", "mine") as command:
                 assert command.wait_for("ready")["contacts"] == ""

@@ -2,6 +2,8 @@
 
 * speed: one frame of 30,848 taxels, for some patterns of touch; the rule of the iCub takes the same frames in turns.
 * contacts: one frame of as many taxels through contacts, alone and after a baseline (contacts.py).
+* health: what is found of planted faults, and what it costs beside the baseline (health.py).
+* motion: how well strokes of known speed and direction are told (motion.py).
 * service: ``skin-calm`` on a driver of 30,848 taxels with places at 50 Hz: processor time of its whole process, which
   publishes contacts too.
 * worlds: 25 minutes of drift and touches (``bench_world``), many worlds for each drift and rate.
@@ -21,6 +23,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import contacts
+import health
+import motion
 import numpy as np
 import numpy.typing as npt
 from processes import Processes, answer
@@ -37,6 +41,7 @@ TAXELS = 30_848
 RATE_HZ = 50
 MODULE, PATCH = np.arange(TAXELS) // 12, np.arange(TAXELS) // 192
 WARM_UP, FRAMES = 400, 1000
+PARTS = ("speed", "contacts", "health", "motion", "service", "worlds")
 
 
 def blobs(random: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -181,16 +186,21 @@ def line(marks: Marks) -> str:
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", nargs="*", choices=["speed", "contacts", "service", "worlds", []], help="default: all")
+    parser.add_argument("part", nargs="*", choices=(*PARTS, []), help="default: all")
     parser.add_argument("--worlds", type=int, default=20, help="of each drift, at each rate")
     parser.add_argument("--rates", default="20,50,100", help="Hz")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the service is measured")
     arguments = parser.parse_args()
-    parts = arguments.part or ["speed", "contacts", "service", "worlds"]
+    parts = arguments.part or PARTS
     if "speed" in parts:
         speed()
     if "contacts" in parts:
         contacts.speed()
+    if "health" in parts:
+        health.speed()
+        health.found()
+    if "motion" in parts:
+        motion.main()
     if "service" in parts:
         service(arguments.seconds)
     if "worlds" in parts:

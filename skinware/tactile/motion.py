@@ -1,0 +1,136 @@
+"""Motion of regions: where to and how fast what touches each of them goes.
+
+A contact has a velocity of its own (:mod:`skinware.tactile.contacts`). That of a region is the mean of those of its
+contacts, each weighted by the load that it has there: a finger that comes or goes moves nothing, as it would move the
+centre of all load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware._columns import Index
+from skinware.tactile.contacts import ContactSet
+
+
+@dataclass(frozen=True, eq=False)
+class RegionMotion:
+    """What moves over one region.
+
+    Attributes:
+        name: of the region.
+        load: sum of the values of its touched taxels, in the unit of the values.
+        contacts: number of contacts that reach into it.
+        velocity_m_s: (3,) m/s; NaN where nothing touches it, or no places are known.
+        speed_m_s: length of it, m/s.
+        frame: name of the coordinate frame, empty if it is not known.
+    """
+
+    name: str
+    load: float
+    contacts: int
+    velocity_m_s: npt.NDArray[np.float32]
+    speed_m_s: float
+    frame: str
+
+    @property
+    def direction(self) -> npt.NDArray[np.float32]:
+        """(3,) of length 1; NaN where nothing moves."""
+        length = np.float32(self.speed_m_s if self.speed_m_s > 0 else np.nan)
+        return self.velocity_m_s / length
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSet:
+    """Motion of all r regions in one frame; a sequence of :class:`RegionMotion`.
+
+    Attributes:
+        names: of the regions.
+        load: (r,) float32.
+        contacts: (r,) uint32.
+        velocity_m_s: (r, 3) float32.
+        speed_m_s: (r,) float32.
+        frame: (r,) int16, index into ``frames``; -1 if it is not known.
+        frames: names of the coordinate frames.
+    """
+
+    names: tuple[str, ...]
+    load: npt.NDArray[np.float32]
+    contacts: npt.NDArray[np.uint32]
+    velocity_m_s: npt.NDArray[np.float32]
+    speed_m_s: npt.NDArray[np.float32]
+    frame: npt.NDArray[np.int16]
+    frames: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, row: int) -> RegionMotion:
+        row = range(len(self))[row]
+        frame = int(self.frame[row])
+        return RegionMotion(
+            self.names[row],
+            self.load[row].item(),
+            self.contacts[row].item(),
+            self.velocity_m_s[row],
+            self.speed_m_s[row].item(),
+            self.frames[frame] if frame >= 0 else "",
+        )
+
+    def __iter__(self) -> Iterator[RegionMotion]:
+        return (self[row] for row in range(len(self)))
+
+
+COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "load": ("<f4", ()),
+    "contacts": ("<u4", ()),
+    "velocity_m_s": ("<f4", (3,)),
+    "speed_m_s": ("<f4", ()),
+    "frame": ("<i2", ()),
+}
+"""Per region: dtype and shape of each array of a :class:`MotionSet`."""
+
+
+def motion(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
+    """The motion of regions, from the contacts of a frame.
+
+    Contacts in another coordinate frame than that with most of the region's load are left out of its velocity.
+
+    Args:
+        regions: by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
+        contacts: of the frame.
+        value: (n,) calmed values, as for :meth:`.Contacts.update`.
+    """
+    found: dict[str, npt.NDArray[Any]] = {
+        name: np.zeros((len(regions), *shape), dtype) for name, (dtype, shape) in COLUMNS.items()
+    }
+    for row, index in enumerate(regions.values()):
+        contact = contacts.contact_of[index]
+        touched = contact >= 0
+        of_taxel = np.nan_to_num(np.maximum(value[index][touched], 0), posinf=0.0)
+        load = np.bincount(contact[touched], of_taxel, len(contacts)).astype(np.float64)
+        reach = np.bincount(contact[touched], minlength=len(contacts)) > 0
+        velocity, frame = _velocity(contacts, load)
+        found["load"][row], found["contacts"][row] = load.sum(), np.count_nonzero(reach)
+        found["velocity_m_s"][row], found["speed_m_s"][row] = velocity, np.linalg.norm(velocity)
+        found["frame"][row] = frame
+    return MotionSet(names=tuple(regions), frames=contacts.frames, **found)
+
+
+def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], int]:
+    """The mean velocity of contacts, weighted by load, and the number of the coordinate frame it is in."""
+    moving = np.flatnonzero((load > 0) & (contacts.frame >= 0))
+    if not len(moving):
+        return np.full(3, np.nan), -1
+    frame = int(np.argmax(np.bincount(contacts.frame[moving], load[moving])))
+    moving = moving[contacts.frame[moving] == frame]
+    weight = load[moving] / load[moving].sum()
+    return weight @ contacts.velocity_m_s[moving], frame
+
+
+__all__ = ["COLUMNS", "MotionSet", "RegionMotion", "motion"]

@@ -52,6 +52,7 @@ def test_it_ends_by_itself_when_all_have_answered() -> None:
             skin.values = values(*second)
             assert wipe.wait_for("done") == {"event": "done", "answered": 40, "sensors": 40, "never": []}
             assert wipe.process.wait(PATIENCE_S) == 0
+            wipe.stop()
 
 
 def test_interrupted_it_names_those_that_never_answered() -> None:

@@ -82,7 +82,10 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels."""
+    """Show all drivers live: states, rates, ages, losses, and a picture of what the skin feels.
+
+    Where a service tells the contacts of a driver, as skin-calm does, they are shown too.
+    """
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)

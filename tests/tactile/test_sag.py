@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinware.tactile import Baseline
-from skinware.tactile.testing import Response, World, triangles
+from skinware.tactile.testing import Response, Wander, World, arm, arm_path, triangles
 
 LOAD = 60
 
@@ -53,3 +53,21 @@ def test_a_touch_where_the_cover_has_sunk_is_seen_and_outlives_the_contact_that_
             over.append(bool(calm.touched.any()))
     assert all(seen)
     assert not any(over)
+
+
+def test_fingers_that_stroke_without_end_leave_nothing_behind_them() -> None:
+    world = World(arm((2, 3)), rate_hz=20, sensitivity=12, drift_per_min=0.5, response=Response(sag=0.15))
+    for board in (2, 3):
+        path = tuple((x, y, z) for x, y, z in arm_path(board).tolist())
+        world.gestures.append(Wander(path_m=path, force=5, radius_m=0.006, begin_s=6, end_s=1e6, speed_m_s=0.02))
+    baseline = Baseline(world.surface.module, world.surface.patch)
+    false = idle = seen = pressed = 0
+    for sample in world.frames(90):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        if sample.time_ns < 21_000_000_000:
+            continue
+        is_idle, is_pressed = sample.truth < 0.5, sample.truth > 15
+        false, idle = false + int((calm.touched & is_idle).sum()), idle + int(is_idle.sum())
+        seen, pressed = seen + int((calm.touched & is_pressed).sum()), pressed + int(is_pressed.sum())
+    assert false / idle < 0.003
+    assert seen / pressed > 0.97

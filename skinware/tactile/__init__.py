@@ -19,8 +19,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skinware.tactile.baseline import Baseline, Calm
+    from skinware.tactile.baseline import Baseline
     from skinware.tactile.baseline_settings import BaselineSettings
+    from skinware.tactile.calm import Calm
     from skinware.tactile.chain import BaselineStageSettings, Chain, ChainSettings, CurveSettings
     from skinware.tactile.contacts import Contact, ContactKind, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
@@ -64,6 +65,7 @@ __all__ = [
 ]
 
 _MODULES = (
+    "calm",
     "baseline",
     "baseline_settings",
     "contacts",

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -29,6 +28,7 @@ from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.baseline_settings import BaselineSettings
+from skinware.tactile.calm import Calm
 from skinware.tactile.drift import Drift
 from skinware.tactile.resting import RestingMeasurement
 from skinware.tactile.sag import Sag
@@ -55,30 +55,6 @@ _EPSILON, _TINY = 1e-6, 1e-12
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Calm:
-    """n taxels, calmed. The arrays belong to the caller.
-
-    Attributes:
-        value: (n,) float32, how far each touched taxel is above its baseline (of types that a touch may move to both
-            sides: from it), in the unit of the type; 0 where nothing touches.
-        touched: (n,) bool.
-        held: (n,) bool, near a contact, or near where one was some seconds ago.
-        baseline: (n,) float32, what each taxel would read if nothing touched it; NaN before that is known.
-        noise: (n,) float32, standard deviation from frame to frame; NaN before it is known.
-        forced: (n,) bool, the baseline was put where the value is, at once.
-        usable: (n,) bool, value and baseline are of this frame; others show what was last known, or nothing yet.
-    """
-
-    value: Floats
-    touched: Flags
-    held: Flags
-    baseline: Floats
-    noise: Floats
-    forced: Flags
-    usable: Flags
 
 
 class Baseline:

@@ -29,8 +29,8 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
-from skinware.tactile.baseline import Calm
 from skinware.tactile.between import Pairs
+from skinware.tactile.calm import Calm
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
+from skinware.recording.frames import RecordedDriverFrame, RecordedFrame, RecordedSnapshot
 from skinware.recording.generation import Generation
 from skinware.recording.mcap_reading import ChunkContents, Damaged, McapSource
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of
@@ -123,35 +123,44 @@ class Recording:
             start_s: where to begin, s since the recording began.
             end_s: where to end, likewise; default: with the last.
         """
-        tracks = [self[name] for name in (self.drivers if drivers is None else drivers)]
         newest: dict[str, RecordedDriverFrame] = {}
         layout = SkinLayout((), ())
-        for contents in self.chunks({self._topics.get(EVENTS, 0), *(track.channel for track in tracks)}, 0.0, end_s):
-            for time_s, service, frame in self._in_order(contents, tracks):
-                if frame is None:
-                    newest.pop(service, None)
-                    continue
-                newest[service] = frame
-                layout = _layout(newest, layout)
-                if time_s >= start_s and (end_s is None or time_s < end_s):
-                    frames = tuple(newest[driver] for driver in layout.drivers)
-                    yield RecordedSnapshot(layout, frames, frame.published_ns, time_s)
+        for time_s, driver, frame in self.moments(self.drivers if drivers is None else drivers, end_s=end_s):
+            if not isinstance(frame, RecordedDriverFrame):
+                newest.pop(driver, None)
+                continue
+            newest[driver] = frame
+            layout = _layout(newest, layout)
+            if time_s >= start_s:
+                frames = tuple(newest[name] for name in layout.drivers)
+                yield RecordedSnapshot(layout, frames, frame.published_ns, time_s)
 
-    def _in_order(
-        self, contents: ChunkContents, tracks: Sequence[Track]
-    ) -> list[tuple[float, str, RecordedDriverFrame | None]]:
-        """(time, driver, frame) of some drivers in a chunk, by time; without a frame where one is gone."""
-        found: list[tuple[float, str, RecordedDriverFrame | None]] = []
-        for track in tracks:
-            for time_s, frame in track.frames_in(contents):
-                if isinstance(frame, RecordedDriverFrame):
-                    found.append((time_s, track.name, frame))
+    def moments(
+        self, services: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+    ) -> Iterator[tuple[float, str, RecordedFrame | None]]:
+        """Every frame of several services, by time: (time, service, frame); without a frame where one is gone.
+
+        Args:
+            services: names; None: all.
+            start_s: where to begin, s since the recording began.
+            end_s: where to end, likewise; default: with the last.
+        """
+        tracks = [self[name] for name in (self.services if services is None else services)]
+        for contents in self.chunks(
+            {self._topics.get(EVENTS, 0), *(track.channel for track in tracks)}, start_s, end_s
+        ):
+            found = [(time_s, track.name, frame) for track in tracks for time_s, frame in track.frames_in(contents)]
+            for time_s, service, frame in sorted([*found, *self._ends_in(contents)], key=lambda moment: moment[0]):
+                if time_s >= start_s and (end_s is None or time_s < end_s):
+                    yield time_s, service, frame
+
+    def _ends_in(self, contents: ChunkContents) -> Iterator[tuple[float, str, None]]:
+        """(time, service) of those that were closed or died."""
         for message in contents.messages:
             if message.channel_id == self._topics.get(EVENTS):
                 event = _event(message.data)
                 if event.get("event") in _GONE:
-                    found.append(((message.time_ns - self.start_ns) / NS_PER_S, str(event.get("service")), None))
-        return sorted(found, key=lambda one: one[0])
+                    yield (message.time_ns - self.start_ns) / NS_PER_S, str(event.get("service")), None
 
     def close(self) -> None:
         """Close the file; what was read stays. Idempotent."""

@@ -55,6 +55,10 @@ class Track:
         """Its generations, in order."""
         return tuple(self._generations[number] for number in sorted(self._generations))
 
+    def generation(self, number: int) -> Generation:
+        """One of them, by its number."""
+        return self._generations[number]
+
     @property
     def is_driver(self) -> bool:
         """Whether it is a driver."""

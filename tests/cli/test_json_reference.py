@@ -18,6 +18,7 @@ from skinware.cli.info import command as info
 from skinware.cli.press import command as press
 from skinware.cli.recover import command as recover
 from skinware.cli.regions import command as regions
+from skinware.cli.replay import command as replay
 from skinware.cli.top import command as top
 from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
@@ -269,6 +270,7 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
             status = record.wait_for("status", lambda status: bool(status["messages"]))
             check("`skin-record`", ready, status, record.stop())
     check("`skin-recover`", *printing(recover, str(file)))
+    check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
 
 
 class _Stop:

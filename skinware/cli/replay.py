@@ -1,0 +1,140 @@
+"""``skin-replay``: publish a recording again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from skinware.recording import Recording
+    from skinware.recording.replaying import Replayer
+
+_NAMESPACE = "replay"
+
+
+def speed(text: str) -> float:
+    """A factor above 0; for ``click.option(type=...)``.
+
+    Raises:
+        click.BadParameter: it is not one.
+    """
+    factor = seconds(text)
+    if not factor:
+        raise click.BadParameter("a speed is above 0: 1 is that of the recording.")
+    return factor
+
+
+@click.command(
+    "skin-replay",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-replay walk.mcap                         skin-top --namespace replay shows it",
+        "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
+        "skin-replay walk.mcap --start 10 --end 12 --loop",
+    ),
+)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
+@click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
+@click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
+@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option(
+    "--namespace",
+    metavar="NAME",
+    help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{_NAMESPACE}']",
+)
+@json_option
+@version_option
+def command(
+    file: Path,
+    names: tuple[str, ...],
+    factor: float,
+    start_s: float,
+    end_s: float | None,
+    loop: bool,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Publish the drivers and services of a recording again, or only NAME..., as if they ran now.
+
+    They have the same names, structures, states and counters, and restart where they restarted. Times are moved to now.
+    """
+    import skinware.recording
+    from skinware.memory.namespace import Namespace
+    from skinware.recording.replaying import Replayer
+
+    place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or _NAMESPACE)
+    with skinware.recording.open(file) as recording:
+        for name in names:
+            recording[name]
+        replayer = Replayer(recording, names=names or None, namespace=place, speed=factor)
+        with contextlib.closing(replayer), _signals(replayer):
+            _ready(recording, names, place.name, as_json)
+            _play(replayer, start_s, end_s, loop, as_json)
+        for problem in recording.problems:
+            warn(problem)
+    _tell("stopped", replayer, as_json)
+
+
+def _play(replayer: Replayer, start_s: float, end_s: float | None, loop: bool, as_json: bool) -> None:
+    published = -1
+    while published < replayer.frames.total():  # what has no frames is not looped
+        published = replayer.frames.total()
+        replayer.run(start_s, end_s, lambda: _tell("status", replayer, as_json))
+        if not loop or replayer.is_stopped:
+            break
+
+
+def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json: bool) -> None:
+    published = list(names or recording.services)
+    if as_json:
+        told = {"file": str(recording.path), "namespace": namespace, "names": published}
+        print_json({"event": "ready", **told, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
+    else:
+        what = ", ".join(published) or "nothing"
+        click.echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
+
+
+def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
+    with contextlib.suppress(BrokenPipeError):
+        if as_json:
+            figures = {"time_s": replayer.time_s, "frames": dict(replayer.frames), "late": replayer.late}
+            print_json({"event": event, **figures})
+        elif event == "stopped":
+            late = f", {replayer.late} of them late" if replayer.late else ""
+            click.echo(f"{replayer.frames.total()} frames published{late}")
+
+
+@contextlib.contextmanager
+def _signals(replayer: Replayer) -> Iterator[None]:
+    """SIGINT and SIGTERM end it in good order."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: replayer.stop()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

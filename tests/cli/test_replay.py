@@ -1,0 +1,87 @@
+"""skin-replay as people and scripts use it."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from skinware import Namespace
+from skinware.cli._command import exit_status
+from skinware.cli.replay import command as replay
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin
+from tests.commands import run, running
+from tests.recording.rig import recording
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Half a second of a driver."""
+    path = tmp_path / "walk.mcap"
+    with recording(path) as recorder, FakeSkin("torso") as torso:
+        for _ in range(50):
+            torso.publish()
+            time.sleep(0.01)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) == 50)
+    return path
+
+
+def test_others_see_what_was_recorded(file: Path, namespace: Namespace) -> None:
+    with running("skin-replay", str(file), "--loop", "--speed", "0.5") as player:
+        ready = player.wait_for("ready")
+        assert (ready["namespace"], ready["names"], ready["is_whole"]) == (namespace.name, ["torso"], True)
+        player.wait_for("status", lambda status: status["frames"].get("torso", 0) > 0)
+        dumped = run("skin-dump", "torso", "-n", "60", "--json")  # further than the end
+        frames = [json.loads(line) for line in dumped.stdout.splitlines()]
+        assert [f["sequence"] for f in frames] == list(range(frames[0]["sequence"], frames[0]["sequence"] + 60))
+        stopped = player.stop()
+        assert stopped["frames"]["torso"] > 60
+        assert player.process.returncode == 0
+    assert namespace.services() == []
+
+
+def test_it_ends_with_the_recording(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(replay, [str(file), "torso", "--speed", "4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"{file}, ")
+    assert lines[0].endswith(f"s: torso in namespace '{Namespace().name}' (Ctrl-C ends)")
+    assert lines[-1].startswith("50 frames published")
+    assert exit_status(replay, [str(file), "--start", "1000", "--loop"]) == 0  # there is nothing
+    assert capsys.readouterr().out.splitlines()[-1] == "0 frames published"
+
+
+def test_without_a_namespace_it_stays_away_from_the_robot(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("SKINWARE_NAMESPACE")
+    assert exit_status(replay, [str(file), "--start", "1000", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.splitlines()[0])["namespace"] == "replay"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nothing.mcap"], 1, "nothing.mcap: No such file or directory"),
+        (["text.mcap"], 1, "text.mcap: not a recording (not an MCAP file)"),
+        (["walk.mcap", "arm"], 2, "no service 'arm' in walk.mcap; there are: torso"),
+        (["walk.mcap", "--speed", "0"], 2, "a speed is above 0"),
+        (["walk.mcap", "--namespace", "a b"], 2, "namespace name 'a b'"),
+    ],
+)
+def test_mistakes_are_one_line(
+    file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.chdir(file.parent)
+    Path("text.mcap").write_text("time,pressure")
+    assert exit_status(replay, arguments) == code
+    errors = capsys.readouterr().err
+    assert words in errors.splitlines()[-1]
+    assert "Traceback" not in errors

@@ -1,0 +1,143 @@
+"""A recording that is published again is what was recorded, frame by frame; only the times are those of now."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skinware.recording
+from skinware import DriverReader, Frame, Namespace, ServiceReader, Skin
+from skinware.errors import NameInUse
+from skinware.recording import Recording
+from skinware.recording.replaying import Replayer
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_structure
+from tests.recording.rig import contents_of, has, pose_service, publish_pose, recording
+
+TIMES = ("module_time_ns", "bus_since_ns")
+
+
+def record_two_lives(file: Path) -> None:
+    """A driver that restarts, then comes back with other sensors, beside another and a service."""
+    with recording(file) as recorder, FakeSkin("arm", fake_structure(1)) as arm, pose_service(rate_hz=50) as pose:
+        total = 0
+        for patches in (2, 2, 3):
+            with FakeSkin("torso", fake_structure(patches)) as torso:
+                torso.break_some()
+                torso.bus_since_ns[:] = time.monotonic_ns() - 5_000_000_000
+                torso.bus_counters[:] = patches
+                for number in range(25):
+                    torso.publish()
+                    if number % 2:
+                        arm.publish()
+                        publish_pose(pose, number)
+                    time.sleep(0.004)
+                total += 25
+                wait_until(lambda total=total: recorder.messages.get("/skin/torso/frame", 0) == total)  # type: ignore[misc]
+
+
+@contextmanager
+def replaying(file: Path, **options: float) -> Iterator[Replayer]:
+    """A replay in a thread, once through."""
+    with skinware.recording.open(file) as opened:
+        replayer = Replayer(opened, **options)  # type: ignore[arg-type]
+        thread = threading.Thread(target=replayer.run)
+        thread.start()
+        try:
+            yield replayer
+        finally:
+            replayer.stop()
+            thread.join()
+            replayer.close()
+
+
+def values_of(opened: Recording, name: str) -> list[dict[str, bytes]]:
+    """Contents of all frames but times; and of times the ages."""
+    found = []
+    for frame in opened[name].frames():
+        contents = contents_of(frame)
+        contents["times"] = np.array([frame.age_ns // 50_000_000, frame.flags]).tobytes()
+        for column in TIMES:
+            if column in contents:
+                times = frame.column(column)
+                ages = np.where(times, frame.acquired_ns - times, -1)
+                contents[column] = ages.tobytes()
+        found.append(contents)
+    return found
+
+
+def test_record_replay_record_is_the_same(tmp_path: Path, namespace: Namespace) -> None:
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    record_two_lives(first)
+    with recording(second) as recorder, replaying(first) as replayer:
+        wait_until(lambda: replayer.frames["torso"] == 75 and recorder.messages.get("/skin/torso/frame", 0) == 75)
+        wait_until(lambda: recorder.messages.get("/skin/pose/frame", 0) == replayer.frames["pose"])
+        wait_until(lambda: recorder.messages.get("/skin/arm/frame", 0) == replayer.frames["arm"])
+    with skinware.recording.open(first) as then, skinware.recording.open(second) as now:
+        assert then.services == now.services == ("arm", "pose", "torso")
+        assert now.lost == 0
+        for name in then.services:
+            assert values_of(then, name) == values_of(now, name)
+            pairs = list(zip(then[name].generations, now[name].generations, strict=True))
+            assert len(pairs) == (3 if name == "torso" else 1)
+            for before, after in pairs:
+                assert before.digest == after.digest
+                assert (before.kind, before.period_ns) == (after.kind, after.period_ns)
+                assert before.context == after.context
+        old, new = then["arm"].read(["status"]), now["arm"].read(["status"])
+        assert new.published_ns[0] > old.published_ns[-1]
+        assert np.abs((new.time_s - new.time_s[0]) - (old.time_s - old.time_s[0])).max() < 5
+    assert namespace.services() == []
+
+
+def test_readers_and_skins_read_it_as_if_it_lived(tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    with recording(file) as recorder, FakeSkin("torso") as torso:
+        for _ in range(100):
+            torso.publish()
+            time.sleep(0.01)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) == 100)
+    with Skin() as skin, replaying(file, speed=0.5):
+        snapshot = skin.read(timeout_s=30)
+        assert snapshot.layout.drivers == ("torso",)
+        assert snapshot.layout.structures == (torso.structure,)
+        assert snapshot.fresh("pressure").all()
+        with DriverReader("torso") as reader:
+            assert reader.driver_type == "fake"
+            assert reader.alive
+
+
+def test_twice_as_fast_takes_half_the_time_and_keeps_ages(tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    with recording(file) as recorder, pose_service(rate_hz=20) as pose:
+        has_begun = time.monotonic()
+        for number in range(20):
+            publish_pose(pose, number)
+            time.sleep(0.05)
+        lasted_s = time.monotonic() - has_begun
+        has(recorder, "pose")
+        wait_until(lambda: recorder.messages.get("/skin/pose/frame", 0) == 20)
+    begun_s = time.monotonic()
+    with replaying(file, speed=4.0) as replayer:
+        with ServiceReader[Frame]("pose", timeout_s=30) as reader:
+            assert reader.read().period_ns == 50_000_000 // 4
+        wait_until(lambda: replayer.frames["pose"] == 20)
+        assert time.monotonic() - begun_s > 0.9 * lasted_s / 4 * 19 / 20
+
+
+def test_a_name_that_is_in_use_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    with recording(file) as recorder, FakeSkin("torso") as torso:
+        torso.publish()
+        wait_until(lambda: "/skin/torso/frame" in recorder.messages)
+    with FakeSkin("torso"), skinware.recording.open(file) as opened:
+        replayer = Replayer(opened)
+        with pytest.raises(NameInUse, match="'torso'"):
+            replayer.run()
+        replayer.close()

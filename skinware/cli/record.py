@@ -121,9 +121,9 @@ def command(
     target = _target(path, split_size, max_size, last_s)
     recorder = Recorder(target, names=names or None, namespace=place)
     report = _Report(recorder, target, path, as_json)
-    report.ready(names, place.name)
     failed = True
     with _signals(recorder):
+        report.ready(names, place.name)
         try:
             recorder.run(duration_s, report.status)
             failed = False

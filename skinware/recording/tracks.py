@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -39,16 +39,30 @@ class ChunkSource(Protocol):
 class Track:
     """What was recorded of one service.
 
+    Args:
+        recording: where it is.
+        name: of the service.
+        channel: number of the channel of its frames.
+        generations: those whose frames are wanted, by number.
+        told: all that are told in the recording; default: the same.
+
     Attributes:
         name: of the service.
-        generations: those of which frames were recorded, or that were told, in order.
     """
 
-    def __init__(self, recording: ChunkSource, name: str, channel: int, generations: dict[int, Generation]) -> None:
+    def __init__(
+        self,
+        recording: ChunkSource,
+        name: str,
+        channel: int,
+        generations: Mapping[int, Generation],
+        told: Collection[int] | None = None,
+    ) -> None:
         self._recording = recording
         self.name: str = name
         self.channel: int = channel
         self._generations = generations
+        self._told: Collection[int] = generations.keys() if told is None else told
 
     @property
     def generations(self) -> tuple[Generation, ...]:
@@ -72,7 +86,7 @@ class Track:
             if not parts or next(iter(parts[-1].values())).digest != generation.digest:
                 parts.append({})
             parts[-1][generation.generation] = generation
-        return tuple(Track(self._recording, self.name, self.channel, part) for part in parts)
+        return tuple(Track(self._recording, self.name, self.channel, part, self._told) for part in parts)
 
     @property
     def structure(self) -> Structure:
@@ -153,6 +167,8 @@ class Track:
         for number, which in runs([message.data for message in messages]):
             generation = self._generations.get(number)
             if generation is None:
+                if number not in self._told:
+                    self._recording.note(f"frames of {self.name!r} left out: what they are made of is lost")
                 continue
             try:
                 run = Run([message.data for message in messages[which]], generation.coded)

@@ -49,6 +49,17 @@ def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespa
         assert opened["torso"].read(["status"]).sequence.tolist() == list(range(1, skin.writer.sequence + 1))
 
 
+def test_a_recording_of_nothing_is_whole_too(tmp_path: Path) -> None:
+    file = tmp_path / "skin.mcap"
+    with running("skin-record", "-o", str(file)) as recorder:
+        recorder.wait_for("ready")
+        stopped = recorder.stop()
+    assert (stopped["event"], stopped["file"], stopped["lost"]) == ("stopped", str(file), 0)
+    with skinware.recording.open(file) as opened:
+        assert opened.is_whole
+        assert opened.services == ()
+
+
 def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with publishing(FakeSkin("torso")):

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 import skinware.recording
 from skinware.errors import BadRecording
+from skinware.recording.mcap_reading import McapSource
 from skinware.recording.recovery import recover
 from tests.recording.damaging import Original, frames_of, recover_too
 from tests.recording.rig import two_drivers_and_a_service
@@ -77,6 +78,22 @@ def test_damage_is_told(original: Original, tmp_path: Path) -> None:
         list(opened["torso"].frames())
         assert opened.problems == ["1 chunk damaged and left out"]
     assert recover(file, tmp_path / "whole.mcap").damaged == 1
+
+
+def test_frames_without_their_generation_are_left_out_and_told(original: Original, tmp_path: Path) -> None:
+    file = tmp_path / "damaged.mcap"
+    data = bytearray(original.data)
+    with McapSource(tmp_path / "original.mcap") as source:
+        for place in source.chunks:
+            channels = {source.channels[channel].topic for channel in place.channel_ids or ()}
+            if "/skin/torso/generation" in channels:
+                data[place.compressed_at + 40] ^= 1
+    file.write_bytes(data)
+    with skinware.recording.open(file) as opened:
+        assert list(opened["torso"].frames()) == []
+        assert "frames of 'torso' left out: what they are made of is lost" in opened.problems
+        with pytest.raises(BadRecording, match="what the frames of 'torso' are made of is lost"):
+            opened["torso"].read()
 
 
 def test_it_takes_its_own_place_and_no_others(original: Original, tmp_path: Path) -> None:

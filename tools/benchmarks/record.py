@@ -1,6 +1,6 @@
 """Recording: what it costs, how large it is, and what a killed recorder leaves; of the recorder as people start it.
 
-tools/bench record [cost|kills|read] [--seconds S] [--kills N]
+tools/bench record [cost|kills] [--seconds S] [--kills N] [--sensors N ...] [--pattern analogue|quiet ...]
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from skinware.sensor_types import PRESSURE
 
 RATE_HZ = 100
 SMALL, LARGE = 768, 30_848
+PATTERNS = ("analogue", "quiet")
 PER_MODULE, PER_PATCH = 16, 16
 NOISE = 2.0
 SHARE = 0.05
@@ -138,11 +139,11 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def cost(seconds: float, folder: Path) -> None:
+def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
     """Processor time, bytes a frame and losses, by skin and pattern."""
     print(f"{RATE_HZ} Hz, {seconds:g} s each; load {os.getloadavg()[0]:.1f}")
-    for sensors in (LARGE, SMALL):
-        for pattern in ("analogue", "quiet"):
+    for sensors in skins:
+        for pattern in patterns:
             with own_namespace() as namespace:
                 file = folder / f"{sensors}-{pattern}.mcap"
                 with driving(namespace.name, sensors, pattern), recording(namespace.name, file) as process:
@@ -181,9 +182,9 @@ def read(file: Path) -> None:
     )
 
 
-def kills(count: int, folder: Path) -> None:
+def kills(count: int, skins: list[int], folder: Path) -> None:
     """What is missing at the end of a recording whose recorder was killed at a random moment."""
-    for sensors in (LARGE, SMALL):
+    for sensors in skins:
         missing: list[float] = []
         with own_namespace() as namespace, driving(namespace.name, sensors, "analogue"):
             for number in range(count):
@@ -209,12 +210,14 @@ def main() -> None:
     parser.add_argument("what", nargs="?", choices=["cost", "kills"])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--sensors", type=int, nargs="+", default=[LARGE, SMALL], metavar="N")
+    parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if options.what in (None, "cost"):
-            cost(options.seconds, Path(folder))
+            cost(options.seconds, options.sensors, options.pattern, Path(folder))
         if options.what in (None, "kills"):
-            kills(options.kills, Path(folder))
+            kills(options.kills, options.sensors, Path(folder))
 
 
 if __name__ == "__main__":

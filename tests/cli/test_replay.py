@@ -14,15 +14,17 @@ from skinware.cli.replay import command as replay
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin
 from tests.commands import run, running
-from tests.recording.rig import recording
+from tests.recording.rig import has, recording
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Half a second of a driver."""
+    """Half a second of a driver, which was there before and after."""
     path = tmp_path / "walk.mcap"
-    with recording(path) as recorder, FakeSkin("torso") as torso:
-        for _ in range(50):
+    with FakeSkin("torso") as torso, recording(path) as recorder:
+        torso.publish()
+        has(recorder, "torso")
+        for _ in range(49):
             torso.publish()
             time.sleep(0.01)
         wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) == 50)

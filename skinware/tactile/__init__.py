@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, ContactKind, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
     from skinware.tactile.curves import Curve, CurveTable, fit_curve, read_curves
+    from skinware.tactile.health import Health, HealthSettings
+    from skinware.tactile.health_report import HealthKind, HealthReport
+    from skinware.tactile.health_service import HealthReader
+    from skinware.tactile.motion import MotionSet, RegionMotion, motion_of
+    from skinware.tactile.motion_service import MotionReader
     from skinware.tactile.neighbours import neighbours_of_pairs
     from skinware.tactile.region_files import put_region, read_regions
     from skinware.tactile.regions import Box, Region, Regions
@@ -51,13 +56,22 @@ __all__ = [
     "CurveSettings",
     "CurveTable",
     "FilterSettings",
+    "Health",
+    "HealthKind",
+    "HealthReader",
+    "HealthReport",
+    "HealthSettings",
+    "MotionReader",
+    "MotionSet",
     "Region",
+    "RegionMotion",
     "Regions",
     "ScalerSettings",
     "Signal",
     "Taxels",
     "TrackingSettings",
     "fit_curve",
+    "motion_of",
     "neighbours_of_pairs",
     "put_region",
     "read_curves",
@@ -76,7 +90,12 @@ _MODULES = (
     "stages",
     "curves",
     "chain",
+    "health_report",
+    "health",
+    "motion",
     "contacts_service",
+    "health_service",
+    "motion_service",
 )
 """Where the names are, what imports little first."""
 

@@ -96,7 +96,7 @@ COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
 """Per region: dtype and shape of each array of a :class:`MotionSet`."""
 
 
-def motion(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
+def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
     """The motion of regions, from the contacts of a frame.
 
     Contacts in another coordinate frame than that with most of the region's load are left out of its velocity.
@@ -133,4 +133,4 @@ def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.
     return weight @ contacts.velocity_m_s[moving], frame
 
 
-__all__ = ["COLUMNS", "MotionSet", "RegionMotion", "motion"]
+__all__ = ["COLUMNS", "MotionSet", "RegionMotion", "motion_of"]

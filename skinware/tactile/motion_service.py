@@ -29,7 +29,7 @@ from skinware.service import Column, ServiceReader, ServiceWriter
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.contacts import ContactSet
-from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion
+from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
 
 KIND = NAME = "motion"
@@ -204,7 +204,7 @@ class MotionWriter:
         Raises:
             Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
         """
-        found = motion(self._index, contacts, value)
+        found = motion_of(self._index, contacts, value)
         columns = self._service.begin()
         for name in COLUMNS:
             columns[name][:] = getattr(found, name)

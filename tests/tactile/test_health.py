@@ -145,12 +145,33 @@ def test_healthy_plates_have_no_faults(how: dict[str, float]) -> None:
     assert np.isfinite(report.shown).mean() > 0.8, "most of them could be judged"
 
 
-def test_a_dead_taxel_at_a_corner_is_called_untouched() -> None:
-    """It lies between no others: nothing tells it from one that nobody touches."""
+def test_what_nobody_can_tell() -> None:
+    """A dead taxel at a corner lies between no others: it may be that nobody touches it. Exchanged taxels look dead."""
     world = plates(3)
+    one, other = TAXELS + 2 * SIDE + 2, TAXELS + 5 * SIDE + 5
     world.dead(CORNERS)
-    report = judged(world, QUICK, 120)
+    world.swap([one], [other])
+    report = judged(world, QUICK)
     assert names(report.kind[CORNERS]) == ["never_touched"] * 4
+    assert names(report.kind[[one, other]]) == ["dead", "dead"]
+    assert np.flatnonzero(report.faulty).tolist() == [one, other]
+
+
+def test_a_dead_taxel_is_found_under_a_hand_that_covers_thousands() -> None:
+    """More than are looked at in one frame."""
+    surface = grid(1, 60, 60)
+    dead = 30 * 60 + 30
+    baseline, health = Baseline(surface.module, surface.patch), Health(surface.module, placed(surface.position_m))
+    baseline.update(0, np.full(3600, 10.0))
+    baseline.tare()
+    for tenth in range(1, 200):
+        values = np.full(3600, 60.0 if tenth % 50 > 30 else 10.0)
+        values[dead] = 10
+        health.update(tenth * 100_000_000, values, baseline.update(tenth * 100_000_000, values))
+    report = health.report()
+    assert np.flatnonzero(report.faulty).tolist() == [dead]
+    assert names(report.kind[[dead]]) == ["dead"]
+    assert report.shown[31 * 60 + 20] == pytest.approx(1)
 
 
 def test_what_was_mended_is_good_again() -> None:

@@ -10,7 +10,7 @@ from skinware._columns import Index
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.baseline_settings import BaselineSettings
 from skinware.tactile.contacts import Contacts
-from skinware.tactile.motion import MotionSet, motion
+from skinware.tactile.motion import MotionSet, motion_of
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.testing import Response, World, grid
 from tests.tactile.skins import PITCH_M, placed
@@ -39,7 +39,7 @@ def slid(rows: dict[int, float], frames: int = 40, load: float = 10.0) -> Motion
             away_m = np.hypot(SURFACE.position_m[:, 0] - x, (ROW - row) * PITCH_M)
             value += load * np.exp(-((away_m / PITCH_M) ** 2))
         found = contacts.update(value, value > 0.1, frame * PERIOD_NS)
-    return motion(REGIONS, found, value)
+    return motion_of(REGIONS, found, value)
 
 
 def test_each_region_has_the_motion_of_what_touches_it() -> None:
@@ -76,7 +76,7 @@ def test_who_rests_has_no_direction() -> None:
 def test_without_places_there_is_no_motion() -> None:
     contacts = Contacts(4, None, None, module=np.zeros(4, int))
     value = np.array([0.0, 3, 4, np.nan])
-    found = motion({"all": slice(0, 4)}, contacts.update(value, value > 0, 0), value)
+    found = motion_of({"all": slice(0, 4)}, contacts.update(value, value > 0, 0), value)
     assert (found[0].load, found[0].contacts, found[0].frame) == (7, 1, "")
     assert np.isnan(found[0].velocity_m_s).all()
 
@@ -92,7 +92,7 @@ def test_another_frame_is_left_out_of_the_velocity() -> None:
             away_m = np.hypot(SURFACE.position_m[:, 0] - x, (ROW - row) * PITCH_M)
             value += load * np.exp(-((away_m / PITCH_M) ** 2))
         found = contacts.update(value, value > 0.1, frame * PERIOD_NS)
-    (everything,) = motion({"all": slice(0, SIDE * SIDE)}, found, value)
+    (everything,) = motion_of({"all": slice(0, SIDE * SIDE)}, found, value)
     assert (everything.frame, everything.contacts) == ("chest", 2)
     assert everything.velocity_m_s[0] == pytest.approx(0.05, abs=0.006)
 
@@ -118,7 +118,7 @@ def test_a_stroke_through_noise_is_told(seed: int) -> None:
         calm = baseline.update(sample.time_ns, sample.values.astype(np.float32), sample.usable)
         found = contacts.update(calm.value, calm.touched, sample.time_ns)
         if 2.0 < number / 50 < end_s - 0.1:
-            told.append(motion({"all": slice(0, SIDE * SIDE)}, found, calm.value)[0])
+            told.append(motion_of({"all": slice(0, SIDE * SIDE)}, found, calm.value)[0])
     speed = np.median([region.speed_m_s for region in told])
     turned = [np.degrees(np.arccos(np.clip(region.direction @ velocity / 0.05, -1, 1))) for region in told]
     assert speed == pytest.approx(0.05, rel=0.25)

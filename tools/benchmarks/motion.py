@@ -16,7 +16,7 @@ import numpy.typing as npt
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.baseline_settings import BaselineSettings
 from skinware.tactile.contacts import Contacts
-from skinware.tactile.motion import motion
+from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import NONE, neighbours
 from skinware.tactile.testing import Gesture, Response, Stroke, World, grid
 from tests.tactile.skins import placed
@@ -148,7 +148,7 @@ def errors(seeds: range, speed_m_s: float, fingers: int) -> dict[str, Floats]:
             calm = baseline.update(sample.time_ns, sample.values.astype(np.float32), sample.usable)
             seen = contacts.update(calm.value, calm.touched, sample.time_ns)
             velocities = {name: rule(calm.value.astype(float), passed_s) for name, rule in rules.items()}
-            velocities["region"] = motion({"all": slice(0, len(SURFACE))}, seen, calm.value).velocity_m_s[0]
+            velocities["region"] = motion_of({"all": slice(0, len(SURFACE))}, seen, calm.value).velocity_m_s[0]
             true = next((v for begin, end, v in done if begin + SETTLED_S < time_s < end - 0.06), None)
             if true is None:
                 continue

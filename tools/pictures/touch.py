@@ -1,6 +1,6 @@
-"""The pictures of docs/tactile: what a baseline, contacts and regions make of a skin whose truth is known.
+"""The pictures of docs/tactile: what a baseline, contacts, regions and health make of a skin whose truth is known.
 
-Usage: python tools/pictures/touch.py FOLDER        (writes baseline.svg, contacts.svg and regions.svg there)
+Usage: python tools/pictures/touch.py FOLDER        (writes baseline.svg, contacts.svg, regions.svg, health.svg there)
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware import Structure
 from skinware.sensor_types import PRESSURE
-from skinware.tactile import Baseline, Box, Contacts, Region, Regions
+from skinware.tactile import Baseline, Box, Contacts, Health, HealthKind, HealthSettings, Region, Regions
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.testing import Response, World, arm, grid
 
@@ -142,6 +142,41 @@ def regions_picture() -> str:
     return _svg("Two regions of an arm, seen from above", height, parts)
 
 
+def health_picture() -> str:
+    """The arm after a minute of strokes, with five broken taxels: what each taxel showed of its due, and the faults."""
+    surface = arm()
+    world = World(surface, seed=3, rate_hz=20, gain_spread=0.15)
+    lines = [((0.0, y, 0.0225), (0.15, y, 0.0225)) for y in np.linspace(-0.012, 0.012, 5)]
+    lines += [((0.165, y, 0.0125), (0.23, y, 0.0125)) for y in np.linspace(-0.024, 0.024, 7)]
+    for number in range(6 * len(lines)):
+        world.stroke(lines[number % len(lines)], 60, 7 + 1.2 * number, 8 + 1.2 * number, radius_m=0.006)
+    places = surface.geometry("arm")
+    wanted_m = [(0.03, 0.011), (0.075, -0.011), (0.115, 0.011), (0.185, 0.012), (0.205, -0.012)]
+    above = surface.normal[:, 2] > 0.8
+    away_m = [np.where(above, np.hypot(*(surface.position_m[:, :2] - place).T), np.inf) for place in wanted_m]
+    dead, weak, noisy, stuck, clipped = (int(np.argmin(of)) for of in away_m)
+    world.dead([dead])
+    world.gain[weak] = 0.12
+    world.noisy([noisy], 8)
+    world.stuck([stuck], 73)
+    world.jump([clipped], 300, at_s=-1)
+    baseline = Baseline(surface.module, surface.patch)
+    health = Health(surface.module, places, HealthSettings(stuck_s=40), limits=(0, 255))
+    for sample in world.record(7 + 1.2 * 6 * len(lines) + 5):
+        values = sample.values.astype(np.float32)
+        health.update(sample.time_ns, values, baseline.update(sample.time_ns, values, sample.usable))
+    report = health.report()
+    shown = np.nan_to_num(report.shown)
+    seen = surface.normal[:, 2] > 0.4
+    parts, height = _taxels(surface.position_m, seen, [_shade(share) for share in shown])
+    at = _on_page(surface.position_m[:, :2])
+    for taxel in np.flatnonzero(report.faulty & seen).tolist():
+        x, y = at[taxel].tolist()
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="none" stroke="{_RED}" stroke-width="3"/>')
+        parts.append(_text(x + 12, y - 10, HealthKind(report.kind[taxel]).name.lower(), colour=_RED, bold=True))
+    return _svg("Five broken taxels of an arm that was stroked for a minute, seen from above", height, parts)
+
+
 def _on_page(xy_m: ArrayF) -> ArrayF:
     """(m, 2) where places of the arm are on the page, px."""
     scale, middle = 3300.0, 135.0
@@ -191,7 +226,12 @@ def _svg(title: str, height: float, parts: Sequence[str]) -> str:
     return head + "\n".join(parts) + "\n</svg>\n"
 
 
-PICTURES = {"baseline": baseline_picture, "contacts": contacts_picture, "regions": regions_picture}
+PICTURES = {
+    "baseline": baseline_picture,
+    "contacts": contacts_picture,
+    "regions": regions_picture,
+    "health": health_picture,
+}
 
 if __name__ == "__main__":
     for name, picture in PICTURES.items():

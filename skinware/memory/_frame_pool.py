@@ -36,7 +36,8 @@ class FramePool(Generic[FrameT]):
         self._rings = rings
         self._memory_type = ctypes.c_char * self._size
         self._places = [self._place(), self._place()]  # a loop still has the frames before when it asks for the next
-        self._references_of_nobody = -1 if _COUNTS_COME_LATE else _references(self._places[0])
+        self._references = _references_of_one if len(rings) == 1 else _references
+        self._references_of_nobody = -1 if _COUNTS_COME_LATE else self._references(self._places[0])
         self._turn = 0
 
     def free(self) -> _Place[FrameT]:
@@ -46,7 +47,7 @@ class FramePool(Generic[FrameT]):
         """
         self._turn = turn = 1 - self._turn
         place = self._places[turn]
-        if _references(place) != self._references_of_nobody:
+        if self._references(place) != self._references_of_nobody:
             place = self._places[turn] = self._place()
         return place
 
@@ -54,6 +55,12 @@ class FramePool(Generic[FrameT]):
         data = bytearray(self._size)
         frames = tuple([ring.frame_in(data, start) for ring, start in zip(self._rings, self.starts, strict=True)])
         return frames, data, self._memory_type.from_buffer(data)
+
+
+def _references_of_one(place: _Place[FrameT]) -> int:
+    """The same where there is one frame, in as few steps as can be: a loop asks in every turn."""
+    frames, data, _ = place
+    return getrefcount(frames) + getrefcount(data) + getrefcount(frames[0])
 
 
 def _references(place: _Place[FrameT]) -> int:

@@ -65,7 +65,8 @@ class _TurnsState(_Ring):
         ("last", ctypes.c_uint64),
         ("in_order", ctypes.c_uint64),
         ("until_ns", ctypes.c_int64),
-        ("deadline_ns", ctypes.c_int64),
+        ("timeout_ns", ctypes.c_int64),
+        ("begun_ns", ctypes.c_int64),
         ("descriptor", ctypes.c_int64),
         ("process", ctypes.c_int64),
         ("frames", ctypes.c_uint64),
@@ -92,8 +93,9 @@ class NativeRingReader(RingReader[FrameT]):
         self._turns = _TurnsState(*_ring_words(segment))
         self._turns_at = ctypes.byref(self._turns)
         self._turns.descriptor, self._turns.process = segment.descriptor.fd, os.getpid()
-        self._turns.deadline_ns = _NEVER_NS
-        self._asked: tuple[int | None, bool] = (None, False)
+        self._turns.timeout_ns = _NEVER_NS
+        self._timeout_ns: int | None = None
+        self._in_order = False
 
     @property
     def turns_address(self) -> int:
@@ -122,16 +124,21 @@ class NativeRingReader(RingReader[FrameT]):
             return None
         raise self._overrun()
 
-    def next_turn(self, deadline_ns: int | None, *, in_order: bool = False) -> FrameT | None:
+    def next_turn(self, timeout_ns: int | None, in_order: bool) -> FrameT | None:
         """One call of C, which lets go of the interpreter lock only if it has to sleep: others may keep it for long."""
         (frame,), _, memory = self._pool.free()
         frame.stale = False
         state = self._turns
-        if (deadline_ns, in_order) != self._asked:
-            state.deadline_ns, state.in_order = _NEVER_NS if deadline_ns is None else deadline_ns, in_order
-            self._asked = deadline_ns, in_order
+        if timeout_ns != self._timeout_ns or in_order != self._in_order:
+            self._timeout_ns, self._in_order = timeout_ns, in_order
+            state.timeout_ns, state.in_order = _NEVER_NS if timeout_ns is None else timeout_ns, in_order
         turn = self._turn_call if self._words[LATEST] == state.last else self._turn_at_once
         return frame if turn(self._turns_at, memory) else None
+
+    @property
+    def begun_ns(self) -> int:
+        """As in Python."""
+        return int(self._turns.begun_ns)
 
     def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> bool:
         """As in Python."""

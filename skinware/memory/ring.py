@@ -288,14 +288,19 @@ class RingReader(Generic[FrameT]):
     # -- turns of a loop -------------------------------------------------------------------------------------------
     # Where there is C, a loop that takes frames as they come goes round there, as long as nothing happens but frames.
 
-    def next_turn(self, deadline_ns: int | None, *, in_order: bool = False) -> FrameT | None:  # noqa: ARG002, not here
+    def next_turn(self, timeout_ns: int | None, in_order: bool) -> FrameT | None:  # noqa: ARG002, not here
         """The next frame; None if whatever is to be done now has to be done here, as always without C.
 
         Args:
-            deadline_ns: when the wait for it is to end, CLOCK_MONOTONIC ns; None: never.
+            timeout_ns: how long the wait for it may take; None: for ever.
             in_order: the one after the one before, not the newest.
         """
         return None
+
+    @property
+    def begun_ns(self) -> int:
+        """When the wait of the last ``next_turn`` began, CLOCK_MONOTONIC ns; 0 without C."""
+        return 0
 
     def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> bool:  # noqa: ARG002, not here
         """Begin to take turns in C, where there is C.

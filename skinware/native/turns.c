@@ -34,12 +34,13 @@ int skinware_native_turn(skinware_native_turns *turns, unsigned char *to) {
     uint64_t latest = skinware__latest(&turns->ring);
     const int64_t now_ns = skinware__clock_ns(CLOCK_MONOTONIC);
     int64_t until_ns;
+    turns->begun_ns = now_ns;
     end_turn(turns, now_ns);
     if (turns->last == 0 || turns->noted == TURNS || skinware__has_ended(&turns->ring) || turns->process != getpid())
         return 0;
     if (latest != turns->last) /* there without a sleep: its writer may be dead */
         return skinware__is_locked((int)turns->descriptor) ? take(turns, latest, to) : 0;
-    until_ns = least(now_ns + SLICE_NS, least(turns->until_ns, turns->deadline_ns));
+    until_ns = least(now_ns + least(SLICE_NS, turns->timeout_ns), turns->until_ns);
     if (until_ns <= now_ns)
         return 0;
     (void)skinware__sleep(map + SKINWARE__WAKE_WORD_OFFSET, wake_word, until_ns - now_ns);

@@ -23,7 +23,8 @@ typedef struct skinware_native_turns {
     uint64_t last;       /* sequence of the frame that was handed out last; 0: the next turn is Python's */
     uint64_t in_order;   /* 1: take the one after it; 0: the newest */
     int64_t until_ns;    /* when Python has something to do at the latest */
-    int64_t deadline_ns; /* of this wait */
+    int64_t timeout_ns;  /* of each wait */
+    int64_t begun_ns;    /* when the wait for the next frame began */
     int64_t descriptor;  /* of the file: asks whether the writer lives */
     int64_t process;     /* whose reader this is: the child of a fork has none */
     uint64_t frames;     /* handed out */

@@ -112,7 +112,7 @@ class ServiceReader(Attachment[FrameT]):
             Closed: this reader was closed, or belongs to the process before a fork.
         """
         known = newer_than.position if isinstance(newer_than, Frame) else newer_than
-        return self._read(known, max_age_s, _deadline_ns(timeout_s))
+        return self._read(known, max_age_s, self._deadline_ns(_in_ns(timeout_s), False))
 
     @contextlib.contextmanager
     def view(self) -> Iterator[FrameT]:
@@ -162,13 +162,13 @@ class ServiceReader(Attachment[FrameT]):
         """
         if rate_hz is None:
             self._accounts.begin_loop("asap")
+            timeout_ns = _in_ns(timeout_s)
             with short_turns():
                 while True:
-                    deadline_ns = _deadline_ns(timeout_s)
                     in_c = self._turns_in_c and not self._closed and max_age_s is None
-                    frame = self._ring.next_turn(deadline_ns) if in_c else None
+                    frame = self._ring.next_turn(timeout_ns, False) if in_c else None
                     if frame is None:
-                        frame = self._read(self._last, max_age_s, deadline_ns)
+                        frame = self._read(self._last, max_age_s, self._deadline_ns(timeout_ns, in_c))
                         self._go_round_in_c()
                     yield frame
         self._accounts.begin_loop(f"periodic {rate_hz:g} Hz")
@@ -195,13 +195,13 @@ class ServiceReader(Attachment[FrameT]):
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         self._accounts.begin_loop("in order")
+        timeout_ns = _in_ns(timeout_s)
         with short_turns():
             while True:
-                deadline_ns = _deadline_ns(timeout_s)
                 in_c = self._turns_in_c and not self._closed
-                frame = self._ring.next_turn(deadline_ns, in_order=True) if in_c else None
+                frame = self._ring.next_turn(timeout_ns, True) if in_c else None
                 if frame is None:
-                    frame = self._read_in_order(deadline_ns)
+                    frame = self._read_in_order(self._deadline_ns(timeout_ns, in_c))
                     self._go_round_in_c()
                 yield frame
 
@@ -396,6 +396,12 @@ class ServiceReader(Attachment[FrameT]):
         self._come_back()
         self._last_taken = position
 
+    def _deadline_ns(self, timeout_ns: int | None, in_c: bool) -> int | None:
+        """Of the wait for a frame that begins now, or began when C was asked for it."""
+        if timeout_ns is None:
+            return None
+        return (self._ring.begun_ns if in_c else now_ns()) + timeout_ns
+
     def _go_round_in_c(self) -> None:
         """Leave a loop's next turns to C, where there is C, until they have to be done here."""
         if self._last_taken is not None:
@@ -463,5 +469,5 @@ def _is_young(frame: Frame, max_age_s: float | None) -> bool:
     return max_age_s is None or frame.age_ns <= max_age_s * NS_PER_S
 
 
-def _deadline_ns(timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+def _in_ns(timeout_s: float | None) -> int | None:
+    return None if timeout_s is None else round(timeout_s * NS_PER_S)

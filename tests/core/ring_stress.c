@@ -120,7 +120,7 @@ static void *read_frames(void *argument) {
         abort();
     turns->ring = request.ring = ring_of();
     turns->in_order = mine->way == 1;
-    turns->until_ns = turns->deadline_ns = INT64_MAX;
+    turns->until_ns = turns->timeout_ns = INT64_MAX;
     turns->descriptor = descriptor;
     turns->process = getpid();
     while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {

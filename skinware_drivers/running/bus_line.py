@@ -27,8 +27,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 4.0
 _FIRST_PAUSE_ASIDE_S, _LONGEST_PAUSE_ASIDE_S = 1.0, 60.0
 _STOP_TIMEOUT_S = 0.8
-_OPENING_S, _CLOSING_S = 10.0, 0.9
-"""How long an interface may take to be opened and closed before somebody says that it hangs."""
+_OPENING_S = 10.0
+"""How long an interface may take to be opened before somebody says that it hangs."""
 _CHECK_PAUSE_NS = NS_PER_S // 2
 _NEVER_NS = 1 << 63
 
@@ -153,13 +153,15 @@ class BusLine:
         if opening is None or not opening.leave(self.bus.close):
             self.bus.close()
         else:
-            log.warning("bus %s: its interface hangs while it is opened, and is left to itself", self.name)
+            log.warning("bus %s: its interface is still being opened, and is left to itself", self.name)
 
-    async def close(self) -> None:
-        """Close the bus for good. One that hangs is left to itself after a second, and holds up no other meanwhile."""
+    async def close(self, patience_s: float) -> None:
+        """Close the bus for good. One that hangs is left to itself after this time, and holds up no other meanwhile."""
+        if self._opening is not None:
+            await self._opening.is_over(patience_s)
         if not self.bus.opens_slowly or self._opening is not None:
             self._close_bus()
-        elif not await SlowCall(f"bus {self.name}, closing", self.bus.close).is_over(_CLOSING_S):
+        elif not await SlowCall(f"bus {self.name}, closing", self.bus.close).is_over(patience_s):
             log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self.name)
 
     async def reopen(self) -> None:
@@ -334,15 +336,10 @@ class BusLine:
     async def stop(self) -> None:
         """Make its devices silent, if they may have been told to send and it can be done now.
 
-        A bus that is being opened meanwhile has as long for it.
-
         Raises:
             DriverError: the driver's own code failed.
         """
-        if self._opening is not None:
-            await self._opening.is_over(_STOP_TIMEOUT_S)
-            return
-        if not self.started or self.bus.fileno() < 0:
+        if not self.started or self._opening is not None or self.bus.fileno() < 0:
             return
         try:
             async with asyncio.timeout(_STOP_TIMEOUT_S):

@@ -38,6 +38,8 @@ from skinware_drivers.running.serving import Serving
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
+_END_S, _LEAST_FOR_CLOSING_S = 0.9, 0.2
+"""In which devices are made silent and buses closed, whatever hangs; and what of it closing has at least."""
 _LOOK_S = 0.5
 """While C publishes: how often files, states and counters are looked after."""
 
@@ -220,6 +222,7 @@ class Runner:
         if self._desk is not None and self.writer is not None:
             loop.remove_reader(self.writer.request_server().fileno())
             await self._desk.close()
+        begun_s = loop.time()
         stopped = await asyncio.gather(*(line.stop() for line in self.lines), return_exceptions=True)
         for failed in stopped:
             if isinstance(failed, Exception):
@@ -229,7 +232,8 @@ class Runner:
         self._intake.stop()
         if self._timer is not None:
             self._timer.cancel()
-        await asyncio.gather(*(line.close() for line in self.lines))
+        left_s = max(_LEAST_FOR_CLOSING_S, begun_s + _END_S - loop.time())
+        await asyncio.gather(*(line.close(left_s) for line in self.lines))
         self._epoll.close()
         if self.writer is not None:
             self.writer.close()

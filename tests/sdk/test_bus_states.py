@@ -19,7 +19,7 @@ from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running import bus_line, bus_news
+from skinware_drivers.running import bus_line, bus_news, runner
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.bus_news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
@@ -211,7 +211,7 @@ def test_an_interface_that_hangs_while_it_is_opened_holds_up_no_other(
 def test_a_driver_stops_while_an_interface_hangs(
     is_there: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(bus_line, "_STOP_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(runner, "_END_S", 0.2)
     slow = reporting(SlowBus)
     if not is_there:
         slow.opening.clear()
@@ -221,7 +221,7 @@ def test_a_driver_stops_while_an_interface_hangs(
             slow.opening.clear()
             running.do(slow.go_down)
         wait_until(lambda: bool(slow.opened_in))
-    assert told(caplog, "bus bus0")[-1] == ("bus bus0: its interface hangs while it is opened, and is left to itself")
+    assert told(caplog, "bus bus0")[-1] == ("bus bus0: its interface is still being opened, and is left to itself")
     threads = threading.active_count()
     slow.down = False
     slow.opening.set()  # nobody waits for it any more

@@ -196,5 +196,5 @@ def test_a_driver_ends_though_the_library_of_its_only_bus_hangs(tmp_path: Path) 
     assert driver.process.returncode == 0
     assert driver.errors.splitlines() == [
         "opening",
-        "skin-driver: bus slcan:/dev/ttyACM0: its interface hangs while it is opened, and is left to itself",
+        "skin-driver: bus slcan:/dev/ttyACM0: its interface is still being opened, and is left to itself",
     ]

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from processes import Processes, answer, own_namespace
 
 import skinware.recording
-from skinware import DriverWriter, Structure
+from skinware import DriverReader, DriverWriter, Structure
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import Periodic, now_ns
 from skinware.recording.recovery import recover
@@ -186,19 +186,23 @@ def kills(count: int, skins: list[int], folder: Path) -> None:
     """What is missing at the end of a recording whose recorder was killed at a random moment."""
     for sensors in skins:
         missing: list[float] = []
-        with own_namespace() as namespace, driving(namespace.name, sensors, "analogue"):
+        with (
+            own_namespace() as namespace,
+            driving(namespace.name, sensors, "analogue"),
+            DriverReader("large", namespace=namespace) as reader,
+        ):
             for number in range(count):
                 file = folder / f"killed-{sensors}-{number}.mcap"
                 with recording(namespace.name, file) as process:
                     time.sleep(random.uniform(0, 1.0))
-                    killed_ns = now_ns()
                     process.kill()
+                    newest_ns = reader.read().published_ns
                     process.wait()
                 whole = file.with_suffix(".whole.mcap")
                 recover(file, whole)
                 with skinware.recording.open(whole) as opened:
                     last_ns = int(opened["large"].read(["status"]).published_ns[-1])
-                missing.append((killed_ns - last_ns) / 1e9)
+                missing.append((newest_ns - last_ns) / 1e9)
                 file.unlink()
                 whole.unlink()
         p50, most = np.median(missing), max(missing)

@@ -10,6 +10,7 @@ The file is TOML. Sensors stand in groups that share a type and a frame::
     type = "pressure"
     frame = "chest"                         # whose axes the numbers are in
     radius_m = 0.002                        # of each sensor; left out where nobody knows
+    confidence = 0.95                       # that a sensor is within half a pitch of its place; may be left out
     uid = [0x70500, 0x70501]
     position_m = [[0.01, 0.02, 0.03], [0.01, 0.03, 0.03]]
     normal = [[0.0, 0.0, 1.0], [nan, nan, nan]]     # outwards, of length 1; nan where nobody knows; may be left out
@@ -64,6 +65,8 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         normal: of each sensor, of length 1, outwards; NaN where it is not known, None if no normal is known.
         radius_m: of each of them, m; None if it is not known.
         name: for people.
+        confidence: 0 to 1, the part of them that is within half a pitch of its place, as who measured them estimates;
+            None where nobody does.
     """
 
     type: str
@@ -73,6 +76,7 @@ class GeometryGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal: tuple[Triple, ...] | None = None
     radius_m: Annotated[float, msgspec.Meta(gt=0)] | None = None
     name: str = ""
+    confidence: Annotated[float, msgspec.Meta(ge=0, le=1)] | None = None
 
     def __post_init__(self) -> None:
         if len(self.frame.encode()) > _LONGEST_NAME:
@@ -113,6 +117,7 @@ class Geometry:
         position_m: (n, 3) float64, m; NaN where it is not known.
         normal: (n, 3) float64 of length 1; NaN where it is not known.
         radius_m: (n,) float64, m; NaN where it is not known.
+        confidence: (n,) float64, that of the group of each in a file; NaN where it has none. Drivers do not publish it.
     """
 
     type_name: npt.NDArray[Any]
@@ -121,6 +126,7 @@ class Geometry:
     position_m: npt.NDArray[np.float64]
     normal: npt.NDArray[np.float64]
     radius_m: npt.NDArray[np.float64]
+    confidence: npt.NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.uid)
@@ -167,12 +173,13 @@ class Geometry:
         return _empty(0).at(type_name, uid)
 
     def to_groups(self) -> list[GeometryGroup]:
-        """The sensors whose places are known, for a file: a group for each type, frame and radius."""
-        rows_of: dict[tuple[str, str, float | None], list[int]] = {}
+        """The sensors whose places are known, for a file: a group for each type, frame, radius and confidence."""
+        rows_of: dict[tuple[str, str, float | None, float | None], list[int]] = {}
         for row in np.flatnonzero(self.known).tolist():
-            radius_m = float(self.radius_m[row])
-            known_radius_m = None if np.isnan(radius_m) else radius_m
-            rows_of.setdefault((self.type_name[row], self.frame[row], known_radius_m), []).append(row)
+            radius_m, confidence = (
+                None if np.isnan(of[row]) else float(of[row]) for of in (self.radius_m, self.confidence)
+            )
+            rows_of.setdefault((self.type_name[row], self.frame[row], radius_m, confidence), []).append(row)
         return [
             GeometryGroup(
                 type=type_name,
@@ -181,8 +188,9 @@ class Geometry:
                 position_m=_triples(self.position_m[rows]),
                 normal=None if np.isnan(self.normal[rows]).all() else _triples(self.normal[rows]),
                 radius_m=radius_m,
+                confidence=confidence,
             )
-            for (type_name, frame, radius_m), rows in rows_of.items()
+            for (type_name, frame, radius_m, confidence), rows in rows_of.items()
         ]
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
@@ -226,6 +234,7 @@ class Geometry:
             position_m=np.array(columns["sensor_position_m"]).reshape(n, 3),
             normal=np.array(columns["sensor_normal"]).reshape(n, 3),
             radius_m=np.array(columns["sensor_radius_m"]),
+            confidence=np.full(n, np.nan),
         )
 
     def _take(self, rows: npt.NDArray[np.int64], type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
@@ -235,7 +244,7 @@ class Geometry:
         known = rows >= 0
         taken.type_name[:] = type_name
         taken.uid[:] = uid
-        for name in ("position_m", "normal", "radius_m", "frame"):
+        for name in ("position_m", "normal", "radius_m", "confidence", "frame"):
             getattr(taken, name)[known] = getattr(self, name)[rows[known]]
         return taken
 
@@ -269,8 +278,9 @@ def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
     for group in groups:
         lines += ["", "[[group]]"]
         lines += [f"{key} = {_string(getattr(group, key))}" for key in ("name", "type", "frame") if getattr(group, key)]
-        if group.radius_m is not None:
-            lines.append(f"radius_m = {group.radius_m!r}")
+        for key in ("radius_m", "confidence"):
+            if getattr(group, key) is not None:
+                lines.append(f"{key} = {getattr(group, key)!r}")
         lines.append(f"uid = [{', '.join(f'{uid:#x}' for uid in group.uid)}]")
         for key in ("position_m", "normal"):
             rows = getattr(group, key)
@@ -305,6 +315,8 @@ def _joined(groups: Sequence[GeometryGroup], place: Callable[[Keys], str]) -> Ge
             geometry.normal[rows] = normal / np.linalg.norm(normal, axis=1)[:, None]
         if group.radius_m is not None:
             geometry.radius_m[rows] = group.radius_m
+        if group.confidence is not None:
+            geometry.confidence[rows] = group.confidence
         row = rows.stop
     return geometry
 
@@ -318,6 +330,7 @@ def _empty(n: int) -> Geometry:
         position_m=nowhere.copy(),
         normal=nowhere,
         radius_m=np.full(n, np.nan),
+        confidence=np.full(n, np.nan),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import select
+import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -65,3 +67,11 @@ def after(seconds: float) -> Callable[[], bool]:
     """Whether so much time has passed since this call."""
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() >= end_s
+
+
+def enter_pressed() -> bool:
+    """Whether somebody has pressed Enter at the terminal; takes the line. Never without a terminal."""
+    if sys.stdin is None or not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -159,7 +158,7 @@ class _Painter:
         """Until Enter, or for so long: how many sensors were touched, and (n,) bool: which are in the region."""
         import numpy as np
 
-        from skinware.cli._driver_frames import after, frames_until
+        from skinware.cli._driver_frames import after, enter_pressed, frames_until
         from skinware.cli._rest import SETTLING_S
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.painting import without_holes
@@ -169,7 +168,7 @@ class _Painter:
         stroked = np.zeros(len(self._reader.structure.module_of(self.type_name)), bool)
         self._say("ready", f"stroke the region{' and press Enter' if duration_s is None else ''}", stroked)
         is_due = after(_TELL_EVERY_S)
-        for frame in frames_until(self._reader, _enter_pressed if duration_s is None else after(duration_s)):
+        for frame in frames_until(self._reader, enter_pressed if duration_s is None else after(duration_s)):
             stroked |= self._touched(frame)
             if is_due():
                 is_due = after(_TELL_EVERY_S)
@@ -199,14 +198,6 @@ class _Painter:
             print_json({"event": event, **(told if event == "ready" else {}), "touched": int(stroked.sum())})
         else:
             click.echo(text)
-
-
-def _enter_pressed() -> bool:
-    """Whether somebody has pressed Enter; takes the line."""
-    if not select.select([sys.stdin], [], [], 0)[0]:
-        return False
-    sys.stdin.readline()
-    return True
 
 
 def main() -> None:

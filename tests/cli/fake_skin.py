@@ -59,6 +59,7 @@ class FakeSkin:
         structure: default: four patches of sixteen modules.
         namespace: default: the one of the environment.
         slots: of its ring.
+        driver_type: that it tells.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class FakeSkin:
         structure: Structure | None = None,
         namespace: Namespace | None = None,
         slots: int = 64,
+        driver_type: str = "fake",
     ) -> None:
         self.structure = structure or fake_structure()
         self.is_hung = False
@@ -86,7 +88,7 @@ class FakeSkin:
         self.writer = DriverWriter(
             name,
             self.structure,
-            driver_type="fake",
+            driver_type=driver_type,
             bus_counters=BUS_COUNTERS,
             patch_counters=PATCH_COUNTERS,
             namespace=namespace,

@@ -10,16 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.cli._command import exit_status
+from skinware.cli.calibrate import command as calibrate
 from skinware.cli.info import command as info
 from skinware.cli.press import command as press
 from skinware.cli.recover import command as recover
 from skinware.cli.regions import command as regions
 from skinware.cli.replay import command as replay
 from skinware.cli.top import command as top
+from skinware.geometry import geometry_to_toml
 from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
 from skinware_drivers.cli.dump import command as dump
@@ -34,6 +37,7 @@ from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
+from tests.cli.test_calibrate import calm_skin, finger_presses, stroked_state, strokes
 from tests.cli.test_contacts import touched_skin
 from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
 from tests.cli.test_sensor_health import looked_after
@@ -140,8 +144,8 @@ Print = Callable[..., list[Any]]
 def printing(capsys: pytest.CaptureFixture[str]) -> Print:
     """Runs a command and gives what it prints."""
 
-    def run(command: click.Command, *arguments: str) -> list[Any]:
-        assert exit_status(command, [*arguments, "--json"]) == 0, capsys.readouterr().err
+    def run(command: click.Command, *arguments: str, status: int = 0) -> list[Any]:
+        assert exit_status(command, [*arguments, "--json"]) == status, capsys.readouterr().err
         return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
 
     return run
@@ -271,6 +275,23 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
             check("`skin-record`", ready, status, record.stop())
     check("`skin-recover`", *printing(recover, str(file)))
     check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
+
+
+def test_calibrate(printing: Print, tmp_path: Path) -> None:
+    surface, _ = strokes()
+    file = tmp_path / "skin.toml"
+    with publishing(calm_skin(surface)) as skin, running("skin-calibrate", "topology", "-o", str(file)) as topology:
+        live = [topology.wait_for("ready"), topology.wait_for("progress"), topology.stop()]
+        stroked_state(file, skin.structure)
+        live += printing(calibrate, "topology", "-o", str(file), "-T", "0")
+        wrong = skin.structure.geometry
+        assert wrong is not None
+        wrong.position_m[:] = np.roll(wrong.position_m, len(surface) // 2, axis=0)  # exchanged patches
+        wrong.position_m[3] = wrong.position_m[4]
+        file.write_text(geometry_to_toml(wrong.to_groups()))
+        live += printing(calibrate, "check", str(file), "-T", "0", status=1)
+    with finger_presses(tmp_path / "finger.toml", surface) as arguments:
+        check("`skin-calibrate`", *live, *printing(calibrate, *arguments[:-1]))
 
 
 class _Stop:

@@ -114,6 +114,8 @@ def test_normals_of_few_digits_get_the_length_1(tmp_path: Path) -> None:
         (HEAD + GROUP + "normal = [[0, 0, 1], [0, 0, 2]]", "normal 1 has the length 2, not 1"),
         (HEAD + GROUP + "normal = [[0, 0, 1]]", "2 uid, but 1 normal"),
         (HEAD + GROUP + "radius_m = 0.0", "radius_m"),
+        (HEAD + GROUP + "confidence = 1.1", "confidence"),
+        (HEAD + GROUP + "confidence = -0.1", "confidence"),
         (HEAD + "group = 3", "group"),
         ("a = " + "[" * 5000, "not TOML"),
         (HEAD + GROUP.replace("chest", "c" * 65), "is longer than 64 bytes - at $.group[0]"),
@@ -166,6 +168,7 @@ groups = st.fixed_dictionaries(
         "position_m": rows | st.just([[1.0, 0.0, 0.0]] * 2),
         "normal": rows | st.just([[1.0, 0.0, 0.0]] * 2),
         "radius_m": odd | st.just(1.0),
+        "confidence": odd | st.just(0.5),
         "name": odd,
     },
 )
@@ -190,6 +193,7 @@ def test_groups_of_a_geometry_are_what_is_known_of_it_and_read_the_same(tmp_path
         GeometryGroup("pressure", "arm", (1, 2), ((0, 0, 1), (0, 1, 0)), ((0, 0, 1), (nan, nan, nan)), 0.002),
         GeometryGroup("pressure", "hand", (3,), ((1, 0, 0),)),
         GeometryGroup("pressure", "arm", (4,), ((1, 1, 0),), None, 0.001),
+        GeometryGroup("pressure", "arm", (5,), ((1, 2, 0),), None, 0.001, confidence=0.9),
         GeometryGroup("temperature", "arm", (1,), ((0, 0, 2),), ((1, 0, 0),), 0.002),
     ]
     path = tmp_path / "places.toml"
@@ -200,6 +204,8 @@ def test_groups_of_a_geometry_are_what_is_known_of_it_and_read_the_same(tmp_path
     again = read_geometry(path)
     for name in ("type_name", "uid", "frame"):
         assert getattr(again, name).tolist() == getattr(read, name).tolist()
-    for name in ("position_m", "normal", "radius_m"):
+    assert np.isnan(read.confidence).tolist() == [True] * 4 + [False, True]
+    assert read.confidence[4] == 0.9
+    for name in ("position_m", "normal", "radius_m", "confidence"):
         assert np.array_equal(getattr(again, name), getattr(read, name), equal_nan=True)
     assert Geometry.unknown(["pressure"], np.array([9], np.uint64)).to_groups() == []

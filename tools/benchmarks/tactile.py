@@ -6,6 +6,7 @@
 * motion: how well strokes of known speed and direction are told (motion.py).
 * service: ``skin-calm`` on a driver of 30,848 taxels with places at 50 Hz: processor time of its whole process, which
   publishes contacts too.
+* calibration: the parts of an iCub, pressed and stroked, with many seeds (calibration.py).
 * worlds: 25 minutes of drift and touches (``bench_world``), many worlds for each drift and rate.
 """
 
@@ -22,6 +23,7 @@ from dataclasses import fields
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import calibration
 import contacts
 import health
 import motion
@@ -41,7 +43,7 @@ TAXELS = 30_848
 RATE_HZ = 50
 MODULE, PATCH = np.arange(TAXELS) // 12, np.arange(TAXELS) // 192
 WARM_UP, FRAMES = 400, 1000
-PARTS = ("speed", "contacts", "health", "motion", "service", "worlds")
+PARTS = ("speed", "contacts", "health", "motion", "service", "calibration", "worlds")
 
 
 def blobs(random: np.random.Generator) -> npt.NDArray[np.bool_]:
@@ -189,6 +191,7 @@ def main() -> None:
     parser.add_argument("part", nargs="*", choices=(*PARTS, []), help="default: all")
     parser.add_argument("--worlds", type=int, default=20, help="of each drift, at each rate")
     parser.add_argument("--rates", default="20,50,100", help="Hz")
+    parser.add_argument("--seeds", type=int, default=20, help="of each part, for calibration")
     parser.add_argument("--seconds", type=float, default=20.0, help="how long the service is measured")
     arguments = parser.parse_args()
     parts = arguments.part or PARTS
@@ -203,6 +206,8 @@ def main() -> None:
         motion.main()
     if "service" in parts:
         service(arguments.seconds)
+    if "calibration" in parts:
+        calibration.calibrate(arguments.seeds)
     if "worlds" in parts:
         worlds(arguments.worlds, [float(rate) for rate in arguments.rates.split(",")])
 

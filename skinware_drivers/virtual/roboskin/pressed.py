@@ -160,6 +160,7 @@ class PressedSkin:
                 position_m=surface.position_m,
                 normal=surface.normal,
                 radius_m=np.full(n, _TAXEL_RADIUS_M),
+                confidence=np.full(n, np.nan),
             )
             for name in ("pressure", "temperature")
         ]

@@ -1,0 +1,175 @@
+"""How ``skin-calibrate`` gathers presses or strokes: until there are enough, or Enter, a time, or Ctrl-C."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+
+from skinware.cli._command import print_json, warn
+from skinware.cli._coverage import SIGNS, bars, picture
+from skinware.cli._driver_frames import after, enter_pressed, frames_until
+from skinware.cli._format import terminal_width
+from skinware.driver_service import DriverReader
+from skinware.structure import Structure
+from skinware.tactile.calibration.sessions import Session
+from skinware.tactile.calibration.sources import LoadSource, PoseSource
+from skinware.tactile.calibration.state import restore_session, save_session
+
+_TELL_EVERY_S = 1.0
+_SAVE_EVERY_S = 10.0
+_WIDTH = 100
+
+
+class Gathering:
+    """Takes the frames of a driver into a session, and tells how far it is.
+
+    Args:
+        reader: of the driver.
+        session: that gathers.
+        source: of the loads.
+        poses: of the presses; None: the session wants none.
+        state_path: file of what was gathered.
+        fresh: begin anew, whatever that file has.
+        as_json: how to tell.
+
+    Attributes:
+        structure: of the driver.
+        type_name: of the sensors.
+        restored: whether it goes on with what the state file had.
+
+    Raises:
+        ConfigurationError: the state file cannot be gone on with.
+    """
+
+    def __init__(
+        self,
+        reader: DriverReader,
+        session: Session,
+        source: LoadSource,
+        poses: PoseSource | None,
+        state_path: Path,
+        *,
+        fresh: bool,
+        as_json: bool,
+    ) -> None:
+        self._reader, self._session, self._source, self._poses = reader, session, source, poses
+        self._state_path, self._as_json = state_path, as_json
+        self.structure: Structure = reader.structure
+        self.type_name: str = source.type_name
+        self._uid: npt.NDArray[np.uint64] = reader.structure.sensor_uid[reader.structure.index(source.type_name)]
+        self.restored: bool = not fresh and restore_session(state_path, session, source.type_name, self._uid)
+        self._told = -1.0
+
+    def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
+        """Gather until that part of the sensors have all that is wanted, or for so long, or until Enter.
+
+        What was gathered is in the state file then, also after Ctrl-C. A person sees what is covered.
+
+        Args:
+            what_to_do: for the person.
+            share: 0 to 1.
+            duration_s: at most so long, once the rest is known; None: no limit.
+
+        Raises:
+            ServiceTimeout: the driver is silent.
+            KeyboardInterrupt: Ctrl-C.
+        """
+        try:
+            self._run(what_to_do, share, duration_s)
+            self._tell_coverage()
+        except KeyboardInterrupt:
+            if self._as_json:
+                print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})
+            else:
+                click.echo(f"\nwhat was gathered is in {self._state_path}; the same command goes on with it")
+            raise
+
+    def _tell_coverage(self) -> None:
+        """For people: how far each patch is, and a picture of the skin."""
+        if self._as_json:
+            return
+        structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
+        for line in bars(structure, type_name, coverage):
+            click.echo(line)
+        click.echo()
+        for line in picture(structure, type_name, coverage, min(terminal_width() or _WIDTH, _WIDTH)):
+            click.echo(line)
+        click.echo(f"\n{SIGNS[0]} nothing   {SIGNS[1]} to {SIGNS[-2]} some   {SIGNS[-1]} all that is wanted")
+
+    def _run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
+        gathers = duration_s is None or duration_s > 0
+        try:
+            if gathers:
+                self._wait_for_rest()
+            self._tell_ready(what_to_do)
+            if gathers:
+                self._gather(share, duration_s)
+        finally:
+            self._save()
+
+    def _gather(self, share: float, duration_s: float | None) -> None:
+        time_is_over = after(math.inf if duration_s is None else duration_s)
+        tell, save = after(_TELL_EVERY_S), after(_SAVE_EVERY_S)
+        for frame in frames_until(
+            self._reader, lambda: self._session.is_complete(share) or time_is_over() or enter_pressed()
+        ):
+            pose = None if self._poses is None else self._poses.newest()
+            self._session.take(frame.acquired_ns, self._source.loads(frame), pose)
+            if tell():
+                tell = after(_TELL_EVERY_S)
+                self._tell_progress()
+            if save():
+                save = after(_SAVE_EVERY_S)
+                self._save()
+
+    def _wait_for_rest(self) -> None:
+        if not self._source.ready and not self._as_json:
+            click.echo("leave the skin alone for some seconds ...")
+        refused = 0.0
+        for frame in frames_until(self._reader, lambda: self._source.ready):
+            self._source.loads(frame)
+            if self._source.refused_share and not refused:
+                refused = self._source.refused_share
+                warn(f"{100 * refused:.0f} % of the sensors move and have no baseline yet; leave them alone")
+
+    def _save(self) -> None:
+        save_session(self._state_path, self._session, self.type_name, self._uid)
+
+    def _figures(self) -> dict[str, Any]:
+        coverage = self._session.coverage
+        return {**self._session.figures, "sensors": len(coverage), "covered": int((coverage >= 1).sum())}
+
+    def _tell_ready(self, what_to_do: str) -> None:
+        if self._as_json:
+            told = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
+            print_json({"event": "ready", **told, **self._figures()})
+            return
+        if self.restored:
+            click.echo(f"going on with what is in {self._state_path}")
+        click.echo(what_to_do)
+
+    def _tell_progress(self) -> None:
+        structure, coverage = self.structure, self._session.coverage
+        figures = self._figures()
+        if self._as_json:
+            patch = structure.patch_of(self.type_name)
+            of_patch = {
+                name: round(float((coverage[patch == number] >= 1).mean()), 3)
+                for number, name in enumerate(structure.patch_names)
+                if (patch == number).any()
+            }
+            print_json({"event": "progress", **figures, "patches": of_patch})
+            return
+        mean = float(coverage.mean())
+        if mean != self._told:
+            self._told = mean
+            gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
+            click.echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
+
+
+__all__ = ["Gathering"]

@@ -1,0 +1,381 @@
+"""``skin-calibrate``: where the sensors of a skin are, by touching it; and whether a geometry is right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    EXIT_DONE,
+    EXIT_FAILED,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+)
+from skinware.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from skinware.cli._gathering import Gathering
+    from skinware.structure import Structure
+    from skinware.tactile.calibration.placing import Placement
+    from skinware.tactile.calibration.shapes import Shape
+
+_Decorated = TypeVar("_Decorated", bound=Callable[..., Any])
+_PATH = click.Path(path_type=Path)
+_POSES_TIMEOUT_S = 5.0
+_MM = 1e3
+_STROKE = "stroke the whole skin with one finger"
+_PRESS = "press the skin at known places; hold each for a moment"
+
+
+def _options(*options: Callable[[_Decorated], _Decorated]) -> Callable[[_Decorated], _Decorated]:
+    """Several options as one decorator, in their order."""
+
+    def decorate(command: _Decorated) -> _Decorated:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+_output = click.option("-o", "--output", "file", type=_PATH, metavar="GEOMETRY", required=True, help="File to write.")
+_pitch = click.option(
+    "--pitch",
+    "pitch_m",
+    type=click.FloatRange(0, min_open=True),
+    metavar="M",
+    default=0.0065,
+    show_default=True,
+    help="Distance between neighbouring sensors, metres.",
+)
+_gathering = _options(
+    click.option("--driver", metavar="DRIVER", help="Driver to read, if several run."),
+    click.option("--type", "type_name", metavar="TYPE", help="Sensors.  [default: pressure, or the first type]"),
+    click.option(
+        "--share",
+        type=click.FloatRange(0, 1),
+        default=0.95,
+        show_default=True,
+        help="Stop when this part of the sensors have enough.",
+    ),
+    click.option("-T", "duration_s", type=seconds, help="Gather for SECONDS at most; 0: use what was gathered."),
+    click.option("--state", metavar="FILE", type=_PATH, help="What was gathered.  [default: GEOMETRY.state.npz]"),
+    click.option("--fresh", is_flag=True, help="Begin anew, whatever that file has."),
+    namespace_option,
+    json_option,
+    version_option,
+)
+_pressing = _options(
+    click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
+    click.option("--poses-namespace", metavar="NAME", help="Where that service is.  [default: as --namespace]"),
+    click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted of each sensor."),
+    click.option("--frame", metavar="NAME", help="Whose axes the poses are in.  [default: name of the service]"),
+)
+
+
+@dataclass(frozen=True)
+class _How:
+    """The options of all commands that gather."""
+
+    driver: str | None
+    type_name: str | None
+    share: float
+    duration_s: float | None
+    state: Path | None
+    fresh: bool
+    namespace: str | None
+    as_json: bool
+
+
+@click.group("skin-calibrate", context_settings=CONTEXT_SETTINGS)
+@version_option
+def command() -> None:
+    """Find where the sensors of a skin are, by touching it; check a geometry.
+
+    Gathering ends when enough is there, or with Enter. Ctrl-C interrupts it: what was gathered is in a state file, and
+    the same command goes on with it.
+    """
+
+
+@command.command(
+    epilog=examples(
+        "skin-calibrate topology -o map.toml                    stroke the skin for some minutes",
+        "skin-calibrate topology --namespace calm -o map.toml    with what skin-calm publishes",
+    )
+)
+@_output
+@_pitch
+@_gathering
+def topology(file: Path, pitch_m: float, **options: Any) -> None:
+    """Find which sensors lie side by side, from strokes with a finger, and draw a map of each piece of skin.
+
+    Nothing but a finger is needed. Curved pieces come out unrolled. The longer, the better: it goes on until 95 % of
+    the sensors have felt the finger in 20 frames.
+    """
+    import numpy as np
+
+    from skinware.cli._format import plural
+    from skinware.geometry import geometry_to_toml
+    from skinware.tactile.calibration.results import unrolled_comment, unrolled_groups
+    from skinware.tactile.calibration.sessions import StrokeSession
+    from skinware.tactile.calibration.topology import topology_of
+
+    how = _How(**options)
+    with _opened(_beside(file, how), StrokeSession, how) as (gathering, session):
+        gathering.run(_STROKE, how.share, how.duration_s)
+        found = topology_of(session.sums, pitch_m)
+        groups = unrolled_groups(gathering.structure, gathering.type_name, found)
+        file.write_text(geometry_to_toml(groups, unrolled_comment(found)), encoding="utf-8")
+    pieces = np.bincount(found.piece[found.piece >= 0]).tolist()
+    _tell_done(
+        how.as_json,
+        {"file": str(file), "placed": sum(pieces), "pieces": pieces, "neighbours": len(found.pairs)},
+        f"{file}: {sum(pieces)} sensors in {plural(len(pieces), 'piece')}, {len(found.pairs)} pairs of neighbours",
+    )
+
+
+@command.command(
+    epilog=examples(
+        "skin-calibrate touch --poses robot -o skin.toml                       the robot publishes point_m",
+        "skin-calibrate touch --poses robot --layout cad.toml -o skin.toml     modules are shaped as in cad.toml",
+    )
+)
+@_output
+@_pressing
+@click.option("--column", metavar="NAME", default="point_m", show_default=True, help="With the points, metres.")
+@click.option("--layout", metavar="FILE", type=_PATH, help="Geometry whose modules have the right shapes.")
+@click.option(
+    "--offset",
+    "offset_m",
+    type=float,
+    metavar="M",
+    default=0.0,
+    help="From sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
+)
+@_pitch
+@_gathering
+def touch(
+    file: Path,
+    service: str,
+    poses_namespace: str | None,
+    touches: int,
+    frame: str | None,
+    column: str,
+    layout: Path | None,
+    offset_m: float,
+    pitch_m: float,
+    **options: Any,
+) -> None:
+    """Find where the sensors are, from presses at points that a service publishes.
+
+    A press is a touch whose point rests for 0.2 s. Wrong ones are found and left out. With the shapes of the modules
+    places are twice as good, sensors that were not touched are placed too, and it is known where outside is.
+    """
+    from skinware.tactile.calibration.placing import place
+    from skinware.tactile.calibration.sessions import PressSession
+
+    how = _How(**options)
+    if offset_m and layout is None:
+        raise click.UsageError("--offset needs --layout: which way is out?")
+    session_of = partial(PressSession, wanted=touches)
+    where = (service, poses_namespace, column, (3,))
+    with _opened(_beside(file, how), session_of, how, where) as (gathering, session):
+        shapes = None if layout is None else _shapes(gathering.structure, gathering.type_name, layout)
+        gathering.run(_PRESS, how.share, how.duration_s)
+        placement = place(session.presses, shapes, offset_m=offset_m)
+        _write(file, gathering, placement, frame or service, pitch_m)
+    _tell_placed(how.as_json, file, placement, {}, "")
+
+
+@command.command(
+    epilog=examples(
+        "skin-calibrate finger --poses robot --layout cad.toml -o skin.toml    the robot publishes pose, 4 x 4",
+        "skin-calibrate finger --poses robot --layout cad.toml --tip 0 0 0.12 -o skin.toml",
+    )
+)
+@_output
+@_pressing
+@click.option("--column", metavar="NAME", default="pose", show_default=True, help="With the poses, 4 x 4, metres.")
+@click.option(
+    "--layout", metavar="FILE", type=_PATH, required=True, help="Geometry whose modules have the right shapes."
+)
+@click.option(
+    "--tip", "tip_m", type=float, nargs=3, default=(0, 0, 0), help="Where the tip may be, in the carrier's frame."
+)
+@_pitch
+@_gathering
+def finger(
+    file: Path,
+    service: str,
+    poses_namespace: str | None,
+    touches: int,
+    frame: str | None,
+    column: str,
+    layout: Path,
+    tip_m: tuple[float, float, float],
+    pitch_m: float,
+    **options: Any,
+) -> None:
+    """Find where the modules are and how long the finger is, from poses of what carries the finger.
+
+    For robots that touch themselves: the pose of the hand is known, in the frame of the skin, but not exactly where the
+    tip of the finger is.
+    """
+    from skinware.tactile.calibration.finger import place_finger
+    from skinware.tactile.calibration.sessions import PressSession
+
+    how = _How(**options)
+    session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
+    where = (service, poses_namespace, column, (4, 4))
+    with _opened(_beside(file, how), session_of, how, where) as (gathering, session):
+        shapes = _shapes(gathering.structure, gathering.type_name, layout)
+        gathering.run(_PRESS, how.share, how.duration_s)
+        found = place_finger(session.presses, shapes, tip_m)
+        _write(file, gathering, found.placement, frame or service, pitch_m)
+    tip = [round(number, 6) for number in found.tip_m.tolist()]
+    words = f"; the tip is at {', '.join(f'{_MM * number:.1f}' for number in tip)} mm"
+    _tell_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+
+
+@command.command(
+    epilog=examples(
+        "skin-calibrate check skin.toml                       stroke the skin for some minutes",
+        "skin-calibrate check skin.toml --state map.toml.state.npz -T 0    with strokes of skin-calibrate topology",
+    )
+)
+@click.argument("file", metavar="GEOMETRY", type=_PATH)
+@_pitch
+@_gathering
+@click.pass_context
+def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any) -> None:
+    """Compare a geometry with strokes over the skin.
+
+    Names modules and patches that are at each other's places, modules that are mirrored or turned, sensors at one place
+    or without any, and sensors that are more than 10 mm off.
+
+    Exit status: 0 nothing found, 1 something is wrong.
+    """
+    from skinware.cli._findings import finding_data, finding_text
+    from skinware.geometry import read_geometry
+    from skinware.tactile.calibration.checking import check_file, check_strokes
+    from skinware.tactile.calibration.sessions import StrokeSession
+    from skinware.tactile.calibration.topology import topology_of
+
+    geometry = read_geometry(file)
+    how = _How(**options)
+    with _opened(_beside(file, how), StrokeSession, how) as (gathering, session):
+        gathering.run(_STROKE, how.share, how.duration_s)
+        structure, type_name = gathering.structure, gathering.type_name
+    places, module = geometry.of(structure, type_name), structure.module_of(type_name)
+    found = check_file(places, module)
+    if session.sums.frames:
+        topology = topology_of(session.sums, pitch_m)
+        found += check_strokes(places, module, structure.patch_of(type_name), topology)
+    for finding in found:
+        if how.as_json:
+            print_json({"event": "finding", **finding_data(finding, structure, type_name)})
+        else:
+            click.echo(finding_text(finding, structure, type_name))
+    _tell_done(
+        how.as_json,
+        {"file": str(file), "findings": len(found), "compared": session.sums.frames > 0},
+        f"{file}: {len(found) or 'nothing'} found{'' if session.sums.frames else '; no strokes to compare it with'}",
+    )
+    context.exit(EXIT_FAILED if found else EXIT_DONE)
+
+
+def _beside(file: Path, how: _How) -> Path:
+    """The state file: the one that was given, or beside the geometry."""
+    return how.state or file.with_name(f"{file.name}.state.npz")
+
+
+@contextmanager
+def _opened(
+    state_path: Path,
+    session_of: Callable[[int], Any],
+    how: _How,
+    poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
+) -> Iterator[tuple[Gathering, Any]]:
+    """What gathers, with driver and poses open, and the session that it gathers into.
+
+    Args:
+        state_path: where what was gathered is kept.
+        session_of: makes a session of a number of sensors.
+        how: options of all commands that gather.
+        poses: service, its namespace, column and shape.
+    """
+    from skinware.cli._driver_frames import reader_of
+    from skinware.cli._gathering import Gathering
+    from skinware.memory.namespace import Namespace
+    from skinware.service import ServiceReader
+    from skinware.tactile.calibration.sources import LoadSource, PoseSource
+
+    with ExitStack() as stack:
+        reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
+        source = LoadSource(reader.structure, reader.driver_type, how.type_name)
+        pose_source = None
+        if poses is not None:
+            service, poses_namespace, column, shape = poses
+            place = Namespace(poses_namespace or how.namespace)
+            pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
+            pose_source = PoseSource(pose_reader, column, shape)
+        session = session_of(len(reader.structure.module_of(source.type_name)))
+        gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
+        yield gathering, session
+
+
+def _shapes(structure: Structure, type_name: str, layout: Path) -> Mapping[int, Shape]:
+    """The shapes of the modules, from a geometry."""
+    from skinware.geometry import read_geometry
+    from skinware.tactile.calibration.shapes import shapes_of
+
+    places = read_geometry(layout).of(structure, type_name)
+    kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
+    shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
+    if not shapes:
+        raise ConfigurationError(f"{layout}: no whole module of this driver has places in it")
+    return shapes
+
+
+def _write(file: Path, gathering: Gathering, placement: Placement, frame: str, pitch_m: float) -> None:
+    from skinware.geometry import geometry_to_toml
+    from skinware.tactile.calibration.results import placed_comment, placed_groups
+
+    structure, type_name = gathering.structure, gathering.type_name
+    if not placement.known.any():
+        raise click.ClickException("no sensor was pressed often enough; nothing is written")
+    groups = placed_groups(structure, type_name, placement, frame, pitch_m)
+    file.write_text(geometry_to_toml(groups, placed_comment(structure, type_name, placement)), encoding="utf-8")
+
+
+def _tell_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
+    known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
+    figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
+    text = (
+        f"{file}: {known} sensors placed, {wrong} presses left out, residual {_MM * placement.spread_m:.1f} mm{words}"
+    )
+    _tell_done(as_json, {"file": str(file), **figures, **also}, text)
+
+
+def _tell_done(as_json: bool, told: Mapping[str, Any], words: str) -> None:
+    if as_json:
+        print_json({"event": "done", **told})
+    else:
+        click.echo(words)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

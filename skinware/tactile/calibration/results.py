@@ -1,0 +1,141 @@
+"""A calibration as a geometry file: a group for each module, with how sure it is; what was measured in the head."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.geometry import GeometryGroup, Triple
+from skinware.structure import Structure
+from skinware.tactile.calibration.placing import Placement
+from skinware.tactile.calibration.topology import Topology
+from skinware.tactile.calibration.unrolling import unrolled_m
+
+ArrayF = npt.NDArray[np.float64]
+
+_DIGITS = 6
+
+
+def confidence_of(error_m: ArrayF, pitch_m: float) -> float:
+    """The part of sensors that is within half a pitch of its place, if errors along the skin are normal.
+
+    Args:
+        error_m: (k,) root of the mean square error that each is expected to have, m.
+        pitch_m: distance between neighbours, m.
+    """
+    within = 1 - np.exp(-((pitch_m / 2 / np.maximum(error_m, 1e-9)) ** 2))
+    return round(float(within.mean()), 3)
+
+
+def placed_groups(
+    structure: Structure, type_name: str, placement: Placement, frame: str, pitch_m: float
+) -> list[GeometryGroup]:
+    """The groups of a geometry file, one for each module that has any place.
+
+    Args:
+        structure: of the skin.
+        type_name: of the sensors that were placed.
+        placement: of them, in the order of the structure.
+        frame: in which the poses were.
+        pitch_m: distance between neighbours, for confidences.
+    """
+    return [
+        _group(
+            structure,
+            type_name,
+            module,
+            rows,
+            placement.position_m,
+            placement.normal,
+            frame,
+            confidence_of(placement.error_m[rows], pitch_m),
+        )
+        for module, rows in _by_module(structure, type_name, placement.known)
+    ]
+
+
+def unrolled_groups(structure: Structure, type_name: str, topology: Topology) -> list[GeometryGroup]:
+    """The groups of a geometry file in which each piece of skin is a flat map of its own.
+
+    Args:
+        structure: of the skin.
+        type_name: of the sensors that were stroked.
+        topology: of them, in the order of the structure.
+    """
+    groups: list[GeometryGroup] = []
+    for piece in range(topology.n_pieces):
+        taxels = np.flatnonzero(topology.piece == piece)
+        position = np.full((len(topology.piece), 3), np.nan)
+        position[taxels, :2], position[taxels, 2] = unrolled_m(topology, taxels), 0
+        normal = np.full_like(position, np.nan)
+        groups += [
+            _group(structure, type_name, module, rows, position, normal, f"piece {piece + 1}")
+            for module, rows in _by_module(structure, type_name, topology.piece == piece)
+        ]
+    return groups
+
+
+def placed_comment(structure: Structure, type_name: str, placement: Placement) -> str:
+    """What a file says of its own quality: of the presses, and of each patch."""
+    index = structure.patch_of(type_name)
+    wrong = int(placement.wrong.sum())
+    presses, residual = f"{len(placement.residual_m)} presses, {wrong} of them left out", 1e3 * placement.spread_m
+    lines = [f"{presses}; median residual of the others {residual:.1f} mm"]
+    for patch, name in enumerate(structure.patch_names):
+        of_patch = index == patch
+        known = of_patch & placement.known
+        if known.any():
+            error_mm = 1e3 * np.median(placement.error_m[known])
+            lines.append(f"{name}: {known.sum()} of {of_patch.sum()} placed, expected error {error_mm:.1f} mm")
+        elif of_patch.any():
+            lines.append(f"{name}: not placed")
+    return "\n".join(lines)
+
+
+def unrolled_comment(topology: Topology) -> str:
+    """What a file of maps says of itself."""
+    sizes = ", ".join(str(int((topology.piece == piece).sum())) for piece in range(topology.n_pieces))
+    lost = int((topology.piece < 0).sum())
+    return (
+        "Found by stroking alone: each piece of skin is unrolled onto a plane of its own, and may be mirrored.\n"
+        f"Pieces: {topology.n_pieces}, of {sizes or 'no'} sensors; not known: {lost};"
+        f" neighbours: {len(topology.pairs)} pairs"
+    )
+
+
+def _by_module(
+    structure: Structure, type_name: str, wanted: npt.NDArray[np.bool_]
+) -> list[tuple[int, npt.NDArray[np.int64]]]:
+    """By module, the rows among the sensors of the type that are wanted."""
+    module = structure.module_of(type_name)
+    return [(number, np.flatnonzero(wanted & (module == number))) for number in np.unique(module[wanted]).tolist()]
+
+
+def _group(
+    structure: Structure,
+    type_name: str,
+    module: int,
+    rows: npt.NDArray[np.int64],
+    position_m: ArrayF,
+    normal: ArrayF,
+    frame: str,
+    confidence: float | None = None,
+) -> GeometryGroup:
+    uid = structure.sensor_uid[structure.index(type_name)][rows]
+    known = np.isfinite(normal[rows]).all()
+    return GeometryGroup(
+        type=type_name,
+        frame=frame,
+        uid=tuple(uid.tolist()),
+        position_m=_triples(position_m[rows]),
+        normal=_triples(normal[rows]) if known else None,
+        confidence=confidence,
+        name=structure.module_names[module],
+    )
+
+
+def _triples(rows: ArrayF) -> tuple[Triple, ...]:
+    return tuple((x, y, z) for x, y, z in np.round(rows, _DIGITS).tolist())
+
+
+__all__ = ["confidence_of", "placed_comment", "placed_groups", "unrolled_comment", "unrolled_groups"]

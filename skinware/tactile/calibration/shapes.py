@@ -1,0 +1,135 @@
+"""Modules are rigid: their shapes, from places in any frame, and the poses that bring a shape onto measured places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+ArrayF = npt.NDArray[np.float64]
+ArrayI = npt.NDArray[np.int64]
+
+LEAST_TAXELS = 4
+"""With fewer measured places than that, a module cannot be brought onto them."""
+_OUTLIER_M = 0.002
+_ROUNDS = 5
+_FLAT = 0.02
+"""A shape whose second extent is below this part of its first is a line: it does not say which way is up."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Of a module, in axes of its own.
+
+    Attributes:
+        taxel: (k,) its taxels.
+        place_m: (k, 3) their places, with the mean at 0.
+        normal: (k, 3) of length 1, NaN where it is not known.
+    """
+
+    taxel: ArrayI
+    place_m: ArrayF
+    normal: ArrayF
+
+
+def shapes_of(
+    module: npt.NDArray[np.integer],
+    kind: Sequence[str],
+    position_m: ArrayF,
+    normal: ArrayF,
+) -> dict[int, Shape]:
+    """By module, its shape, wherever places are known for all of its taxels.
+
+    A module without places of its own has the shape of one of the same kind with as many taxels: their order is that
+    of their kind.
+
+    Args:
+        module: (n,) of each taxel.
+        kind: of each module, by its number; empty: like no other.
+        position_m: (n, 3), NaN where it is not known.
+        normal: (n, 3) likewise.
+    """
+    shapes: dict[int, Shape] = {}
+    like: dict[tuple[str, int], Shape] = {}
+    numbers = np.unique(module).tolist()
+    for number in numbers:
+        taxel = np.flatnonzero(module == number)
+        places = position_m[taxel]
+        if not np.isfinite(places).all() or not _has_extent(places):
+            continue
+        shapes[number] = Shape(taxel, places - places.mean(axis=0), normal[taxel])
+        like.setdefault((kind[number], len(taxel)), shapes[number])
+    for number in numbers:
+        taxel = np.flatnonzero(module == number)
+        lent = like.get((kind[number], len(taxel))) if kind[number] else None
+        if number not in shapes and lent is not None:
+            shapes[number] = Shape(taxel, lent.place_m, lent.normal)
+    return shapes
+
+
+def _has_extent(places: ArrayF) -> bool:
+    """Whether places tell how a module lies: they are not on a line, nor at one point."""
+    if len(places) < LEAST_TAXELS:
+        return False
+    extents = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > _FLAT * extents[0] > 0)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a module is.
+
+    Attributes:
+        rotation: (3, 3).
+        origin_m: (3,).
+    """
+
+    rotation: ArrayF
+    origin_m: ArrayF
+
+    def places_m(self, shape: Shape) -> ArrayF:
+        """(k, 3) where the taxels of a shape are."""
+        places: ArrayF = shape.place_m @ self.rotation.T + self.origin_m
+        return places
+
+    def normals(self, shape: Shape) -> ArrayF:
+        """(k, 3) their normals."""
+        normals: ArrayF = shape.normal @ self.rotation.T
+        return normals
+
+
+def fitted(shape: Shape, measured_m: ArrayF, weight: ArrayF) -> Pose | None:
+    """The pose that brings a shape onto measured places; None: they are too few, or on a line.
+
+    Places far from where the shape says lose their weight: 1 / (1 + (distance / 2 mm)^2), in 5 rounds.
+
+    Args:
+        shape: of the module.
+        measured_m: (k, 3) of its taxels, NaN where there is none.
+        weight: (k,) of each.
+    """
+    known = np.isfinite(measured_m).all(axis=1) & (weight > 0)
+    if known.sum() < LEAST_TAXELS or not _has_extent(shape.place_m[known]):
+        return None
+    source, target, given = shape.place_m[known], measured_m[known], weight[known] / weight[known].sum()
+    now = given
+    for _ in range(_ROUNDS):
+        pose = rigid(source, target, now)
+        distance = np.linalg.norm(source @ pose.rotation.T + pose.origin_m - target, axis=1)
+        now = given / (1 + (distance / _OUTLIER_M) ** 2)
+    return pose
+
+
+def rigid(source: ArrayF, target: ArrayF, weight: ArrayF) -> Pose:
+    """The rotation and shift that bring (k, 3) places onto others, by weighted least squares (Procrustes)."""
+    share = weight / weight.sum()
+    from_m, to_m = share @ source, share @ target
+    u, _, vt = np.linalg.svd((target - to_m).T @ ((source - from_m) * share[:, None]))
+    turn = np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)])
+    rotation = u @ turn @ vt
+    return Pose(rotation, to_m - rotation @ from_m)
+
+
+__all__ = ["LEAST_TAXELS", "Pose", "Shape", "fitted", "rigid", "shapes_of"]

@@ -1,0 +1,123 @@
+"""Where frames come from: the loads of a driver, calmed or not, and the poses of a service."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_frame import DriverFrame
+from skinware.errors import ConfigurationError, Overrun, ServiceTimeout
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.service import ServiceReader
+from skinware.structure import Structure
+from skinware.tactile.baseline import UNUSABLE
+from skinware.tactile.chain import Chain, ChainSettings
+
+ArrayF = npt.NDArray[np.float64]
+
+POINT, POSE = "point_m", "pose"
+"""Columns of a service of poses: (3,) or (k, 3) points in m; (4, 4) of what carries a finger, homogeneous, in m."""
+
+_COUNT = "count"
+_OLDEST_NS = NS_PER_S // 5
+_CALM_TYPE = "calm"
+_PREFERRED = "pressure"
+
+
+class LoadSource:
+    """The loads of the sensors of one type of a driver: 0 where nothing touches.
+
+    What ``skin-calm`` publishes is taken as it is, values of any other driver go through a baseline here.
+
+    Args:
+        structure: of the driver.
+        driver_type: as it tells.
+        type_name: which sensors; None: pressure, or else the driver's first type.
+
+    Attributes:
+        structure: of the driver.
+        type_name: which sensors.
+
+    Raises:
+        StructureError: no such type here.
+        ConfigurationError: sensors of that type have no rest.
+    """
+
+    def __init__(self, structure: Structure, driver_type: str, type_name: str | None = None) -> None:
+        names = [t.name for t in structure.types]
+        self.structure = structure
+        self.type_name: str = type_name or (_PREFERRED if _PREFERRED in names else names[0])
+        self._index = structure.index(self.type_name)
+        self._chain: Chain | None = None
+        if driver_type != _CALM_TYPE:
+            self._chain = ChainSettings.calm().chain(structure)
+            if self.type_name not in self._chain.baselines:
+                raise ConfigurationError(f"{self.type_name} sensors have no rest that a touch raises them from")
+            self._values = np.zeros(structure.n_sensors, np.float32)
+            self._status = np.zeros(structure.n_sensors, np.uint8)
+
+    @property
+    def ready(self) -> bool:
+        """Whether what the sensors read at rest is known, of most of them."""
+        return self._chain is None or bool(self._chain.baselines[self.type_name].ready.mean() > 0.5)
+
+    @property
+    def refused_share(self) -> float:
+        """The part of the sensors that have no baseline yet because they move; 0: none."""
+        return 0.0 if self._chain is None else self._chain.baselines[self.type_name].refused_share
+
+    def loads(self, frame: DriverFrame) -> ArrayF:
+        """(n,) the loads in a frame; NaN where they are not known."""
+        if self._chain is None:
+            values, status = frame.physical(self.type_name), frame.status_of(self.type_name)
+        else:
+            self._chain.step(frame, self._values, self._status)
+            values, status = self._values[self._index], self._status[self._index]
+        usable = (status & np.uint8(UNUSABLE)) == 0
+        loads: ArrayF = np.where(usable, values, np.nan).astype(np.float64)
+        return loads
+
+
+class PoseSource:
+    """The newest pose of a service that publishes poses.
+
+    A service may have several points and a column ``count`` of those that press: it tells a pose while that is one.
+
+    Args:
+        reader: of the service.
+        column: with the poses.
+        shape: (3,) for points, (4, 4) for poses.
+
+    Raises:
+        ConfigurationError: the service has no such column of floats.
+    """
+
+    def __init__(self, reader: ServiceReader[Any], column: str, shape: tuple[int, ...]) -> None:
+        columns = reader.schema.columns
+        if column not in columns:
+            there_are = ", ".join(columns)
+            raise ConfigurationError(f"service {reader.name!r} has no column {column!r}; there are: {there_are}")
+        found = tuple(columns[column].shape)
+        self._has_count = found[1:] == shape and _COUNT in columns
+        if columns[column].dtype.kind != "f" or not (found == shape or found == (1, *shape) or self._has_count):
+            raise ConfigurationError(f"column {column!r} of {reader.name!r} is {found}; poses are {shape}, of floats")
+        self._reader, self._column, self._shape = reader, column, shape
+
+    def newest(self) -> ArrayF | None:
+        """The pose of now; None if it is older than 0.2 s, or there is none."""
+        try:
+            frame = self._reader.read(timeout_s=0)
+        except (ServiceTimeout, Overrun):
+            return None
+        if frame.stale or now_ns() - frame.published_ns > _OLDEST_NS:
+            return None
+        if self._has_count and int(np.asarray(frame.column(_COUNT)).reshape(-1)[0]) != 1:
+            return None
+        rows = np.asarray(frame.column(self._column), np.float64).reshape(-1, *self._shape)
+        pose: ArrayF = rows[0].copy()
+        return pose
+
+
+__all__ = ["POINT", "POSE", "LoadSource", "PoseSource"]

@@ -15,7 +15,7 @@ the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``fram
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
 
@@ -23,13 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
-from skinware.errors import BadServiceFile
-from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import DEFAULT_SLOTS, Column, ServiceReader, ServiceWriter
+from skinware.service import DEFAULT_SLOTS, Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
+from skinware.tactile.source_reader import SourceReader
 
 KIND = NAME = "contacts"
 
@@ -101,7 +100,7 @@ class ContactsFrame(Frame):
         return iter(self.contacts)
 
 
-class ContactsReader(ServiceReader[ContactsFrame]):
+class ContactsReader(SourceReader[ContactsSource, ContactsFrame]):
     """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose frames are contacts.
 
     Args:
@@ -112,41 +111,22 @@ class ContactsReader(ServiceReader[ContactsFrame]):
         BadServiceFile: the service is none of contacts.
     """
 
+    kind = KIND
     frame_class = ContactsFrame
 
-    def __init__(
-        self,
-        name: str = NAME,
-        *,
-        namespace: Namespace | str | None = None,
-        timeout_s: float | None = 0.0,
-        announce: bool = True,
-    ) -> None:
-        super().__init__(name, namespace=namespace, timeout_s=timeout_s, announce=announce)
+    @staticmethod
+    def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> ContactsSource:
+        return ContactsSource(
+            driver=texts(static["driver"])[0],
+            type_name=texts(static["type_name"])[0],
+            unit=texts(static["type_unit"])[0],
+            uid=static["sensor_uid"].astype(np.uint64),
+            frames=tuple(texts(static["frame_name"])),
+        )
 
-    @property
-    def source(self) -> ContactsSource:
-        """What the contacts are of."""
-        return cast(ContactsSource, self._ring.context)
-
-    def _describe(self, attached: segments.Segment) -> ContactsSource:
-        if bytes(attached.header["kind"]) != KIND.encode():
-            raise BadServiceFile(f"service {self.name!r} is none of contacts")
-        static, columns = attached.static_columns(), attached.schema.columns
-        try:
-            source = ContactsSource(
-                driver=texts(static["driver"])[0],
-                type_name=texts(static["type_name"])[0],
-                unit=texts(static["type_unit"])[0],
-                uid=static["sensor_uid"].astype(np.uint64),
-                frames=tuple(texts(static["frame_name"])),
-            )
-            for name, (dtype, shape) in _frame_columns(len(source.uid)).items():
-                if columns[name].dtype != np.dtype(dtype) or columns[name].shape != shape:
-                    raise ValueError(f"column {name!r} is not {shape} of {dtype}")
-        except (LookupError, ValueError, TypeError, AttributeError) as error:
-            raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
-        return source
+    @staticmethod
+    def _layout_of(source: ContactsSource) -> Mapping[str, tuple[str, tuple[int, ...]]]:
+        return _frame_columns(len(source.uid))
 
 
 class ContactsWriter:

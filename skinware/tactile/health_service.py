@@ -22,13 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
-from skinware.errors import BadServiceFile
-from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import Column, ServiceReader, ServiceWriter
+from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.health_report import COLUMNS, HealthReport
+from skinware.tactile.source_reader import SourceReader
 
 KIND = NAME = "health"
 RATE_HZ = 1.0
@@ -80,7 +79,7 @@ class HealthFrame(Frame):
         return HealthReport(**{name: self.column(name) for name in COLUMNS})
 
 
-class HealthReader(ServiceReader[HealthFrame]):
+class HealthReader(SourceReader[HealthSource, HealthFrame]):
     """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose frames are reports.
 
     Args:
@@ -91,38 +90,19 @@ class HealthReader(ServiceReader[HealthFrame]):
         BadServiceFile: the service is none of health.
     """
 
+    kind = KIND
     frame_class = HealthFrame
 
-    def __init__(
-        self,
-        name: str = NAME,
-        *,
-        namespace: Namespace | str | None = None,
-        timeout_s: float | None = 0.0,
-        announce: bool = True,
-    ) -> None:
-        super().__init__(name, namespace=namespace, timeout_s=timeout_s, announce=announce)
+    @staticmethod
+    def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> HealthSource:
+        uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
+        if uid.shape != type_id.shape:
+            raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
+        return HealthSource(texts(static["driver"])[0], uid, type_id)
 
-    @property
-    def source(self) -> HealthSource:
-        """What it is told of."""
-        return cast(HealthSource, self._ring.context)
-
-    def _describe(self, attached: segments.Segment) -> HealthSource:
-        if bytes(attached.header["kind"]) != KIND.encode():
-            raise BadServiceFile(f"service {self.name!r} is none of health")
-        static, columns = attached.static_columns(), attached.schema.columns
-        try:
-            uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
-            source = HealthSource(texts(static["driver"])[0], uid, type_id)
-            if uid.shape != type_id.shape:
-                raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
-            for name, (dtype, _) in COLUMNS.items():
-                if columns[name].dtype != np.dtype(dtype) or columns[name].shape != uid.shape:
-                    raise ValueError(f"column {name!r} is not {uid.shape} of {dtype}")
-        except (LookupError, ValueError, TypeError, AttributeError) as error:
-            raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
-        return source
+    @staticmethod
+    def _layout_of(source: HealthSource) -> Mapping[str, tuple[str, tuple[int, ...]]]:
+        return {name: (dtype, source.uid.shape) for name, (dtype, _) in COLUMNS.items()}
 
 
 class HealthWriter:

@@ -13,7 +13,7 @@ Columns of a frame: those of :data:`skinware.tactile.motion.COLUMNS`, a row for 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self, cast
 
@@ -21,16 +21,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import texts
-from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.memory import segments
+from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import Column, ServiceReader, ServiceWriter
+from skinware.service import Column, ServiceWriter
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
+from skinware.tactile.source_reader import SourceReader
 
 KIND = NAME = "motion"
 
@@ -82,7 +82,7 @@ class MotionFrame(Frame):
         return iter(self.motion)
 
 
-class MotionReader(ServiceReader[MotionFrame]):
+class MotionReader(SourceReader[MotionSource, MotionFrame]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose frames are motion.
 
     Args:
@@ -93,42 +93,22 @@ class MotionReader(ServiceReader[MotionFrame]):
         BadServiceFile: the service is none of motion.
     """
 
+    kind = KIND
     frame_class = MotionFrame
 
-    def __init__(
-        self,
-        name: str = NAME,
-        *,
-        namespace: Namespace | str | None = None,
-        timeout_s: float | None = 0.0,
-        announce: bool = True,
-    ) -> None:
-        super().__init__(name, namespace=namespace, timeout_s=timeout_s, announce=announce)
+    @staticmethod
+    def _source_of(static: Mapping[str, npt.NDArray[Any]]) -> MotionSource:
+        return MotionSource(
+            driver=texts(static["driver"])[0],
+            type_name=texts(static["type_name"])[0],
+            unit=texts(static["type_unit"])[0],
+            regions=tuple(texts(static["region_name"])),
+            frames=tuple(texts(static["frame_name"])),
+        )
 
-    @property
-    def source(self) -> MotionSource:
-        """What the motion is of."""
-        return cast(MotionSource, self._ring.context)
-
-    def _describe(self, attached: segments.Segment) -> MotionSource:
-        if bytes(attached.header["kind"]) != KIND.encode():
-            raise BadServiceFile(f"service {self.name!r} is none of motion")
-        static, columns = attached.static_columns(), attached.schema.columns
-        try:
-            source = MotionSource(
-                driver=texts(static["driver"])[0],
-                type_name=texts(static["type_name"])[0],
-                unit=texts(static["type_unit"])[0],
-                regions=tuple(texts(static["region_name"])),
-                frames=tuple(texts(static["frame_name"])),
-            )
-            for name, (dtype, shape) in COLUMNS.items():
-                wanted = (len(source.regions), *shape)
-                if columns[name].dtype != np.dtype(dtype) or columns[name].shape != wanted:
-                    raise ValueError(f"column {name!r} is not {wanted} of {dtype}")
-        except (LookupError, ValueError, TypeError, AttributeError) as error:
-            raise BadServiceFile(f"{attached.path}: {error}; not attached") from None
-        return source
+    @staticmethod
+    def _layout_of(source: MotionSource) -> Mapping[str, tuple[str, tuple[int, ...]]]:
+        return {name: (dtype, (len(source.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
 
 
 class MotionWriter:

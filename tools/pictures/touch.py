@@ -1,6 +1,6 @@
-"""The pictures of docs/tactile: what a baseline, contacts, regions and health make of a skin whose truth is known.
+"""The pictures of docs/tactile: what each part of skinware.tactile makes of a skin whose truth is known.
 
-Usage: python tools/pictures/touch.py FOLDER        (writes baseline.svg, contacts.svg, regions.svg, health.svg there)
+Usage: python tools/pictures/touch.py FOLDER        (writes NAME.svg there, for each NAME in PICTURES)
 """
 
 from __future__ import annotations
@@ -15,8 +15,12 @@ import numpy.typing as npt
 from skinware import Structure
 from skinware.sensor_types import PRESSURE
 from skinware.tactile import Baseline, Box, Contacts, Health, HealthKind, HealthSettings, Region, Regions
+from skinware.tactile.calibration.placing import place
+from skinware.tactile.calibration.presses import Presses
+from skinware.tactile.calibration.shapes import shapes_of
+from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.testing import Response, World, arm, grid
+from skinware.tactile.testing import Response, World, arm, grid, triangles
 
 ArrayF = npt.NDArray[np.float64]
 
@@ -137,8 +141,8 @@ def regions_picture() -> str:
         colours[index] = colour_of[name]
     parts, height = _taxels(surface.position_m, surface.normal[:, 2] > 0.4, colours.tolist())
     words = {"wrist": 'box = [{ frame = "arm", ... }]', "hand": 'patch = ["board 10"]'}
-    for place, (name, colour) in enumerate(colour_of.items()):
-        parts.append(_text(40 + 330 * place, 24, f"{name}: {words[name]}", colour=colour, bold=True))
+    for number, (name, colour) in enumerate(colour_of.items()):
+        parts.append(_text(40 + 330 * number, 24, f"{name}: {words[name]}", colour=colour, bold=True))
     return _svg("Two regions of an arm, seen from above", height, parts)
 
 
@@ -175,6 +179,87 @@ def health_picture() -> str:
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="none" stroke="{_RED}" stroke-width="3"/>')
         parts.append(_text(x + 12, y - 10, HealthKind(report.kind[taxel]).name.lower(), colour=_RED, bold=True))
     return _svg("Five broken taxels of an arm that was stroked for a minute, seen from above", height, parts)
+
+
+def motion_picture() -> str:
+    """A finger that strokes to and fro, faster each time: the velocity of the region along x, told and in truth."""
+    surface = grid(rows=6, columns=30)
+    (low_m, low_y_m), (high_m, high_y_m) = surface.position_m.min(axis=0)[:2], surface.position_m.max(axis=0)[:2]
+    ways = [(low_m, high_m), (high_m, low_m)]
+    world = World(surface, seed=5, drift_per_min=1)
+    strokes, begin_s = [], 7.0
+    for number, speed_m_s in enumerate((0.02, 0.04, 0.08)):
+        ends = [(at, (low_y_m + high_y_m) / 2, 0.0) for at in ways[number % 2]]
+        end_s = begin_s + (high_m - low_m) / speed_m_s
+        world.stroke(ends, 60, begin_s, end_s, radius_m=0.005)
+        strokes.append((begin_s, end_s, speed_m_s * (-1) ** number))
+        begin_s = end_s + 1.5
+    until_s = begin_s
+    places = surface.geometry("arm")
+    baseline, contacts = Baseline(surface.module, surface.patch), Contacts(len(places), neighbours(places), places)
+    told = []
+    for sample in world.record(until_s):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+        found = contacts.update(calm.value, calm.touched, sample.time_ns)
+        told.append(motion_of({"all": slice(None)}, found, calm.value).velocity_m_s[0, 0])
+    time_s, velocity = np.arange(len(told)) / world.rate_hz, 1e3 * np.array(told)
+    left, right, top, height, from_s = 60, 20, 30, 260, 6.0
+
+    def x(at_s: float | ArrayF) -> ArrayF:
+        return left + (_WIDTH - left - right) * (np.asarray(at_s) - from_s) / (until_s - from_s)
+
+    def y(value: float | ArrayF) -> ArrayF:
+        return top + height * (120 - np.asarray(value)) / 280
+
+    parts = [_text(left, top - 10, "velocity of a region along its length, mm/s", bold=True)]
+    for value in range(-160, 121, 40):
+        parts.append(_line([left, _WIDTH - right], [float(y(value))] * 2, _PALE))
+        parts.append(_text(left - 8, float(y(value)) + 5, str(value), anchor="end"))
+    for first_s, last_s, speed_m_s in strokes:
+        parts.append(_line(x(np.array([first_s, last_s])), y(np.full(2, 1e3 * speed_m_s)), _GREY, width=3))
+    for first, last in _runs(np.isfinite(velocity) & (time_s > from_s)):
+        parts.append(_line(x(time_s[first:last]), y(velocity[first:last]), _GREEN, width=2))
+    parts.append(_text(_WIDTH - right, top + 14, "grey: the finger; green: what is told", anchor="end"))
+    bottom = top + height + 20
+    parts += [_text(float(x(second)), bottom, f"{second} s", anchor="middle") for second in range(8, int(until_s), 2)]
+    return _svg("The motion of a region while a finger strokes it", bottom + 14, parts)
+
+
+def calibration_picture() -> str:
+    """Triangles whose taxels were pressed five times each, by points good to 2 mm: true places and those found."""
+    surface = triangles(modules=7)
+    random = np.random.default_rng(3)
+    taxel = np.repeat(np.arange(len(surface)), 5)
+    away = random.uniform(-0.004, 0.004, (len(taxel), 3)) * (1, 1, 0)
+    true_m = surface.position_m[taxel] + away
+    distance_m = np.linalg.norm(true_m[:, None] - surface.position_m, axis=2)
+    load = np.rint(80 * np.exp(-0.5 * (distance_m / 0.004) ** 2) + random.normal(0, 1.5, distance_m.shape))
+    presses = Presses.of_arrays(true_m + random.normal(0, 0.002, true_m.shape), np.where(load < 8, 0, load))
+    layout = shapes_of(surface.module, ["triangle"] * surface.n_modules, surface.position_m, surface.normal)
+    ways = {
+        "each taxel by itself": (place(presses), _AMBER),
+        "with the layout of modules": (place(presses, layout), _BLUE),
+    }
+    origin_m = surface.position_m[:, :2].min(axis=0)
+    scale, left, top = 5600.0, 60, 70
+    parts = []
+
+    def at(position_m: ArrayF) -> ArrayF:
+        return np.asarray(scale * (position_m[:, :2] - origin_m) + (left, top))
+
+    true = at(surface.position_m)
+    for x, y in true.tolist():
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="9" fill="none" stroke="{_GREY}" stroke-width="2"/>')
+    words_x = 40.0
+    for name, (placement, colour) in ways.items():
+        off_mm = 1e3 * np.linalg.norm(placement.position_m - surface.position_m, axis=1)
+        parts.append(_text(words_x, 30, f"{name}: off by {np.nanmean(off_mm):.1f} mm", colour=colour, bold=True))
+        words_x += 320
+        for (x, y), (true_x, true_y) in zip(at(placement.position_m).tolist(), true.tolist(), strict=True):
+            parts.append(_line([true_x, x], [true_y, y], colour))
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>')
+    parts.append(_text(_WIDTH - 30, 30, "circles: the truth", anchor="end"))
+    return _svg("Places of taxels from presses, and the truth", float(true[:, 1].max()) + 40, parts)
 
 
 def _on_page(xy_m: ArrayF) -> ArrayF:
@@ -231,6 +316,8 @@ PICTURES = {
     "contacts": contacts_picture,
     "regions": regions_picture,
     "health": health_picture,
+    "motion": motion_picture,
+    "calibration": calibration_picture,
 }
 
 if __name__ == "__main__":

@@ -99,6 +99,9 @@ class Stamper:
         np.minimum(stamps, poll_ns, out=stamps)
         if is_step:
             np.maximum.accumulate(stamps, out=stamps)
+        else:
+            # the kernel begins to stamp in the background: what came before that has the time at which it was read
+            stamps = np.minimum.accumulate(stamps[::-1])[::-1]
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
         self._last_poll_ns = min(int(stamps[-1]), poll_ns)
         if self.hardware:

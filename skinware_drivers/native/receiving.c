@@ -33,7 +33,7 @@ static void stamp(struct path *path, struct source *source, int64_t first, int64
     int64_t before_ns = source->offset_ns, poll_ns = 0, *stamps = path->batch->time_ns + first, latest_ns = INT64_MIN;
     source->offset_ns = offset_now_ns(&poll_ns);
     int64_t step_ns = source->offset_ns - before_ns;
-    bool is_step = step_ns > SLEW_NS || step_ns < -SLEW_NS;
+    bool is_step = step_ns > SLEW_NS || step_ns < -SLEW_NS, is_falling = false;
     for (int64_t i = 0; i < n; i++) {
         const int64_t *words = control + (first + i) * (CONTROL_BYTES / 8) + SOFTWARE_WORD;
         int64_t software_ns = words[0] * INT64_C(1000000000) + words[1], other_ns = software_ns + before_ns;
@@ -47,8 +47,12 @@ static void stamp(struct path *path, struct source *source, int64_t first, int64
             stamps[i] = poll_ns;
         if (is_step && stamps[i] < latest_ns)
             stamps[i] = latest_ns;
+        is_falling |= stamps[i] < latest_ns;
         latest_ns = stamps[i];
     }
+    for (int64_t i = n - 2; is_falling && i >= 0; i--)
+        if (stamps[i] > stamps[i + 1])
+            stamps[i] = stamps[i + 1];
     source->last_poll_ns = latest_ns < poll_ns ? latest_ns : poll_ns;
 }
 

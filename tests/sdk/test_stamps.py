@@ -74,6 +74,19 @@ def test_frames_before_and_after_a_step_in_one_batch(monkeypatch: pytest.MonkeyP
     assert stamper.read(np.concatenate([early, late])).tolist() == [start_ns + 1_000_000, start_ns + 2_000_000]
 
 
+def test_frames_that_came_before_the_kernel_stamped_are_not_later_than_those_after_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clocks = Clocks(monkeypatch)
+    stamper = Stamper()
+    start_ns = clocks.monotonic_ns
+    when_read = [start_ns + 5_000_000, start_ns + 5_001_000]
+    when_arrived = [start_ns + 1_000_000, start_ns + 2_000_000]
+    clocks.monotonic_ns += 6_000_000
+    expected = [when_arrived[0], when_arrived[0], *when_arrived]
+    assert stamper.read(control(clocks, when_read + when_arrived)).tolist() == expected
+
+
 def test_a_pause_between_two_clock_reads_bends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     clocks = Clocks(monkeypatch)
     stamper = Stamper()

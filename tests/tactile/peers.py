@@ -44,7 +44,7 @@ class TareOnce:
         if self._base is None:
             self._frames.append(values.astype(np.float32))
             if len(self._frames) == self._left:
-                self._base = np.mean(np.array(self._frames), axis=0)
+                self._base = np.mean(np.array(self._frames), axis=0).astype(np.float32)
             return _nothing(len(values))
         above = values.astype(np.float32) - self._base
         return above > 8, above
@@ -83,7 +83,7 @@ class ICub:
         if self._base is None:
             self._frames.append(values.astype(np.float32))
             if len(self._frames) == self._left:
-                self._base = np.mean(np.array(self._frames), axis=0)
+                self._base = np.mean(np.array(self._frames), axis=0).astype(np.float32)
                 above = np.percentile(np.array(self._frames), 95, axis=0).astype(np.float32) - self._base
                 self._threshold, self._shown = np.maximum(above, 1), np.zeros_like(self._base)
             return _nothing(len(values))

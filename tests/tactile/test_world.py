@@ -179,7 +179,7 @@ def test_drift_is_common_with_a_factor_of_each_taxel() -> None:
 
 def test_waves_start_at_zero_and_each_patch_has_its_own() -> None:
     world = quiet(grid(4, patches=2), wave=5, wave_s=10, drift_spread=0)
-    values = world.record(20).values
+    values = world.record(20).values.astype(np.float64)
     assert np.ptp(values, axis=0) == pytest.approx(10, rel=0.01)
     assert not np.allclose(values[:, 0], values[:, -1], atol=0.5)
     assert np.allclose(values[0], 0, atol=0.1)

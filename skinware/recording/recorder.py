@@ -80,6 +80,7 @@ class Recorder:
         self._bytes_given = 0
         self._coder = _Coder(target, self._jobs)
         self._collector = Collector(Namespace.of(namespace), names, self)
+        self._collector.take()  # what comes later is recorded from its first frame on
         self._stopping = False
 
     @property

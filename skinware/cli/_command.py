@@ -13,7 +13,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NoReturn, TypeVar
 
 import click
@@ -77,6 +77,25 @@ def print_json(data: object) -> None:
 def warn(text: str) -> None:
     """One line on stderr under the running command's name, for what is worth knowing but no error."""
     click.echo(f"{click.get_current_context().info_name}: {text}", err=True)
+
+
+@contextlib.contextmanager
+def signals_end(
+    stop: Callable[[], object], others: Mapping[signal.Signals, Callable[[], object]] | None = None
+) -> Iterator[None]:
+    """SIGINT and SIGTERM end what runs in this block in good order, whatever it is doing.
+
+    Args:
+        stop: what they call, in the main thread.
+        others: what other signals call.
+    """
+    calls = {signal.SIGINT: stop, signal.SIGTERM: stop, **(others or {})}
+    before = {number: signal.signal(number, lambda *_, call=call: call()) for number, call in calls.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run(command: click.Command) -> NoReturn:

@@ -7,6 +7,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
+import numpy as np
+import numpy.typing as npt
+
 from skinware.driver_service import DriverFrame, DriverReader
 from skinware.errors import ConfigurationError, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
@@ -61,6 +64,13 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
             continue
         heard_s = time.monotonic()
         yield newest
+
+
+def physical_of(frame: DriverFrame, type_name: str) -> npt.NDArray[np.float32]:
+    """(n_sensors,) float32: the physical values of the sensors of a type; 0 for those of other types."""
+    physical = np.zeros(frame.structure.n_sensors, np.float32)
+    physical[frame.structure.index(type_name)] = frame.physical(type_name)
+    return physical
 
 
 def after(seconds: float) -> Callable[[], bool]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +17,11 @@ from skinware.cli._command import (
     namespace_option,
     print_json,
     run,
+    signals_end,
     version_option,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from skinware.tactile.calm_service import CalmService
 
 
@@ -133,23 +131,11 @@ def command(
     if name not in source.services():
         there_are = ", ".join(source.services()) or "none"
         click.echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
-    with _signals_end(service):
+    with signals_end(service.stop):
         service.run((lambda: _tell_status(service)) if as_json else lambda: None)
     if as_json:
         with contextlib.suppress(BrokenPipeError):
             print_json({"event": "stopped", "name": service.name, **service.status()})
-
-
-@contextlib.contextmanager
-def _signals_end(service: CalmService) -> Iterator[None]:
-    """SIGINT and SIGTERM end it in good order, whatever it is doing."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: service.stop()) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def _tell_ready(service: CalmService, as_json: bool) -> None:

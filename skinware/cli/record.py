@@ -7,7 +7,6 @@ import errno
 import re
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from skinware.cli._command import (
     print_json,
     run,
     seconds,
+    signals_end,
     version_option,
 )
 
@@ -122,7 +122,7 @@ def command(
     recorder = Recorder(target, names=names or None, namespace=place)
     report = _Report(recorder, target, path, as_json)
     failed = True
-    with _signals(recorder):
+    with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):
         report.ready(names, place.name)
         try:
             recorder.run(duration_s, report.status)
@@ -189,22 +189,6 @@ class _Report:
 
     def _figures(self, messages: dict[str, int]) -> dict[str, Any]:
         return {"messages": messages, "lost": self._recorder.lost, "bytes": self._target.size}
-
-
-@contextlib.contextmanager
-def _signals(recorder: Recorder) -> Iterator[None]:
-    """SIGINT and SIGTERM end it in good order; SIGUSR1 saves what is only in memory."""
-    handlers = {
-        signal.SIGINT: lambda *_: recorder.stop(),
-        signal.SIGTERM: lambda *_: recorder.stop(),
-        signal.SIGUSR1: lambda *_: recorder.save(),
-    }
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def main() -> None:

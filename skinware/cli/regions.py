@@ -180,12 +180,10 @@ class _Painter:
 
     def _touched(self, frame: DriverFrame) -> npt.NDArray[np.bool_]:
         """(n,) bool: which sensors of the type are far from rest."""
-        import numpy as np
-
+        from skinware.cli._driver_frames import physical_of
         from skinware.cli._wipe import threshold
 
-        physical = np.zeros(frame.structure.n_sensors, np.float32)
-        physical[self._index] = frame.physical(self.type_name)
+        physical = physical_of(frame, self.type_name)
         fresh = frame.status == 0
         self._rest.follow(physical, fresh, frame.published_ns)
         change = self._rest.change(physical)[self._index]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +16,7 @@ from skinware.cli._command import (
     print_json,
     run,
     seconds,
+    signals_end,
     version_option,
     warn,
 )
@@ -86,7 +85,7 @@ def command(
         for name in names:
             recording[name]
         replayer = Replayer(recording, names=names or None, namespace=place, speed=factor)
-        with contextlib.closing(replayer), _signals(replayer):
+        with contextlib.closing(replayer), signals_end(replayer.stop):
             _ready(recording, names, place.name, as_json)
             _play(replayer, start_s, end_s, loop, as_json)
         for problem in recording.problems:
@@ -121,18 +120,6 @@ def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
         elif event == "stopped":
             late = f", {replayer.late} of them late" if replayer.late else ""
             click.echo(f"{replayer.frames.total()} frames published{late}")
-
-
-@contextlib.contextmanager
-def _signals(replayer: Replayer) -> Iterator[None]:
-    """SIGINT and SIGTERM end it in good order."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: replayer.stop()) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 def main() -> None:

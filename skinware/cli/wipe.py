@@ -165,16 +165,11 @@ class _Wipe:
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverFrame, npt.NDArray[np.float32]]]:
         """Frames with their physical values, (n_sensors,); 0 for sensors of other types."""
-        import numpy as np
+        from skinware.cli._driver_frames import after, frames_until, physical_of
 
-        from skinware.cli._driver_frames import after, frames_until
-
-        index = self._structure.index(self._type.name)
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):
-            physical = np.zeros(self._structure.n_sensors, np.float32)
-            physical[index] = frame.physical(self._type.name)
             self._status = frame.status
-            yield frame, physical
+            yield frame, physical_of(frame, self._type.name)
 
     def _progress(self) -> str:
         answered = self._n_tested - len(self._never_answered())

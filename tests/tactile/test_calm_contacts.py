@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,11 @@ from skinware import DriverReader, Namespace, Status, Structure
 from skinware.geometry import Geometry
 from skinware.sensor_types import SHEAR_X, TEMPERATURE
 from skinware.tactile.calm_service import CalmService
-from skinware.tactile.contacts_service import ContactsFrame, ContactsReader, ContactsWriter
+from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import running
+from tests.tactile.reading import read_until
 from tests.tactile.skins import triangles
 
 REST, PRESSED = 200.0, 150.0
@@ -65,20 +66,6 @@ def calming(into: Namespace, name: str = "fake", **how: Any) -> Iterator[CalmSer
 def tare(into: Namespace, name: str = "fake") -> None:
     with DriverReader(name, namespace=into, timeout_s=10) as reader:
         reader.call("tare")
-
-
-def read_until(reader: ContactsReader, condition: Callable[[ContactsFrame], bool]) -> ContactsFrame:
-    """The first frame that fulfils a condition."""
-    found: list[ContactsFrame] = []
-
-    def look() -> bool:
-        frame = reader.read(timeout_s=10)
-        if condition(frame):
-            found.append(frame)
-        return bool(found)
-
-    wait_until(look)
-    return found[0]
 
 
 def test_contacts_stand_beside_the_calmed_driver(into: Namespace) -> None:

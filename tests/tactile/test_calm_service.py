@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skinware import DriverFrame, DriverReader, Namespace, PatchState, Status
+from skinware import DriverReader, Namespace, PatchState, Status
 from skinware.errors import ConfigurationError, NameInUse, RequestFailed, RequestRefused, ServiceError, SkinwareError
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_service import CalmService
@@ -24,6 +24,7 @@ from skinware.tactile.chain_state import default_path, read_state, save_state
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, run, running
+from tests.tactile.reading import read_until
 
 
 @pytest.fixture(autouse=True)
@@ -66,20 +67,6 @@ def idle(skin: FakeSkin) -> FakeSkin:
     """Nobody touches it: all sensors show 200."""
     skin.values = np.full(skin.structure.n_sensors, 200.0)
     return skin
-
-
-def read_until(reader: DriverReader, condition: Callable[[DriverFrame], bool]) -> DriverFrame:
-    """The first frame that fulfils a condition."""
-    found: list[DriverFrame] = []
-
-    def look() -> bool:
-        frame = reader.read()
-        if condition(frame):
-            found.append(frame)
-        return bool(found)
-
-    wait_until(look)
-    return found[0]
 
 
 def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,11 @@ from skinware import Namespace, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
 from skinware.tactile.calm_contacts import WatchedRegions
 from skinware.tactile.motion import COLUMNS
-from skinware.tactile.motion_service import MotionFrame, MotionReader, MotionWriter
+from skinware.tactile.motion_service import MotionReader, MotionWriter
 from skinware.tactile.regions import Region, Regions
-from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import running
+from tests.tactile.reading import read_until
 from tests.tactile.test_calm_contacts import calming, placed_structure, press, tare
 
 REGIONS = Regions(
@@ -39,20 +38,6 @@ patch = ["board 7"]
 @pytest.fixture
 def into(calm_namespace: Namespace) -> Namespace:
     return calm_namespace
-
-
-def read_until(reader: MotionReader, condition: Callable[[MotionFrame], bool]) -> MotionFrame:
-    """The first frame that fulfils a condition."""
-    found: list[MotionFrame] = []
-
-    def look() -> bool:
-        frame = reader.read(timeout_s=10)
-        if condition(frame):
-            found.append(frame)
-        return bool(found)
-
-    wait_until(look)
-    return found[0]
 
 
 def test_regions_of_the_driver_are_told(into: Namespace) -> None:

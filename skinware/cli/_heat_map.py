@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._shapes import Shape, rows_of, shape_of
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.views.shapes import Shape, rows_of, shape_of
 
 LEVELS = 16
 FRESH, STALE, OUT_OF_RANGE, SUSPECT, UNHEALTHY, NO_ACK, MASKED, NEVER_SEEN, NOT_CONNECTED, UNMOVED = range(10)

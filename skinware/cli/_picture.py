@@ -10,20 +10,20 @@ import numpy.typing as npt
 from rich.text import Text
 
 from skinware.cli._format import figure_text
-from skinware.cli._health import status_now
 from skinware.cli._heat_map import FRESH, UNMOVED, Arrangement, arrange, codes_of, marks_of
 from skinware.cli._painting import marks_text, scale_text
 from skinware.cli._palette import TRUE_COLOURS, Palette
-from skinware.cli._rest import Rest
 from skinware.cli._scale import CHANGE, RANGE, RAW, SCALES, ChangeScale, Scaled, ValueScale
 from skinware.cli._top_rows import RowKey, patches_of, title_of
-from skinware.cli._wipe import WipeTest
 from skinware.driver_service import DriverFrame
 from skinware.sensor_types import SensorType
 from skinware.skin_layout import SkinLayout
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
+from skinware.views.health import status_now
+from skinware.views.rest import Rest
+from skinware.views.wiping import WipeTest
 
 _NAMED_STATUSES = {bit: str(bit.name).lower().replace("_", " ") for bit in Status}
 _PEAK = "peak"

@@ -8,15 +8,6 @@ import msgspec
 import numpy as np
 
 from skinware import native
-from skinware.cli._health import (
-    bus_reason_name,
-    bus_state_name,
-    life_of,
-    patch_ages_ns,
-    patch_state_name,
-    rate_now_hz,
-    status_now,
-)
 from skinware.driver_service import KIND, DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS, ReaderRecord, living_readers
@@ -27,6 +18,15 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import sample_report
 from skinware.service import ServiceReader
 from skinware.status import DataPath, load_report
+from skinware.views.health import (
+    bus_reason_name,
+    bus_state_name,
+    life_of,
+    patch_ages_ns,
+    patch_state_name,
+    rate_now_hz,
+    status_now,
+)
 
 FrameT = TypeVar("FrameT", bound=Frame)
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.cli._heat_map import levels_of
+from skinware.views.scales import ChangeSpan, ValueLimits
 
 Floats = npt.NDArray[np.float32]
 Levels = npt.NDArray[np.uint8]
@@ -16,11 +17,6 @@ Levels = npt.NDArray[np.uint8]
 CHANGE, RANGE, RAW = "change", "range", "raw"
 SCALES = (CHANGE, RANGE, RAW)
 """Names of the scales, in the order in which they take turns."""
-
-_LEAST_SPAN = 8
-"""Of a scale of changes, in multiples of the noise."""
-_FORGET_S = 20.0
-_STEPS = (1, 1.5, 2, 3, 4, 6, 8, 10)
 
 
 @dataclass(frozen=True)
@@ -43,8 +39,7 @@ class ChangeScale:
     """
 
     def __init__(self) -> None:
-        self._greatest = 0.0
-        self._time_ns = 0
+        self._span = ChangeSpan()
 
     def draw(
         self, change: Floats, fresh: npt.NDArray[np.bool_], noise: float, time_ns: int, before: Levels | None
@@ -58,11 +53,7 @@ class ChangeScale:
             time_ns: of the frame: what was seen is forgotten slowly.
             before: the levels drawn so far.
         """
-        passed_s = max(0, time_ns - self._time_ns) / 1e9
-        self._time_ns = time_ns
-        self._greatest *= math.exp(-passed_s / _FORGET_S)
-        self._greatest = max(self._greatest, float(change[fresh].max(initial=0)))
-        span = rounded_up(max(self._greatest, _LEAST_SPAN * noise))
+        span = self._span.follow(change[fresh], noise, time_ns)
         felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
         levels = levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before)
         return Scaled(levels, (0.0, span / 4, span))
@@ -72,7 +63,7 @@ class ValueScale:
     """The values themselves: between two limits where they are known, otherwise between the extremes seen so far."""
 
     def __init__(self) -> None:
-        self._low, self._high = math.inf, -math.inf
+        self._limits = ValueLimits()
 
     def draw(
         self, values: Floats, fresh: npt.NDArray[np.bool_], limits: tuple[float, float], before: Levels | None
@@ -85,18 +76,5 @@ class ValueScale:
             limits: what is level 0 and what the highest; infinite where it is not known.
             before: the levels drawn so far.
         """
-        low, high = limits
-        if not math.isfinite(low) or not math.isfinite(high):
-            counting = values[fresh & np.isfinite(values)]
-            self._low = min(self._low, float(counting.min(initial=math.inf)))
-            self._high = max(self._high, float(counting.max(initial=-math.inf)))
-            low, high = (self._low, self._high) if self._low <= self._high else (0.0, 1.0)
+        low, high = self._limits.follow(values[fresh], limits)
         return Scaled(levels_of(values, low, high, before), (low, high))
-
-
-def rounded_up(value: float) -> float:
-    """The next of a few round numbers, of any size."""
-    if not value > 0 or not math.isfinite(value):
-        return 1.0
-    unit = 10.0 ** math.floor(math.log10(value))
-    return next(step * unit for step in _STEPS if step * unit >= value * (1 - 1e-9))

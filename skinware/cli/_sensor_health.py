@@ -11,13 +11,13 @@ import numpy as np
 
 from skinware.cli._command import print_json
 from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
-from skinware.cli._health import life_of
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.service import ServiceReader
 from skinware.tactile.health_report import HealthKind, HealthReport
 from skinware.tactile.health_service import KIND, HealthFrame, HealthReader
+from skinware.views.health import life_of
 
 _NOTHING = """\
 Nobody looks after the health of sensors here. For a driver NAME:

@@ -15,11 +15,9 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
-from skinware.cli._contacts import LiveContacts, labels_of, lines_of, places_of
+from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._format import NOT_FRESH, plural
-from skinware.cli._health import LIVE, life_of
 from skinware.cli._heat_widget import HeatMap
-from skinware.cli._live import LiveDrivers
 from skinware.cli._palette import Palette, palette_for
 from skinware.cli._picture import Picture, describe_sensor
 from skinware.cli._scale import CHANGE
@@ -27,6 +25,9 @@ from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.tactile.regions import Regions
+from skinware.views.health import LIVE, life_of
+from skinware.views.live import LiveDrivers
+from skinware.views.touches import LiveContacts, places_of
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5

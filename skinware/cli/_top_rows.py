@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skinware.cli._format import NO_VALUE, age_text, count_text, plural, rate_text, state_shown
-from skinware.cli._health import (
+from skinware.driver_service import DriverFrame, DriverReader
+from skinware.structure import Structure
+from skinware.views.health import (
     DEAD,
     LIVE,
     SILENT,
@@ -22,8 +24,6 @@ from skinware.cli._health import (
     rate_now_hz,
     status_now,
 )
-from skinware.driver_service import DriverFrame, DriverReader
-from skinware.structure import Structure
 
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "lost", "orphans", "other counters")
 """Titles of the cells of a row."""

@@ -147,7 +147,7 @@ class _Painter:
     """
 
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
-        from skinware.cli._rest import Rest
+        from skinware.views.rest import Rest
 
         self._reader, self._as_json = reader, as_json
         self.type_name: str = reader.structure.types[0].name if type_name is None else type_name
@@ -159,9 +159,9 @@ class _Painter:
         import numpy as np
 
         from skinware.cli._driver_frames import after, enter_pressed, frames_until
-        from skinware.cli._rest import SETTLING_S
         from skinware.tactile.neighbours import neighbours
         from skinware.tactile.painting import without_holes
+        from skinware.views.rest import SETTLING_S
 
         for frame in frames_until(self._reader, after(SETTLING_S)):
             self._touched(frame)
@@ -181,7 +181,7 @@ class _Painter:
     def _touched(self, frame: DriverFrame) -> npt.NDArray[np.bool_]:
         """(n,) bool: which sensors of the type are far from rest."""
         from skinware.cli._driver_frames import physical_of
-        from skinware.cli._wipe import threshold
+        from skinware.views.wiping import threshold
 
         physical = physical_of(frame, self.type_name)
         fresh = frame.status == 0

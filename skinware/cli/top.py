@@ -24,10 +24,10 @@ from skinware.cli._command import (
 )
 
 if TYPE_CHECKING:
-    from skinware.cli._contacts import LiveContacts
-    from skinware.cli._live import LiveDrivers
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Regions
+    from skinware.views.live import LiveDrivers
+    from skinware.views.touches import LiveContacts
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
@@ -117,8 +117,8 @@ def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
     """Print a line per driver each second, until the time is over."""
-    from skinware.cli._contacts import LiveContacts
-    from skinware.cli._live import LiveDrivers
+    from skinware.views.live import LiveDrivers
+    from skinware.views.touches import LiveContacts
 
     start_s = time.monotonic()
     end_s = None if duration_s is None else start_s + duration_s
@@ -147,11 +147,12 @@ def _on_terminal() -> bool:
 def _print_lines(drivers: LiveDrivers, contacts: LiveContacts, as_json: bool) -> None:
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
+    from skinware.views.touches import places_of
 
     found = drivers.look()
     contacts.look(drivers.others)
     for driver in found:
-        places = _contacts.places_of(contacts.of(driver.name), driver.reader.structure)
+        places = places_of(contacts.of(driver.name), driver.reader.structure)
         if as_json:
             print_json(as_data(driver.health(), [_contacts.as_data(place) for place in places]))
         else:

@@ -86,8 +86,8 @@ class _Wipe:
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 
-        from skinware.cli._rest import Rest
-        from skinware.cli._wipe import WipeTest
+        from skinware.views.rest import Rest
+        from skinware.views.wiping import WipeTest
 
         self._reader, self._as_json = reader, as_json
         self._structure = reader.structure
@@ -99,8 +99,8 @@ class _Wipe:
     def go_on(self, duration_s: float | None) -> None:
         """Until everything has answered, or for so long."""
         from skinware.cli._driver_frames import after
-        from skinware.cli._rest import SETTLING_S
-        from skinware.cli._wipe import threshold
+        from skinware.views.rest import SETTLING_S
+        from skinware.views.wiping import threshold
 
         for frame, physical in self._frames(SETTLING_S):
             self._rest.follow(physical, frame.status == 0, frame.published_ns)

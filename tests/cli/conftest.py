@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from skinware.cli import _health
+from skinware.views import health
 
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", 10**15)
-    monkeypatch.setattr(_health, "age_limit_ns", lambda _: 10**15)
+    monkeypatch.setattr(health, "_LEAST_SILENCE_NS", 10**15)
+    monkeypatch.setattr(health, "age_limit_ns", lambda _: 10**15)

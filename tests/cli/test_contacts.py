@@ -12,9 +12,9 @@ import pytest
 from textual.widgets import Static
 
 from skinware import Namespace, Structure
-from skinware.cli import _live, _top_app
+from skinware.cli import _top_app
 from skinware.cli._command import exit_status
-from skinware.cli._contacts import TITLES, LiveContacts, labels_of, line_of, lines_of, places_of, plain_text
+from skinware.cli._contacts import TITLES, labels_of, line_of, lines_of, plain_text
 from skinware.cli._heat_map import arrange
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._top_app import SkinTop
@@ -23,6 +23,8 @@ from skinware.geometry import Geometry
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
+from skinware.views import live
+from skinware.views.touches import LiveContacts, places_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.cli.test_top_app import go, line, picture, shown, until
@@ -56,7 +58,7 @@ def touched_skin(*taxels: int, driver: str = "a") -> Iterator[ContactsWriter]:
 
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
 
 

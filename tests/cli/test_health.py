@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader
-from skinware.cli import _health
-from skinware.cli._health import (
+from skinware.memory.ring import Frame
+from skinware.status import Status
+from skinware.views import health
+from skinware.views.health import (
     bus_state_name,
     count_statuses,
     health_of,
@@ -18,8 +20,6 @@ from skinware.cli._health import (
     rate_now_hz,
     status_now,
 )
-from skinware.memory.ring import Frame
-from skinware.status import Status
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 SECOND = 1_000_000_000
@@ -36,8 +36,8 @@ def life(silence_s: float | None, rate_hz: float | None = 20.0, *, alive: bool =
 
 @pytest.fixture
 def frozen_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_health, "now_ns", lambda: NOW_NS)
-    monkeypatch.setattr(_health, "_LEAST_SILENCE_NS", SECOND)
+    monkeypatch.setattr(health, "now_ns", lambda: NOW_NS)
+    monkeypatch.setattr(health, "_LEAST_SILENCE_NS", SECOND)
 
 
 def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -47,7 +47,7 @@ def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> 
         skin.publish()
         frame = reader.read()
         assert status_now("live", frame).tolist() == [0] * 3 + [Status.OUT_OF_RANGE] + [0] * 8
-        monkeypatch.setattr(_health, "age_limit_ns", lambda _: 0)
+        monkeypatch.setattr(health, "age_limit_ns", lambda _: 0)
         assert status_now("live", frame).tolist() == [Status.STALE] * 3 + [Status.OUT_OF_RANGE] + [Status.STALE] * 8
 
 
@@ -130,7 +130,7 @@ def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:
 
 
 def test_a_patch_is_as_old_as_its_newest_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_health, "now_ns", lambda: 5000)
+    monkeypatch.setattr(health, "now_ns", lambda: 5000)
     structure = fake_structure(3, 2)
     frame = SimpleNamespace(structure=structure, module_time_ns=np.array([1000, 4000, 0, 2000, 0, 0]))
     assert patch_ages_ns(cast(Any, frame)) == [1000, 3000, None]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter, native
-from skinware.cli import _health
 from skinware.cli._command import exit_status
 from skinware.cli.info import as_text, command
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS
@@ -21,6 +20,7 @@ from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.service import Columns
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, DataPath
+from skinware.views import health
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 
@@ -234,7 +234,7 @@ def test_a_dead_driver_stays_to_be_seen(capsys: pytest.CaptureFixture[str]) -> N
 def test_a_stopped_driver_is_silent(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with FakeSkin("a") as skin:
         skin.publish(3)
-        monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 10**16)
+        monkeypatch.setattr(health, "now_ns", lambda: now_ns() + 10**16)
         (driver,) = told(capsys)["drivers"]
         assert (driver["alive"], driver["state"], driver["rate_hz"]) == (True, "silent", 0.0)
         assert "driver a: silent, its process runs but publishes nothing" in text(capsys)

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from skinware import Namespace, ServiceWriter, native
-from skinware.cli import _live
-from skinware.cli._live import LiveDriver, LiveDrivers
 from skinware.memory import ring_writer
 from skinware.realtime import now_ns
+from skinware.views import live
+from skinware.views.live import LiveDriver, LiveDrivers
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 
 
 @pytest.fixture(autouse=True)
 def look_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
 
 
 def names(drivers: LiveDrivers) -> list[str]:

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from skinware.cli._rest import Rest
 from skinware.sensor_types import PRESSURE
+from skinware.views.rest import Rest
 from tests.cli.fake_skin import fake_structure
 
 STRUCTURE = fake_structure(1, 1)

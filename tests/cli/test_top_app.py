@@ -14,13 +14,14 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable, Static
 
 from skinware import DriverReader, Namespace, Status
-from skinware.cli import _health, _live, _top_app
+from skinware.cli import _top_app
 from skinware.cli._heat_widget import HeatMap
 from skinware.cli._palette import CHARACTERS, COLOURS_16, COLOURS_256, TRUE_COLOURS, Palette
 from skinware.cli._scale import CHANGE, RANGE
 from skinware.cli._top_app import SkinTop
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region, Regions
+from skinware.views import health, live
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 
 SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
@@ -80,7 +81,7 @@ def go(scene: Callable[[], Awaitable[None]]) -> None:
 
 @pytest.fixture(autouse=True)
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_live, "_LOOK_EVERY_NS", 0)
+    monkeypatch.setattr(live, "_LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
 
 
@@ -223,7 +224,7 @@ def test_a_silent_driver_is_shown_as_such(monkeypatch: pytest.MonkeyPatch) -> No
             async with shown() as (app, pilot):
                 await until(pilot, lambda: line(app, "marks") == "10 fresh")
                 skin.is_hung = True
-                monkeypatch.setattr(_health, "now_ns", lambda: now_ns() + 10**16)
+                monkeypatch.setattr(health, "now_ns", lambda: now_ns() + 10**16)
                 await until(pilot, lambda: listed(app)[:1] == ["a silent"])
                 await until(pilot, lambda: line(app, "marks") == "0 fresh  ░ 10 stale")
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from skinware import DriverReader
-from skinware.cli._health import SkinHealth, health_of
 from skinware.cli._top_rows import (
     BUS,
     COLUMNS,
@@ -19,6 +18,7 @@ from skinware.cli._top_rows import (
     plain_line,
     rows_of,
 )
+from skinware.views.health import SkinHealth, health_of
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
 HEALTH = SkinHealth(

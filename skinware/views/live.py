@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._health import SkinHealth, health_of
 from skinware.driver_service import DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.views.health import SkinHealth, health_of
 
 _LOOK_EVERY_NS = NS_PER_S // 4
 _RATE_WINDOW_NS = 2 * NS_PER_S

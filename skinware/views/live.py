@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from skinware.driver_service import DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.structure import Structure
 from skinware.views.health import SkinHealth, health_of
 
 _LOOK_EVERY_NS = NS_PER_S // 4
@@ -44,6 +46,11 @@ class LiveDriver:
     def name(self) -> str:
         """Name of the driver."""
         return self.reader.name
+
+    @property
+    def structure(self) -> Structure:
+        """Of its newest frame; before the first of the service."""
+        return self.reader.structure if self.frame is None else self.frame.structure
 
     def poll(self) -> bool:
         """Take the newest frame if there is a newer one; never waits.
@@ -83,7 +90,7 @@ class LiveDriver:
 
         None shortly after a start, and of a driver that does not count them.
         """
-        structure, passed_s = self.reader.structure if self.frame is None else self.frame.structure, self._passed_s
+        structure, passed_s = self.structure, self._passed_s
         if not passed_s or not self._samples[-1].updates.any():
             return [None] * structure.n_patches
         modules = np.bincount(structure.module_patch, minlength=structure.n_patches)
@@ -119,13 +126,15 @@ class LiveDrivers:
 
     Args:
         namespace: where to look.
+        names: of the drivers to follow; default: all.
 
     Attributes:
         others: names of the services that are no drivers.
     """
 
-    def __init__(self, namespace: Namespace) -> None:
+    def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
         self.namespace = namespace
+        self._wanted = frozenset(names)
         self.others: tuple[str, ...] = ()
         self._drivers: dict[str, LiveDriver] = {}
         self._next_look_ns = 0
@@ -146,7 +155,7 @@ class LiveDrivers:
             for name in [name for name in self._drivers if name not in names]:
                 self._drop(name)
             for name in names:
-                if name not in self._drivers:
+                if name not in self._drivers and (not self._wanted or name in self._wanted):
                     self._attach(name)
             self._drivers = dict(sorted(self._drivers.items()))
             self.others = tuple(name for name in names if name not in self._drivers)

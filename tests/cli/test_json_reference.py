@@ -277,6 +277,11 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
     check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
 
 
+def test_view() -> None:
+    with running("skin-view", "torso", "--port", "0", "--no-browser") as view:
+        check("`skin-view`", view.wait_for("ready"))
+
+
 def test_calibrate(printing: Print, tmp_path: Path) -> None:
     surface, _ = strokes()
     file = tmp_path / "skin.toml"

@@ -1,0 +1,150 @@
+"""``skin-view``: a skin in the browser."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import secrets
+import signal
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    EXIT_FAILED,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    version_option,
+)
+
+if TYPE_CHECKING:
+    from skinware.views.access import Access
+    from skinware.views.following import Follower
+
+DEFAULT_PORT = 8736
+_CALM = "calm"
+_NEEDED = "websockets>=15"
+"""What the extra ``view`` brings."""
+
+
+@click.command(
+    "skin-view",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-view                       all drivers, in the browser",
+        "skin-view torso --no-browser    one driver; prints the address to open",
+        "skin-view --host 0.0.0.0        for other machines too: the address has a token",
+    ),
+)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    help=f"Port to listen at; 0: any that is free.  [default: {DEFAULT_PORT}, or any if that is in use]",
+)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
+@click.option(
+    "--token",
+    metavar="TEXT",
+    help="That the address needs.  [default: a random one, if other machines can connect]",
+)
+@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@namespace_option
+@json_option
+@version_option
+def command(
+    names: tuple[str, ...],
+    port: int | None,
+    host: str,
+    token: str | None,
+    no_browser: bool,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Show drivers NAME..., or all there are and come, live in a browser.
+
+    Where skin-calm runs, changes from its baselines, contacts and regions are shown too.
+
+    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
+    """
+    if find_spec("websockets") is None:
+        raise click.ClickException(f"skin-view needs: {sys.executable} -m pip install '{_NEEDED}'")
+    from skinware.memory.namespace import Namespace, check_name
+    from skinware.views.access import Access, is_loopback
+    from skinware.views.following import Follower
+
+    for name in names:
+        check_name(name, "driver")
+    place = Namespace(namespace)
+    calm = None if place.name == _CALM else Namespace(_CALM)
+    if token is None and not is_loopback(host):
+        token = secrets.token_urlsafe(16)
+    follower = Follower(place, names, calm)
+    access = Access(host, token)
+
+    def ready(found: int) -> None:
+        url = _address(host, found) + (f"?token={token}" if token else "")
+        if as_json:
+            print_json({"event": "ready", "url": url, "namespace": place.name, "names": list(names)})
+        else:
+            what = ", ".join(names) or f"all drivers of namespace {place.name!r}"
+            click.echo(f"{url} shows {what} (Ctrl-C ends)")
+        if not no_browser and _has_screen():
+            threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
+
+    try:
+        asyncio.run(_serve(follower, access, host, port, ready))
+    except OSError as error:
+        where = f"{host}, port {DEFAULT_PORT if port is None else port}"
+        click.echo(f"skin-view: {where}: {_why(error)}", err=True)
+        click.get_current_context().exit(EXIT_FAILED)
+    finally:
+        follower.close()
+
+
+async def _serve(follower: Follower, access: Access, host: str, port: int | None, ready: Callable[[int], None]) -> None:
+    from skinware.views.server import ViewServer, show
+
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    server = ViewServer(follower, access)
+    try:
+        await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
+    except OSError as error:
+        if port is not None or error.errno != errno.EADDRINUSE:
+            raise
+        await show(server, host, 0, ready, stop)
+
+
+def _why(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "in use: give another --port, or 0 for any that is free"
+    return os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror or error)
+
+
+def _address(host: str, port: int) -> str:
+    """Where a browser on this machine finds the page."""
+    name = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
+
+
+def _has_screen() -> bool:
+    """Whether a browser with a window can be opened: not a text browser in this terminal."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

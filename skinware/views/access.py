@@ -1,0 +1,108 @@
+"""Who may see a skin in a browser: which requests are answered, judged by their address, token and origin.
+
+A page of another site that somebody has open in the same browser must not see the skin: neither through a web socket
+(which browsers let any page open, but with its ``Origin``), nor by giving its own name this machine's address (DNS
+rebinding: the request then has that name as its ``Host``).
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+from collections.abc import Mapping
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+_COOKIE = "skin-view"
+
+
+class Refused(Exception):
+    """A request that is not answered.
+
+    Attributes:
+        status: of the answer.
+    """
+
+    def __init__(self, status: HTTPStatus, why: str) -> None:
+        super().__init__(why)
+        self.status = status
+
+
+class Access:
+    """Who may.
+
+    Args:
+        host: that the server listens at.
+        token: that is needed; None: who can connect may look. Where others than this machine can, give one.
+    """
+
+    def __init__(self, host: str, token: str | None = None) -> None:
+        self.token = token
+        self._hosts = None if not is_loopback(host) else {"localhost", "127.0.0.1", "::1", host.lower()}
+
+    def check(self, target: str, headers: Mapping[str, str]) -> None:
+        """Make sure that a request may be answered.
+
+        Args:
+            target: path and query that are asked for.
+            headers: of the request.
+
+        Raises:
+            Refused: it may not.
+        """
+        host = _only(headers, "Host")
+        name = _host_of(f"http://{host}")
+        if name is None or (self._hosts is not None and name not in self._hosts):
+            raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so: open the address that skin-view printed")
+        origin = _only(headers, "Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
+            raise Refused(HTTPStatus.FORBIDDEN, "pages of other sites may not see this skin")
+        if self.token is not None and not (
+            self.has_token(target) or hmac.compare_digest(_cookie(headers).encode(), self.token.encode())
+        ):
+            raise Refused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
+
+    def has_token(self, target: str) -> bool:
+        """Whether the token is in an address."""
+        given = parse_qs(urlsplit(target).query).get("token", [""])[0]
+        return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
+
+    @property
+    def cookie(self) -> str:
+        """By which a browser keeps the token, out of sight of the page."""
+        return f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can connect to an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _only(headers: Mapping[str, str], name: str) -> str | None:
+    """A header that may be there once at most."""
+    try:
+        return headers.get(name)
+    except LookupError:
+        raise Refused(HTTPStatus.BAD_REQUEST, f"more than one {name}") from None
+
+
+def _host_of(url: str) -> str | None:
+    try:
+        return urlsplit(url).hostname
+    except ValueError:
+        return None
+
+
+def _cookie(headers: Mapping[str, str]) -> str:
+    try:
+        found = SimpleCookie(_only(headers, "Cookie") or "").get(_COOKIE)
+    except CookieError:
+        return ""
+    return "" if found is None else found.value
+
+
+__all__ = ["Access", "Refused", "is_loopback"]

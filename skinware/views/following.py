@@ -1,0 +1,237 @@
+"""What all viewers look at, taken once for all of them: drivers, their newest frames, and what is calm of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_service import DriverFrame
+from skinware.errors import NamespaceError
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.status import Status
+from skinware.structure import Structure
+from skinware.views.health import LIVE, STARTING, life_of, status_now
+from skinware.views.live import LiveDriver, LiveDrivers
+from skinware.views.past import Past
+from skinware.views.quantities import Quantity, quantities_of
+from skinware.views.scene import Pose, Scene
+
+_JUDGE_EVERY_NS = NS_PER_S // 5
+_SLACK_NS = 5_000_000
+"""A frame may be taken so much earlier than the pace says."""
+_UNHEALTHY = np.uint8(Status.UNHEALTHY)
+
+
+class Followed:
+    """A driver as all viewers see it.
+
+    Args:
+        number: by which viewers know it, over its restarts too.
+        live: its reader.
+        namespace: where it is.
+
+    Attributes:
+        structure: of what is shown.
+        quantities: the pictures that there are of it.
+        edition: another one whenever the structure is.
+        frame: its newest; None before the first.
+        life: what it is doing; see :func:`skinware.views.health.life_of`.
+        status: (n_sensors,) uint8, status of its sensors now, with what the calmed driver knows of their health.
+        changes: counts frames and changes of status.
+        past: its values of the last seconds.
+    """
+
+    def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
+        self.number, self.live, self.namespace = number, live, namespace
+        self.frame: DriverFrame | None = None
+        self.life = STARTING
+        self.changes = 0
+        self.edition = 0
+        self.taken_ns = 0
+        self._judged_ns = 0
+        self._calm: LiveDriver | None = None
+        self._calm_structure: Structure | None = None
+        self._calm_fits = False
+        self._shared: dict[object, Any] = {}
+        self._take_structure(live.structure)
+
+    @property
+    def name(self) -> str:
+        """Name of the driver."""
+        return self.live.name
+
+    def quantity(self, name: str) -> Quantity | None:
+        """The picture of this name; None where there is none."""
+        return next((quantity for quantity in self.quantities if quantity.name == name), None)
+
+    def take(self, frame: DriverFrame, calm: LiveDriver | None) -> None:
+        """Go on to a newer frame.
+
+        Args:
+            frame: it.
+            calm: the same driver calmed, if there is one, with its newest frame.
+        """
+        if frame.structure is not self.structure and frame.structure != self.structure:
+            self._take_structure(frame.structure)
+        self.frame, self.taken_ns, self.life, self._calm = frame, now_ns(), LIVE, calm
+        self.past.add(frame.values, frame.published_ns)
+        self._judge(frame)
+
+    def judge(self) -> bool:
+        """Look what has become of a driver that says nothing new; whether anything is to be seen of it."""
+        if self.frame is None or now_ns() - max(self._judged_ns, self.taken_ns) < _JUDGE_EVERY_NS:
+            return False
+        before, status = self.life, self.status
+        self.life = life_of(self.live.reader, self.frame)
+        self._judge(self.frame)
+        return self.life != before or not np.array_equal(self.status, status)
+
+    def shared(self, key: object, make: Callable[[], Any]) -> Any:
+        """What several viewers need of the newest frame, made once."""
+        if key not in self._shared:
+            self._shared[key] = make()
+        return self._shared[key]
+
+    def physical(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]]:
+        """(n,): values of a quantity's sensors in its unit."""
+        frame = self.frame
+        assert frame is not None  # noqa: S101 - nobody looks at a driver without frames
+        return self.shared(("physical", quantity.name), lambda: frame.physical(quantity.type.name))  # type: ignore[no-any-return]
+
+    def calm(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
+        """(n,): how far each of them is above its baseline, 0 where nothing touches; None where nobody knows."""
+        frame = self._calm_frame
+        if frame is None:
+            return None
+        return self.shared(("calm", quantity.name), lambda: frame.physical(quantity.type.name))  # type: ignore[no-any-return]
+
+    @property
+    def _calm_frame(self) -> DriverFrame | None:
+        """The newest frame of the calmed driver, if it is of the same sensors and lives."""
+        frame = None if self._calm is None else self._calm.frame
+        if frame is None or frame.stale:
+            return None
+        if frame.structure is not self._calm_structure:
+            self._calm_structure = frame.structure
+            self._calm_fits = np.array_equal(frame.structure.sensor_uid, self.structure.sensor_uid) and np.array_equal(
+                frame.structure.sensor_type, self.structure.sensor_type
+            )
+        return frame if self._calm_fits else None
+
+    def _take_structure(self, structure: Structure) -> None:
+        self.structure = structure
+        self.quantities = quantities_of(structure)
+        self.status: npt.NDArray[np.uint8] = np.full(structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
+        self.past = Past(structure.n_sensors, structure.dtype)
+        self.edition += 1
+        self._calm_structure = None
+
+    def _judge(self, frame: DriverFrame) -> None:
+        self._judged_ns = now_ns()
+        self.changes += 1
+        self._shared.clear()
+        self.status = status_now(self.life, frame)
+        calm = self._calm_frame
+        if calm is not None:
+            self.status = self.status | (calm.status & _UNHEALTHY)
+
+
+class Follower:
+    """All drivers of a namespace, and beside them what is calm of them.
+
+    Args:
+        namespace: of the drivers.
+        names: of those to follow; default: all.
+        calm: namespace where calmed drivers are; None: nowhere.
+        poses: of coordinate frames, by name.
+
+    Attributes:
+        drivers: all there are, by name.
+        scene: where their taxels are.
+        edition: another one whenever drivers or structures are others.
+        problem: why nothing can be seen; None: all is well.
+    """
+
+    def __init__(
+        self,
+        namespace: Namespace,
+        names: Collection[str] = (),
+        calm: Namespace | None = None,
+        poses: Mapping[str, Pose] | None = None,
+    ) -> None:
+        self.namespace, self.calm_namespace = namespace, calm
+        self.drivers: list[Followed] = []
+        self.problem: str | None = None
+        self.edition = 0
+        self.scene = Scene({}, poses)
+        self._poses = poses
+        self._numbers: dict[str, int] = {}
+        self._live = LiveDrivers(namespace, names)
+        self._calm = None if calm is None else LiveDrivers(calm, names)
+
+    def get(self, number: int) -> Followed | None:
+        """The driver that viewers know by this number."""
+        return next((driver for driver in self.drivers if driver.number == number), None)
+
+    def take(self, period_ns: int) -> list[Followed]:
+        """Take what is new; never waits.
+
+        Args:
+            period_ns: no driver's frames are taken more often.
+
+        Returns:
+            The drivers with a newer frame; ``changes`` and ``edition`` tell what else there is to be seen.
+        """
+        try:
+            found, calm = self._live.look(), {} if self._calm is None else {one.name: one for one in self._calm.look()}
+            self.problem = None
+        except NamespaceError as error:
+            self.problem = str(error)
+            return []
+        self._keep(found)
+        newer = []
+        editions = [driver.edition for driver in self.drivers]
+        for driver in self.drivers:
+            if now_ns() - driver.taken_ns < period_ns - _SLACK_NS:
+                continue
+            if self._live.poll(driver.live) and driver.live.frame is not None:
+                calmed = calm.get(driver.name)
+                if calmed is not None and self._calm is not None:
+                    self._calm.poll(calmed)
+                driver.take(driver.live.frame, calmed)
+                newer.append(driver)
+            else:
+                driver.judge()
+        if editions != [driver.edition for driver in self.drivers]:
+            self._arrange()
+        return newer
+
+    def close(self) -> None:
+        """Detach from everything. Idempotent."""
+        for drivers in (self._live, self._calm):
+            if drivers is not None:
+                drivers.close()
+        self.drivers = []
+
+    def _keep(self, found: list[LiveDriver]) -> None:
+        """Drivers that came and went."""
+        if [driver.live for driver in self.drivers] == found:
+            return
+        kept = {id(driver.live): driver for driver in self.drivers}
+        self.drivers = [kept.get(id(live)) or self._begin(live) for live in found]
+        self._arrange()
+
+    def _begin(self, live: LiveDriver) -> Followed:
+        number = self._numbers.setdefault(live.name, len(self._numbers))
+        return Followed(number, live, self.namespace.name)
+
+    def _arrange(self) -> None:
+        self.edition += 1
+        self.scene = Scene({driver.name: (driver.structure, driver.quantities) for driver in self.drivers}, self._poses)
+
+
+__all__ = ["Followed", "Follower"]

@@ -1,0 +1,111 @@
+"""What a page may ask for: the operations of the protocol, read from JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+from skinware.errors import ConfigurationError
+from skinware.views.looks import DEFAULT_FPS, Mode
+
+MOST_EXACT = 32
+"""Sensors whose values are told as they are, at once."""
+
+Number = Annotated[int, msgspec.Meta(ge=0, le=2**31)]
+
+
+class Next(msgspec.Struct, tag_field="op", tag="next"):
+    """Asks for the next turn."""
+
+    protocol: str | None = None
+
+
+class Choose(msgspec.Struct, tag_field="op", tag="look"):
+    """Chooses what is looked at."""
+
+    mode: Mode = "raw"
+    type: str | None = None
+    scale: tuple[float, float] | None = None
+    fps: Annotated[float, msgspec.Meta(ge=0.1, le=60)] = DEFAULT_FPS
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not (all(map(math.isfinite, self.scale)) and self.scale[0] < self.scale[1]):
+            raise ValueError(f"scale {list(self.scale)}: give two numbers, the lower one first")
+
+
+class Exact(msgspec.Struct, tag_field="op", tag="exact"):
+    """Chooses the sensors whose values come as they are, as pairs of driver and position."""
+
+    sensors: Annotated[list[tuple[Number, Number]], msgspec.Meta(max_length=MOST_EXACT)]
+
+
+class Names(msgspec.Struct, tag_field="op", tag="names"):
+    """Asks for the names of the sensors of a driver's quantity."""
+
+    driver: Number
+    type: str
+
+
+class Series(msgspec.Struct, tag_field="op", tag="series"):
+    """Asks for the last seconds of a sensor."""
+
+    driver: Number
+    position: Number
+
+
+class Tare(msgspec.Struct, tag_field="op", tag="tare"):
+    """Takes the present values for rest."""
+
+
+class Wipe(msgspec.Struct, tag_field="op", tag="wipe"):
+    """Begins a wipe test anew, or leaves it as it is."""
+
+    action: Literal["start", "stop"]
+
+
+class Record(msgspec.Struct, tag_field="op", tag="record"):
+    """Begins or ends a recording."""
+
+    action: Literal["start", "stop"]
+
+
+class Replay(msgspec.Struct, tag_field="op", tag="replay"):
+    """Controls the replay that is shown."""
+
+    action: Literal["pause", "resume", "step", "seek", "speed", "loop"]
+    value: float | bool | None = None
+
+
+Operation = Next | Choose | Exact | Names | Series | Tare | Wipe | Record | Replay
+_DECODER = msgspec.json.Decoder(Operation)
+
+
+def operation_of(text: str | bytes) -> Operation:
+    """One operation from its JSON.
+
+    Raises:
+        ConfigurationError: it is none; the message says why.
+    """
+    try:
+        operation: Operation = _DECODER.decode(text)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a ValidationError is a DecodeError
+        raise ConfigurationError(str(error)) from None
+    return operation
+
+
+__all__ = [
+    "MOST_EXACT",
+    "Choose",
+    "Exact",
+    "Names",
+    "Next",
+    "Operation",
+    "Record",
+    "Replay",
+    "Series",
+    "Tare",
+    "Wipe",
+    "operation_of",
+]

@@ -1,0 +1,216 @@
+"""The server of ``skin-view``: the page's files by HTTP, and its turns by a web socket at ``/live``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import mimetypes
+from collections.abc import Callable
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
+from skinware.views import operations
+from skinware.views.access import Access, Refused
+from skinware.views.following import Follower
+from skinware.views.turns import PROTOCOL, Viewer
+
+PAGE = Path(__file__).parent / "page"
+"""What the browser runs."""
+
+_TICK_S = 0.01
+_LONGEST_TURN_S = 0.5
+_MOST_VIEWERS = 32
+_LONGEST_OPERATION = 1 << 16
+_HEADERS = {
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline';"
+    " frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+_TYPES = {".js": "text/javascript", ".html": "text/html", ".css": "text/css", ".svg": "image/svg+xml"}
+
+
+class ViewServer:
+    """Shows what a follower follows to any number of viewers; each gets as much as it asks for.
+
+    Args:
+        follower: of the drivers; used in the event loop's thread only.
+        access: who may see it.
+        page: folder of the page's files.
+    """
+
+    def __init__(self, follower: Follower, access: Access, page: Path = PAGE) -> None:
+        self._follower, self._access, self._page = follower, access, page
+        self._viewers: set[Viewer] = set()
+        self._news = asyncio.Event()
+        self._server: Server | None = None
+
+    async def start(self, host: str, port: int) -> int:
+        """Begin to listen.
+
+        Returns:
+            The port, which the system chooses if ``port`` is 0.
+
+        Raises:
+            OSError: nobody can listen there.
+        """
+        self._server = await serve(
+            self._attend,
+            host,
+            port,
+            process_request=self._answer,
+            compression=None,
+            max_size=_LONGEST_OPERATION,
+            server_header=None,
+        )
+        return int(next(iter(self._server.sockets)).getsockname()[1])
+
+    async def run(self) -> None:
+        """Follow the drivers for as long as somebody looks, without end."""
+        while True:
+            if self._viewers:
+                period_ns = round(NS_PER_S / max(viewer.look.fps for viewer in self._viewers))
+                for driver in self._follower.take(period_ns):
+                    for viewer in self._viewers:
+                        viewer.look.follow(driver)
+                self._news.set()
+                self._news.clear()
+            await asyncio.sleep(_TICK_S)
+
+    async def close(self) -> None:
+        """Let go of all viewers."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    # -- files --------------------------------------------------------------------------------------------------
+
+    def _answer(self, _connection: ServerConnection, request: Request) -> Response | None:
+        """The answer to a request; None: go on to a web socket."""
+        try:
+            self._access.check(request.path, request.headers)
+            path = unquote(urlsplit(request.path).path)
+            if path == "/live":
+                return None
+            return self._file(path, request)
+        except Refused as refused:
+            return _response(refused.status, f"{refused}\n".encode(), "text/plain")
+
+    def _file(self, path: str, request: Request) -> Response:
+        if path == "/" and self._access.has_token(request.path):  # kept by the browser, and out of the address
+            response = _response(HTTPStatus.SEE_OTHER, b"", "text/plain")
+            response.headers["Location"] = "/"
+            response.headers["Set-Cookie"] = self._access.cookie
+            return response
+        files = {f"/{file.relative_to(self._page).as_posix()}": file for file in self._page.rglob("*")}
+        file = files.get("/index.html" if path == "/" else path)
+        if file is None or not file.is_file():
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")
+        return _response(HTTPStatus.OK, file.read_bytes(), _type_of(file))
+
+    # -- viewers ------------------------------------------------------------------------------------------------
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        """One viewer, until it goes."""
+        if len(self._viewers) >= _MOST_VIEWERS:
+            await connection.close(1013, "too many viewers")
+            return
+        viewer = Viewer(self._follower)
+        self._viewers.add(viewer)
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                await self._serve(viewer, connection)
+        finally:
+            self._viewers.discard(viewer)
+
+    async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
+        loop = asyncio.get_running_loop()
+        last_s = 0.0
+        async for text in connection:
+            try:
+                operation = operations.operation_of(text)
+            except ConfigurationError as error:
+                viewer.refuse(str(error))
+                continue
+            if not isinstance(operation, operations.Next):
+                self._do(viewer, operation)
+                continue
+            if operation.protocol not in (None, PROTOCOL):
+                viewer.refuse(f"this server speaks {PROTOCOL}: reload the page")
+            await asyncio.sleep(last_s + 1 / viewer.look.fps - loop.time())
+            await self._wait_for_news(viewer)
+            last_s = loop.time()
+            await connection.send(viewer.turn(self._besides()))
+
+    async def _wait_for_news(self, viewer: Viewer) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_LONGEST_TURN_S):
+                while not viewer.has_news:
+                    await self._news.wait()
+
+    def _do(self, viewer: Viewer, operation: operations.Operation) -> None:
+        match operation:
+            case operations.Choose():
+                viewer.choose(operation)
+            case operations.Exact():
+                viewer.pin(operation.sensors)
+            case operations.Names() | operations.Series():
+                viewer.ask(operation)
+            case operations.Tare():
+                viewer.tare()
+            case operations.Wipe():
+                viewer.wipe(operation.action == "start")
+            case _:
+                viewer.refuse("nothing here can do that")
+
+    def _besides(self) -> dict[str, Any]:
+        return {"recording": None, "replay": None}
+
+
+async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
+    """Serve until told to stop.
+
+    Args:
+        server: it.
+        host: where to listen.
+        port: likewise; 0: any.
+        ready: called with the port when browsers can connect.
+        stop: set it to end.
+
+    Raises:
+        OSError: nobody can listen there.
+    """
+    found = await server.start(host, port)
+    following, stopping = asyncio.create_task(server.run()), asyncio.create_task(stop.wait())
+    try:
+        ready(found)
+        await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in (following, stopping):
+            task.cancel()
+        await server.close()
+    if following.done() and not following.cancelled():
+        following.result()
+
+
+def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
+    own = {"Content-Type": f"{content_type}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+    return Response(status.value, status.phrase, Headers(own | _HEADERS), body)
+
+
+def _type_of(file: Path) -> str:
+    return _TYPES.get(file.suffix) or mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+
+
+__all__ = ["PAGE", "ViewServer", "show"]

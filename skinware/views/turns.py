@@ -1,0 +1,310 @@
+"""What one viewer gets: turns of a header and arrays, with what is new for it since its last one.
+
+A turn is the length of its header (uint32, little endian), the header (JSON, padded with spaces so that what follows
+begins at a multiple of 8), and the blobs, each padded to 8 bytes; the header names each as ``[offset, length]``, in
+bytes from the first one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.views import operations
+from skinware.views.following import Followed, Follower
+from skinware.views.looks import Look
+from skinware.views.scene import Scene
+from skinware.views.state import ERROR, problems_of, state_of, worst_first
+
+PROTOCOL = "skinware.view.1"
+_ALIGNMENT = 8
+_STATE_EVERY_NS = NS_PER_S // 2
+
+
+class Blobs:
+    """The arrays of a turn."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, array: npt.NDArray[Any], dtype: str) -> list[int]:
+        """Put an array in; where it is, as headers tell it."""
+        data = np.ascontiguousarray(array, dtype).tobytes()
+        at = [self._size, len(data)]
+        padded = -len(data) % _ALIGNMENT
+        self._parts += [data, bytes(padded)]
+        self._size += len(data) + padded
+        return at
+
+    def under(self, header: dict[str, Any]) -> bytes:
+        """The whole turn."""
+        text = msgspec.json.encode(header)
+        text += b" " * (-(4 + len(text)) % _ALIGNMENT)
+        return b"".join([len(text).to_bytes(4, "little"), text, *self._parts])
+
+
+class Viewer:
+    """One viewer: what it looks at, what it has asked for, and what it was told so far.
+
+    Args:
+        follower: of what is shown.
+
+    Attributes:
+        look: how it looks.
+    """
+
+    def __init__(self, follower: Follower) -> None:
+        self.look = Look()
+        self._follower = follower
+        self._number = 0
+        self._edition = -1
+        self._changes: dict[int, tuple[int, int]] = {}
+        self._status: dict[tuple[int, str], npt.NDArray[np.uint8]] = {}
+        self._state_due_ns = 0
+        self._exact: list[tuple[int, int]] = []
+        self._asked = False
+        self._answers: list[tuple[str, Any]] = []
+
+    # -- what it asks for ---------------------------------------------------------------------------------------
+
+    def choose(self, choice: operations.Choose) -> None:
+        """Look otherwise."""
+        self.look.choose(choice.mode, choice.type, choice.scale, choice.fps)
+        self._see_all_again()
+
+    def tare(self) -> None:
+        """Take what comes next for rest."""
+        self.look.tare()
+
+    def wipe(self, on: bool) -> None:
+        """Begin a wipe test, or leave it."""
+        self.look.wipe(on)
+
+    def pin(self, sensors: list[tuple[int, int]]) -> None:
+        """Tell the values of these sensors, of drivers by number, as they are, in every turn."""
+        self._exact, self._asked = sensors, True
+
+    def ask(self, question: operations.Names | operations.Series) -> None:
+        """Answer in the next turn."""
+        self._answers.append((type(question).__name__.lower(), question))
+
+    def refuse(self, why: str) -> None:
+        """Tell in the next turn that something could not be done."""
+        self._answers.append(("error", why))
+
+    # -- what it gets -------------------------------------------------------------------------------------------
+
+    @property
+    def has_news(self) -> bool:
+        """Whether there is something that this viewer has not seen."""
+        return (
+            self._asked
+            or bool(self._answers)
+            or self._edition != self._follower.edition
+            or any(self._changes.get(driver.number) != _seen(driver) for driver in self._follower.drivers)
+        )
+
+    def turn(self, besides: dict[str, Any]) -> bytes:
+        """All that is new for this viewer.
+
+        Args:
+            besides: part of the state that the server knows.
+        """
+        self._number += 1
+        blobs = Blobs()
+        header: dict[str, Any] = {"turn": self._number, "now_ns": str(now_ns())}
+        if self._edition != self._follower.edition:
+            self._edition = self._follower.edition
+            header["skin"] = self._skin(blobs)
+            self._see_all_again()
+        self._add_pictures(header, blobs)
+        if self._exact:
+            header["exact"] = [told for number, at in self._exact if (told := self._exactly(number, at)) is not None]
+        for name, question in self._answers:
+            header |= self._answer(name, question, blobs)
+        self._answers, self._asked = [], False
+        if now_ns() >= self._state_due_ns:
+            self._state_due_ns = now_ns() + _STATE_EVERY_NS
+            header["state"] = self._state() | besides
+        return blobs.under(header)
+
+    def _see_all_again(self) -> None:
+        self._changes, self._status = {}, {}
+
+    def _skin(self, blobs: Blobs) -> dict[str, Any]:
+        follower = self._follower
+        namespaces = [follower.namespace, *([follower.calm_namespace] if follower.calm_namespace else [])]
+        return {
+            "protocol": PROTOCOL,
+            "namespaces": [namespace.name for namespace in namespaces],
+            "drivers": [_driver(driver, follower.scene, blobs) for driver in follower.drivers],
+            "links": [],
+        }
+
+    def _add_pictures(self, header: dict[str, Any], blobs: Blobs) -> None:
+        pictures = []
+        for driver in self._follower.drivers:
+            if self._changes.get(driver.number) == _seen(driver):
+                continue
+            self._changes[driver.number] = _seen(driver)
+            shown = self._picture(driver, blobs)
+            pictures += [shown] if shown is not None else []
+        if not pictures:
+            return
+        header["pictures"] = pictures
+        low, high = pictures[0]["scale"]
+        header["scale"] = {"low": low, "high": high, "unit": pictures[0]["unit"], "mode": self.look.mode}
+        wiped = self.look.wiped(self._follower.drivers)
+        if wiped is not None:
+            header["wipe"] = wiped._asdict()
+
+    def _picture(self, driver: Followed, blobs: Blobs) -> dict[str, Any] | None:
+        picture, frame = self.look.picture(driver), driver.frame
+        if picture is None or frame is None:
+            return None
+        quantity = picture.quantity
+        told: dict[str, Any] = {
+            "driver": driver.number,
+            "type": quantity.name,
+            "generation": str(driver.edition),
+            "sequence": str(frame.sequence),
+            "acquired_ns": str(frame.acquired_ns),
+            "scale": picture.scale,
+            "unit": quantity.type.unit,
+            "levels": blobs.add(picture.levels, "u1"),
+        }
+        if picture.shear is not None:
+            told |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
+        status, key = driver.status[quantity.where], (driver.number, quantity.name)
+        before = self._status.get(key)
+        if before is None or not np.array_equal(status, before):
+            self._status[key] = status
+            told["status"] = blobs.add(status, "u1")
+        return told
+
+    def _exactly(self, number: int, position: int) -> dict[str, Any] | None:
+        """A sensor's value as it is; None for one that is not there (any more)."""
+        driver = self._follower.get(number)
+        if driver is None or driver.frame is None or position >= driver.structure.n_sensors:
+            return None
+        frame, structure = driver.frame, driver.structure
+        of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
+        raw = frame.values[position].item()
+        time_ns = int(frame.module_time_ns[structure.sensor_module[position]])
+        return {
+            "driver": number,
+            "position": position,
+            "value": of_type.offset + of_type.scale * raw,
+            "raw": raw,
+            "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
+            "noise": abs(of_type.scale) * float(driver.past.noise([position])[0]),
+            "status": int(driver.status[position]),
+        }
+
+    def _answer(self, name: str, question: Any, blobs: Blobs) -> dict[str, Any]:
+        if name == "error":
+            return {"error": question}
+        driver = self._follower.get(question.driver)
+        try:
+            if driver is None:
+                raise ConfigurationError(f"no driver {question.driver}")
+            if name == "names":
+                return {"names": _names(driver, question.type)}
+            return {"series": _series(driver, question.position, blobs)}
+        except ConfigurationError as error:
+            return {"error": str(error)}
+
+    def _state(self) -> dict[str, Any]:
+        problems: list[dict[str, Any]] = []
+        if self._follower.problem is not None:
+            problems.append({"severity": ERROR, "driver": None, "text": self._follower.problem})
+        drivers = []
+        for driver in self._follower.drivers:
+            drivers.append(state_of(driver))
+            problems += problems_of(driver, drivers[-1])
+        return {"drivers": drivers, "problems": worst_first(problems)}
+
+
+def _seen(driver: Followed) -> tuple[int, int]:
+    return driver.edition, driver.changes
+
+
+def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
+    structure = driver.structure
+    types = []
+    for quantity in driver.quantities:
+        placed, index = scene.of(driver.name, quantity.name), quantity.index
+        types.append(
+            {
+                "name": quantity.name,
+                "unit": quantity.type.unit,
+                "scale": quantity.type.scale,
+                "offset": quantity.type.offset,
+                "minimum": quantity.type.minimum,
+                "maximum": quantity.type.maximum,
+                "n": len(quantity),
+                "index": blobs.add(index, "<u4"),
+                "uid": blobs.add(structure.sensor_uid[index], "<u8"),
+                "patch": blobs.add(structure.sensor_patch[index], "<u2"),
+                "module": blobs.add(structure.sensor_module[index], "<u2"),
+                "names": "lazy",
+                "position": blobs.add(placed.position, "<f4"),
+                "normal": blobs.add(placed.normal, "<f4"),
+                "radius": blobs.add(placed.radius, "<f4"),
+                "placed": placed.is_known,
+                "neighbour_spacing_m": placed.spacing_m,
+            }
+            | ({"axes": ["x", "y", "z"]} if quantity.shear is not None else {})
+        )
+    kinds = [kind.decode() for kind in structure.module_kind.tolist()]
+    return {
+        "id": driver.number,
+        "name": driver.name,
+        "namespace": driver.namespace,
+        "generation": str(driver.edition),
+        "type": driver.live.reader.driver_type,
+        "dtype": structure.dtype.name,
+        "types": types,
+        "buses": list(structure.buses),
+        "patches": [
+            {"name": name, "bus": bus}
+            for name, bus in zip(structure.patch_names, structure.patch_bus.tolist(), strict=True)
+        ],
+        "modules": [
+            {"name": name, "patch": patch, "kind": kind}
+            for name, patch, kind in zip(structure.module_names, structure.module_patch.tolist(), kinds, strict=True)
+        ],
+    }
+
+
+def _names(driver: Followed, type_name: str) -> dict[str, Any]:
+    quantity = driver.quantity(type_name)
+    if quantity is None:
+        raise ConfigurationError(f"no {type_name!r} in driver {driver.name!r}")
+    names = [driver.structure.sensor_name(position) for position in quantity.index.tolist()]
+    return {"driver": driver.number, "type": type_name, "of": names}
+
+
+def _series(driver: Followed, position: int, blobs: Blobs) -> dict[str, Any]:
+    structure = driver.structure
+    if position >= structure.n_sensors:
+        raise ConfigurationError(f"no sensor {position} in driver {driver.name!r}")
+    times_ns, raw = driver.past.series(position)
+    of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
+    newest_ns = times_ns[-1] if len(times_ns) else 0
+    return {
+        "driver": driver.number,
+        "position": position,
+        "newest_ns": str(newest_ns),
+        "time_s": blobs.add((times_ns - newest_ns) / NS_PER_S, "<f4"),
+        "value": blobs.add(raw * of_type.scale + of_type.offset, "<f4"),
+    }
+
+
+__all__ = ["PROTOCOL", "Blobs", "Viewer"]

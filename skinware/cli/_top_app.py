@@ -27,7 +27,7 @@ from skinware.memory.namespace import Namespace
 from skinware.tactile.regions import Regions
 from skinware.views.health import LIVE, life_of
 from skinware.views.live import LiveDrivers
-from skinware.views.touches import LiveContacts, places_of
+from skinware.views.touches import live_contacts, places_of
 
 _REDRAWS_HZ = 15
 _LIST_PERIOD_S = 0.5
@@ -125,7 +125,7 @@ class SkinTop(App[None]):
         super().__init__()
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
         self._drivers = LiveDrivers(namespace)
-        self._contacts = LiveContacts(namespace)
+        self._contacts = live_contacts(namespace)
         self._duration_s = duration_s
         self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
         self._has_regions = regions is not None

@@ -25,9 +25,10 @@ from skinware.cli._command import (
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
+    from skinware.tactile.contacts_service import ContactsFrame
     from skinware.tactile.regions import Regions
     from skinware.views.live import LiveDrivers
-    from skinware.views.touches import LiveContacts
+    from skinware.views.touches import LiveSources
 
 _LINE_PERIOD_S = 1.0
 _TAKE_PERIOD_S = 0.1
@@ -118,11 +119,11 @@ def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
     """Print a line per driver each second, until the time is over."""
     from skinware.views.live import LiveDrivers
-    from skinware.views.touches import LiveContacts
+    from skinware.views.touches import live_contacts
 
     start_s = time.monotonic()
     end_s = None if duration_s is None else start_s + duration_s
-    drivers, contacts = LiveDrivers(namespace), LiveContacts(namespace)
+    drivers, contacts = LiveDrivers(namespace), live_contacts(namespace)
     try:
         lines_at_s = start_s
         while end_s is None or time.monotonic() < end_s:
@@ -144,7 +145,7 @@ def _on_terminal() -> bool:
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
-def _print_lines(drivers: LiveDrivers, contacts: LiveContacts, as_json: bool) -> None:
+def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_json: bool) -> None:
     from skinware.cli import _contacts
     from skinware.cli._top_rows import as_data, plain_line
     from skinware.views.touches import places_of

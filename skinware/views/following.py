@@ -14,6 +14,9 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.contacts_service import ContactsFrame
+from skinware.tactile.motion_service import MotionFrame
+from skinware.views.beside import Beside
 from skinware.views.health import LIVE, STARTING, life_of, status_now
 from skinware.views.live import LiveDriver, LiveDrivers
 from skinware.views.past import Past
@@ -43,6 +46,8 @@ class Followed:
         status: (n_sensors,) uint8, status of its sensors now, with what the calmed driver knows of their health.
         changes: counts frames and changes of status.
         past: its values of the last seconds.
+        contacts: on it; None where nobody tells any.
+        motion: over its regions, likewise.
     """
 
     def __init__(self, number: int, live: LiveDriver, namespace: str) -> None:
@@ -53,7 +58,9 @@ class Followed:
         self.edition = 0
         self.taken_ns = 0
         self._judged_ns = 0
-        self._calm: LiveDriver | None = None
+        self.contacts: ContactsFrame | None = None
+        self.motion: MotionFrame | None = None
+        self._calm: DriverFrame | None = None
         self._calm_structure: Structure | None = None
         self._calm_fits = False
         self._shared: dict[object, Any] = {}
@@ -68,27 +75,32 @@ class Followed:
         """The picture of this name; None where there is none."""
         return next((quantity for quantity in self.quantities if quantity.name == name), None)
 
-    def take(self, frame: DriverFrame, calm: LiveDriver | None) -> None:
+    def take(self, frame: DriverFrame, beside: Beside) -> None:
         """Go on to a newer frame.
 
         Args:
             frame: it.
-            calm: the same driver calmed, if there is one, with its newest frame.
+            beside: what services tell beside it.
         """
         if frame.structure is not self.structure and frame.structure != self.structure:
             self._take_structure(frame.structure)
-        self.frame, self.taken_ns, self.life, self._calm = frame, now_ns(), LIVE, calm
+        self.frame, self.taken_ns, self.life = frame, now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
-        self._judge(frame)
+        self._judge(frame, beside)
+        self.changes += 1
 
-    def judge(self) -> bool:
-        """Look what has become of a driver that says nothing new; whether anything is to be seen of it."""
-        if self.frame is None or now_ns() - max(self._judged_ns, self.taken_ns) < _JUDGE_EVERY_NS:
-            return False
-        before, status = self.life, self.status
-        self.life = life_of(self.live.reader, self.frame)
-        self._judge(self.frame)
-        return self.life != before or not np.array_equal(self.status, status)
+    def judge(self, beside: Beside) -> None:
+        """Look what has become of a driver that says nothing new."""
+        if self.frame is not None and now_ns() - self._judged_ns >= _JUDGE_EVERY_NS:
+            before = self.life, self.status, self.contacts
+            self.life = life_of(self.live.reader, self.frame)
+            self._judge(self.frame, beside)
+            if (
+                self.life != before[0]
+                or not np.array_equal(self.status, before[1])
+                or (self.contacts is None) != (before[2] is None)
+            ):
+                self.changes += 1
 
     def shared(self, key: object, make: Callable[[], Any]) -> Any:
         """What several viewers need of the newest frame, made once."""
@@ -109,11 +121,20 @@ class Followed:
             return None
         return self.shared(("calm", quantity.name), lambda: frame.physical(quantity.type.name))  # type: ignore[no-any-return]
 
+    def contact_of(self, quantity: Quantity) -> npt.NDArray[np.int16] | None:
+        """(n,) int16: row of the contact of each sensor of a quantity, below 0: none; None where nobody tells any."""
+        frame = self.contacts
+        if frame is None or frame.source.type_name != quantity.type.name:
+            return None
+        if not np.array_equal(frame.source.uid, self.structure.sensor_uid[quantity.where]):
+            return None
+        return frame.contacts.contact_of
+
     @property
     def _calm_frame(self) -> DriverFrame | None:
         """The newest frame of the calmed driver, if it is of the same sensors and lives."""
-        frame = None if self._calm is None else self._calm.frame
-        if frame is None or frame.stale:
+        frame = self._calm
+        if frame is None:
             return None
         if frame.structure is not self._calm_structure:
             self._calm_structure = frame.structure
@@ -130,9 +151,10 @@ class Followed:
         self.edition += 1
         self._calm_structure = None
 
-    def _judge(self, frame: DriverFrame) -> None:
+    def _judge(self, frame: DriverFrame, beside: Beside) -> None:
         self._judged_ns = now_ns()
-        self.changes += 1
+        self._calm = beside.calm_of(self.name)
+        self.contacts, self.motion = beside.contacts_of(self.name), beside.motion_of(self.name)
         self._shared.clear()
         self.status = status_now(self.life, frame)
         calm = self._calm_frame
@@ -141,7 +163,7 @@ class Followed:
 
 
 class Follower:
-    """All drivers of a namespace, and beside them what is calm of them.
+    """All drivers of a namespace, and what services tell beside them.
 
     Args:
         namespace: of the drivers.
@@ -171,7 +193,7 @@ class Follower:
         self._poses = poses
         self._numbers: dict[str, int] = {}
         self._live = LiveDrivers(namespace, names)
-        self._calm = None if calm is None else LiveDrivers(calm, names)
+        self._beside = Beside(self._live, names, calm)
 
     def get(self, number: int) -> Followed | None:
         """The driver that viewers know by this number."""
@@ -187,7 +209,8 @@ class Follower:
             The drivers with a newer frame; ``changes`` and ``edition`` tell what else there is to be seen.
         """
         try:
-            found, calm = self._live.look(), {} if self._calm is None else {one.name: one for one in self._calm.look()}
+            found = self._live.look()
+            self._beside.look()
             self.problem = None
         except NamespaceError as error:
             self.problem = str(error)
@@ -198,23 +221,22 @@ class Follower:
         for driver in self.drivers:
             if now_ns() - driver.taken_ns < period_ns - _SLACK_NS:
                 continue
-            if self._live.poll(driver.live) and driver.live.frame is not None:
-                calmed = calm.get(driver.name)
-                if calmed is not None and self._calm is not None:
-                    self._calm.poll(calmed)
-                driver.take(driver.live.frame, calmed)
+            live = driver.live
+            if live.frame is driver.frame:  # the last one is shown
+                self._live.poll(live)
+            if live.frame is None or live.frame is driver.frame:
+                driver.judge(self._beside)
+            elif self._beside.is_due(live):
+                driver.take(live.frame, self._beside)
                 newer.append(driver)
-            else:
-                driver.judge()
         if editions != [driver.edition for driver in self.drivers]:
             self._arrange()
         return newer
 
     def close(self) -> None:
         """Detach from everything. Idempotent."""
-        for drivers in (self._live, self._calm):
-            if drivers is not None:
-                drivers.close()
+        self._beside.close()
+        self._live.close()
         self.drivers = []
 
     def _keep(self, found: list[LiveDriver]) -> None:

@@ -1,9 +1,9 @@
-"""Contacts beside the drivers that are looked at: found, followed, and where they are on the skin."""
+"""Contacts and motion beside the drivers that are looked at: found, followed, and where contacts are on the skin."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
@@ -16,9 +16,12 @@ from skinware.errors import (
     StructureError,
 )
 from skinware.memory.namespace import Namespace
+from skinware.memory.ring import FrameT
 from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
+from skinware.tactile.motion_service import MotionFrame, MotionReader
+from skinware.tactile.source_reader import SourceReader
 
 
 class TouchedPlace(NamedTuple):
@@ -38,19 +41,20 @@ class TouchedPlace(NamedTuple):
     module: str
 
 
-class LiveContacts:
-    """The services of contacts in a namespace, followed live.
+class LiveSources(Generic[FrameT]):
+    """The services of one kind that tell something of drivers, in one namespace, followed live.
 
     Args:
         namespace: where to look.
+        reader: class of the readers of this kind.
     """
 
-    def __init__(self, namespace: Namespace) -> None:
-        self._namespace = namespace
-        self._readers: dict[str, ContactsReader] = {}
+    def __init__(self, namespace: Namespace, reader: type[SourceReader[Any, FrameT]]) -> None:
+        self._namespace, self._reader = namespace, reader
+        self._readers: dict[str, SourceReader[Any, FrameT]] = {}
 
     def look(self, names: Iterable[str]) -> None:
-        """Look for services of contacts that are new, and for those that went.
+        """Look for services of the kind that are new, and for those that went.
 
         Args:
             names: of the services that there are now; those of drivers may be missing.
@@ -60,12 +64,12 @@ class LiveContacts:
             self._drop(name)
         for name in sorted(there - self._readers.keys()):
             try:
-                self._readers[name] = ContactsReader(name, namespace=self._namespace)
+                self._readers[name] = self._reader(name, namespace=self._namespace)
             except (BadServiceFile, ConfigurationError, ServiceNotFound):
                 continue  # another kind of service, or just gone
 
-    def of(self, driver: str) -> ContactsFrame | None:
-        """The newest contacts of a driver; None where no service tells any."""
+    def of(self, driver: str) -> FrameT | None:
+        """What was told last of a driver; None where no service tells anything."""
         for name, reader in sorted(self._readers.items()):
             if reader.source.driver == driver:
                 return self._newest(name, reader)
@@ -76,7 +80,7 @@ class LiveContacts:
         for name in list(self._readers):
             self._drop(name)
 
-    def _newest(self, name: str, reader: ContactsReader) -> ContactsFrame | None:
+    def _newest(self, name: str, reader: SourceReader[Any, FrameT]) -> FrameT | None:
         try:
             reader.refresh()
             if reader.structure_changed:
@@ -91,6 +95,16 @@ class LiveContacts:
 
     def _drop(self, name: str) -> None:
         self._readers.pop(name).close()
+
+
+def live_contacts(namespace: Namespace) -> LiveSources[ContactsFrame]:
+    """The services of contacts in a namespace."""
+    return LiveSources(namespace, ContactsReader)
+
+
+def live_motion(namespace: Namespace) -> LiveSources[MotionFrame]:
+    """The services of motion over regions in a namespace."""
+    return LiveSources(namespace, MotionReader)
 
 
 def places_of(frame: ContactsFrame | None, structure: Structure) -> list[TouchedPlace]:

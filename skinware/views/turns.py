@@ -160,6 +160,8 @@ class Viewer:
         header["pictures"] = pictures
         low, high = pictures[0]["scale"]
         header["scale"] = {"low": low, "high": high, "unit": pictures[0]["unit"], "mode": self.look.mode}
+        header["contacts"] = [told for driver in self._follower.drivers for told in self._contacts(driver)]
+        header["regions"] = [told for driver in self._follower.drivers for told in _regions(driver)]
         wiped = self.look.wiped(self._follower.drivers)
         if wiped is not None:
             header["wipe"] = wiped._asdict()
@@ -181,11 +183,43 @@ class Viewer:
         }
         if picture.shear is not None:
             told |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
+        contact_of = driver.contact_of(quantity)
+        if contact_of is not None:
+            told["contact_of"] = blobs.add(contact_of, "i1")
         status, key = driver.status[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):
             self._status[key] = status
             told["status"] = blobs.add(status, "u1")
+        return told
+
+    def _contacts(self, driver: Followed) -> list[dict[str, Any]]:
+        """The contacts on a driver where the viewer sees them, the oldest first."""
+        quantity = self.look.quantity_of(driver)
+        if quantity is None or driver.contacts is None or driver.contact_of(quantity) is None:
+            return []
+        placed = self._follower.scene.of(driver.name, quantity.name)
+        told = []
+        for contact in driver.contacts:
+            pose = self._follower.scene.pose(contact.frame)
+            position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
+            if not np.isfinite(position).all():  # without places: in the middle of where its taxels are laid out
+                position = placed.position[contact.taxels].mean(axis=0)
+            told.append(
+                {
+                    "id": contact.id,
+                    "driver": driver.number,
+                    "kind": contact.kind.name.lower(),
+                    "position": position.tolist(),
+                    "normal": normal.tolist(),
+                    "load": contact.load,
+                    "unit": driver.contacts.source.unit,
+                    "area_m2": contact.area_m2,
+                    "speed": float(np.linalg.norm(contact.velocity_m_s)),
+                    "age_s": contact.age_s,
+                    "taxels": contact.n,
+                }
+            )
         return told
 
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:
@@ -229,6 +263,23 @@ class Viewer:
             drivers.append(state_of(driver))
             problems += problems_of(driver, drivers[-1])
         return {"drivers": drivers, "problems": worst_first(problems)}
+
+
+def _regions(driver: Followed) -> list[dict[str, Any]]:
+    """What touches the regions of a driver."""
+    if driver.motion is None:
+        return []
+    return [
+        {
+            "name": region.name,
+            "driver": driver.number,
+            "value": region.load,
+            "unit": driver.motion.source.unit,
+            "touched": region.contacts > 0,
+            "speed": region.speed_m_s,
+        }
+        for region in driver.motion
+    ]
 
 
 def _seen(driver: Followed) -> tuple[int, int]:

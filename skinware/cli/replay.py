@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from skinware.recording.replaying import Replayer
 
 _NAMESPACE = "replay"
+_DRAW_EVERY_S = 0.1
 
 
 def speed(text: str) -> float:
@@ -47,6 +49,7 @@ def speed(text: str) -> float:
         "skin-replay walk.mcap                         skin-top --namespace replay shows it",
         "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
         "skin-replay walk.mcap --start 10 --end 12 --loop",
+        "skin-replay walk.mcap --paused                step through it with . and ,",
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
@@ -55,6 +58,15 @@ def speed(text: str) -> float:
 @click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--paused", is_flag=True, help="Wait for a key or a request first.")
+@click.option("--stay", is_flag=True, help="Pause at the end, instead of ending.")
+@click.option(
+    "--times",
+    type=click.Choice(["now", "recorded"]),
+    default="now",
+    show_default=True,
+    help="Times of frames: moved to now, so that ages are as they were; or those of then.",
+)
 @click.option(
     "--namespace",
     metavar="NAME",
@@ -69,37 +81,53 @@ def command(
     start_s: float,
     end_s: float | None,
     loop: bool,
+    paused: bool,
+    stay: bool,
+    times: str,
     namespace: str | None,
     as_json: bool,
 ) -> None:
     """Publish the drivers and services of a recording again, or only NAME..., as if they ran now.
 
-    They have the same names, structures, states and counters, and restart where they restarted. Times are moved to now.
+    They have the same names, structures, states and counters, and restart where they restarted. In a terminal, keys
+    pause, step, seek and change the speed; other programs ask any of the services for the same (pause, resume, step,
+    seek, speed, loop, replay).
+
+    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
     import skinware.recording
+    from skinware.cli._replay_keys import KEYS, Terminal
     from skinware.memory.namespace import Namespace
     from skinware.recording.replaying import Replayer
 
     place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or _NAMESPACE)
     with skinware.recording.open(file) as recording:
-        for name in names:
-            recording[name]
-        replayer = Replayer(recording, names=names or None, namespace=place, speed=factor)
-        with contextlib.closing(replayer), signals_end(replayer.stop):
+        replayer = Replayer(
+            recording,
+            names=names or None,
+            namespace=place,
+            speed=factor,
+            start_s=start_s,
+            end_s=end_s,
+            loop=loop,
+            paused=paused,
+            stays=stay,
+            keeps_times=times == "recorded",
+        )
+        terminal = Terminal(replayer)
+        has_keys = not as_json and terminal.is_ours
+        continued = {signal.SIGCONT: terminal.take} if has_keys else {}
+        with contextlib.closing(replayer), signals_end(replayer.stop, continued):
             _ready(recording, names, place.name, as_json)
-            _play(replayer, start_s, end_s, loop, as_json)
+            if has_keys:
+                click.echo(KEYS)
+                with terminal.keys():
+                    replayer.run(terminal.draw, _DRAW_EVERY_S)
+            else:
+                replayer.run(lambda: _tell("status", replayer, as_json))
         for problem in recording.problems:
             warn(problem)
     _tell("stopped", replayer, as_json)
-
-
-def _play(replayer: Replayer, start_s: float, end_s: float | None, loop: bool, as_json: bool) -> None:
-    published = -1
-    while published < replayer.frames.total():  # what has no frames is not looped
-        published = replayer.frames.total()
-        replayer.run(start_s, end_s, lambda: _tell("status", replayer, as_json))
-        if not loop or replayer.is_stopped:
-            break
 
 
 def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json: bool) -> None:
@@ -115,8 +143,7 @@ def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json
 def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
     with contextlib.suppress(BrokenPipeError):
         if as_json:
-            figures = {"time_s": replayer.time_s, "frames": dict(replayer.frames), "late": replayer.late}
-            print_json({"event": event, **figures})
+            print_json({"event": event, **replayer.replay(), "frames": dict(replayer.frames)})
         elif event == "stopped":
             late = f", {replayer.late} of them late" if replayer.late else ""
             click.echo(f"{replayer.frames.total()} frames published{late}")

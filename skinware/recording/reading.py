@@ -10,14 +10,13 @@ from typing import Any, Self
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.recording.frames import RecordedDriverFrame, RecordedFrame, RecordedSnapshot
+from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
 from skinware.recording.generation import Generation
-from skinware.recording.mcap_reading import ChunkContents, Damaged, McapSource
+from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource
+from skinware.recording.timeline import GONE, LIVE, PAUSED, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of
 from skinware.recording.tracks import Track
 from skinware.skin_layout import SkinLayout
-
-_GONE = ("closed", "dead")
 
 
 @dataclass
@@ -125,9 +124,10 @@ class Recording:
         """
         newest: dict[str, RecordedDriverFrame] = {}
         layout = SkinLayout((), ())
-        for time_s, driver, frame in self.moments(self.drivers if drivers is None else drivers, end_s=end_s):
-            if not isinstance(frame, RecordedDriverFrame):
+        for time_s, driver, frame, event in self.moments(self.drivers if drivers is None else drivers, end_s=end_s):
+            if event in GONE:
                 newest.pop(driver, None)
+            if not isinstance(frame, RecordedDriverFrame):
                 continue
             newest[driver] = frame
             layout = _layout(newest, layout)
@@ -137,30 +137,32 @@ class Recording:
 
     def moments(
         self, services: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
-    ) -> Iterator[tuple[float, str, RecordedFrame | None]]:
-        """Every frame of several services, by time: (time, service, frame); without a frame where one is gone.
+    ) -> Iterator[Moment]:
+        """Every frame of several services, and when they were paused, went on, or were gone, by time.
 
         Args:
             services: names; None: all.
             start_s: where to begin, s since the recording began.
             end_s: where to end, likewise; default: with the last.
         """
-        tracks = [self[name] for name in (self.services if services is None else services)]
-        for contents in self.chunks(
-            {self._topics.get(EVENTS, 0), *(track.channel for track in tracks)}, start_s, end_s
-        ):
-            found = [(time_s, track.name, frame) for track in tracks for time_s, frame in track.frames_in(contents)]
-            for time_s, service, frame in sorted([*found, *self._ends_in(contents)], key=lambda moment: moment[0]):
-                if time_s >= start_s and (end_s is None or time_s < end_s):
-                    yield time_s, service, frame
+        timeline = self.timeline(services)
+        timeline.seek(start_s)
+        while (moment := timeline.next()) is not None and (end_s is None or moment.time_s < end_s):
+            yield moment
 
-    def _ends_in(self, contents: ChunkContents) -> Iterator[tuple[float, str, None]]:
-        """(time, service) of those that were closed or died."""
-        for message in contents.messages:
-            if message.channel_id == self._topics.get(EVENTS):
-                event = _event(message.data)
-                if event.get("event") in _GONE:
-                    yield (message.time_ns - self.start_ns) / NS_PER_S, str(event.get("service")), None
+    def timeline(self, services: Collection[str] | None = None) -> Timeline:
+        """The moments of several services, to go to and fro in.
+
+        Args:
+            services: names; None: all.
+
+        Raises:
+            ConfigurationError: nothing was recorded of one of them.
+        """
+        names = self.services if services is None else tuple(services)
+        for name in names:
+            self[name]
+        return Timeline(self, names)
 
     def close(self) -> None:
         """Close the file; what was read stays. Idempotent."""
@@ -172,16 +174,61 @@ class Recording:
         """The chunks in which there may be messages of some channels, of a time; for tracks."""
         for place in self._source.chunks:
             has_some = place.channel_ids is None or not place.channel_ids.isdisjoint(channels)
-            begins_in_time = end_s is None or place.start_ns < self.start_ns + round(end_s * NS_PER_S)
-            if has_some and begins_in_time and place.end_ns >= self.start_ns + round(start_s * NS_PER_S):
-                try:
-                    yield self._source.contents(place)
-                except Damaged:
-                    self._damaged.add(place.offset)
+            begins_in_time = end_s is None or self.time_s(place.start_ns) < end_s
+            if has_some and begins_in_time and self.time_s(place.end_ns) >= start_s:
+                yield self._contents(place)
 
     def note(self, problem: str) -> None:
         """Something that is wrong with the file; for tracks."""
         self._problems[problem] = None
+
+    # -- what timelines ask for ---------------------------------------------------------------------------------
+
+    @property
+    def places(self) -> list[ChunkPlace]:
+        """Its chunks, in order."""
+        return self._source.chunks
+
+    def time_s(self, time_ns: int) -> float:
+        """The time of a message, s since the recording began."""
+        return (time_ns - self.start_ns) / NS_PER_S
+
+    def may_have(self, place: ChunkPlace, services: Collection[str], *, events: bool = True) -> bool:
+        """Whether there may be frames of some services in a chunk, or events."""
+        if place.channel_ids is None:
+            return True
+        channels = {self._services[name].frame_channel for name in services}
+        return not place.channel_ids.isdisjoint(channels | {self._topics.get(EVENTS, 0)} if events else channels)
+
+    def moments_in(self, place: ChunkPlace, services: Collection[str]) -> list[Moment]:
+        """The moments of some services in a chunk, by time; none if it is damaged."""
+        contents = self._contents(place)
+        frames = [Moment(time_s, name, frame) for name in services for time_s, frame in self[name].frames_in(contents)]
+        return sorted([*self._changes_in(contents, services), *frames], key=lambda moment: moment.time_s)
+
+    def _changes_in(self, contents: ChunkContents, services: Collection[str]) -> list[Moment]:
+        """What happened to some services; not later than the frames that come after it in the file."""
+        channels = {self._services[name].frame_channel: name for name in services}
+        next_s: dict[str, float] = {}
+        changes = []
+        for message in reversed(contents.messages):
+            time_s = self.time_s(message.time_ns)
+            if message.channel_id in channels:
+                next_s[channels[message.channel_id]] = time_s
+            elif message.channel_id == self._topics.get(EVENTS):
+                event = _event(message.data)
+                name, what = str(event.get("service")), str(event.get("event"))
+                if name in services and what in (PAUSED, LIVE, *GONE):
+                    next_s[name] = min(time_s, next_s.get(name, time_s))
+                    changes.append(Moment(next_s[name], name, None, what))
+        return changes[::-1]
+
+    def _contents(self, place: ChunkPlace) -> ChunkContents:
+        try:
+            return self._source.contents(place)
+        except Damaged:
+            self._damaged.add(place.offset)
+            return ChunkContents()
 
     # -- what there is ------------------------------------------------------------------------------------------
 
@@ -223,7 +270,7 @@ class Recording:
         for contents in self.chunks({channel}):
             for message in contents.messages:
                 if message.channel_id == channel:
-                    yield {**_event(message.data), "time_s": (message.time_ns - self.start_ns) / NS_PER_S}
+                    yield {**_event(message.data), "time_s": self.time_s(message.time_ns)}
 
     def __enter__(self) -> Self:
         return self

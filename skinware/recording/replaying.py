@@ -2,39 +2,48 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
+from typing import Any
 
 from skinware.memory.namespace import Namespace
-from skinware.memory.schema import STATIC_NAME
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
-from skinware.recording.frames import RecordedFrame
-from skinware.recording.generation import Generation
 from skinware.recording.reading import Recording
-from skinware.service import ServiceWriter
+from skinware.recording.republishing import Republisher
+from skinware.recording.timeline import GONE, Moment
 
-_TIMES_OF_DRIVERS = ("module_time_ns", "bus_since_ns")
-"""Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""
 _LATE_NS = 10_000_000
+_MOST_BEHIND_NS = 50_000_000
+"""Who is later than that goes on from there: frames that follow at once are more than a ring holds."""
+_FINE_NS = 1_500_000
+"""Before a frame is due, requests wait: their wait is in full milliseconds."""
+_NEAR_S = 1.0
+_TIDY_NS = NS_PER_S // 2
 
 
 class Replayer:
     """Publishes what was recorded under the same names, with the same tables, and in the same rhythm.
 
-    Times are moved to now: a frame and all times in it by as much as lies between its publication then and now, so that
-    ages stay as they were, also at another speed.
+    Programs ask its services for the operations :meth:`replay`, :meth:`pause`, :meth:`resume`, :meth:`step`,
+    :meth:`seek`, :meth:`speed` and :meth:`loop`; whichever they ask, all services of the replay follow. In Python they
+    are for the thread that runs it.
 
     Args:
         recording: what to publish.
         names: of services; None: all.
         namespace: where to publish them.
         speed: 2.0: twice as fast.
+        start_s: where it begins, s since the recording began.
+        end_s: where it ends, likewise; default: with the last frame.
+        loop: it begins again at its end.
+        paused: it waits for ``resume`` or ``step`` first.
+        stays: at its end it is paused, and does not end.
+        keeps_times: times stay as they were recorded; otherwise they are moved to now.
 
     Attributes:
-        frames: of each service that were published.
         late: frames that were published more than 10 ms after their time.
-        time_s: of the recording, up to which it was published.
     """
 
     def __init__(
@@ -44,47 +53,81 @@ class Replayer:
         names: Collection[str] | None = None,
         namespace: Namespace | str | None = None,
         speed: float = 1.0,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+        loop: bool = False,
+        paused: bool = False,
+        stays: bool = False,
+        keeps_times: bool = False,
     ) -> None:
-        self._recording, self._names = recording, recording.services if names is None else tuple(names)
-        self._namespace = Namespace.of(namespace)
-        self._speed = speed
-        self._writers: dict[str, ServiceWriter] = {}
-        self._generations: dict[str, int] = {}
+        self._recording = recording
+        self._timeline = recording.timeline(names)
+        self._first_s = self._timeline.first_s()
+        self._start_s, self._end_s = start_s, math.inf if end_s is None else end_s
+        self._loops, self._paused, self._stays = loop, paused, stays
+        operations = (self.replay, self.pause, self.resume, self.step, self.seek, self.speed, self.loop)
+        self._republisher = Republisher(
+            Namespace.of(namespace), {call.__name__: call for call in operations}, keeps_times=keeps_times
+        )
+        self._republisher.speed = speed
+        self._republisher.pause(paused)
+        self._next: Moment | None = None
+        self._reached_s = self._from_s = start_s
+        self._from_ns = now_ns()
+        self._turned = 0
+        self._jumped: set[str] = set()
+        self._goes_on = False
         self._stopping = False
-        self._tell_ns = 0
-        self.frames: Counter[str] = Counter()
+        self._tell_ns = self._tidy_ns = 0
         self.late: int = 0
-        self.time_s: float = 0.0
 
-    def run(self, start_s: float = 0.0, end_s: float | None = None, tell: Callable[[], object] = lambda: None) -> None:
-        """Publish it once, until its end or until ``stop``.
+    @property
+    def time_s(self) -> float:
+        """Where it is in the recording, s since that began."""
+        if self._paused:
+            return self._from_s
+        passed_s = self._from_s + (now_ns() - self._from_ns) / NS_PER_S * self._republisher.speed
+        most_s = min(self._end_s, self._recording.duration_s) if self._next is None else self._next.time_s
+        return max(self._reached_s, min(passed_s, most_s))
+
+    @property
+    def frames(self) -> Counter[str]:
+        """Of each service that were published."""
+        return self._republisher.frames
+
+    def run(self, tell: Callable[[], object] = lambda: None, every_s: float = 1.0) -> None:
+        """Publish it, until its end or until ``stop``.
 
         Args:
-            start_s: where to begin, s since the recording began.
-            end_s: where to end, likewise; default: with the last frame.
-            tell: called about once a second.
+            tell: called about every ``every_s``.
+            every_s: how often.
 
         Raises:
             NameInUse: a running driver or service has one of the names.
             NamespaceError: the namespace cannot be used, or shared memory is full.
         """
-        begin_ns, first_s = now_ns(), None
-        for time_s, name, frame in self._recording.moments(self._names, start_s=start_s, end_s=end_s):
-            first_s = time_s if first_s is None else first_s
-            due_ns = begin_ns + round((time_s - first_s) / self._speed * NS_PER_S)
-            if not self._wait(due_ns, tell):
-                return
-            self.time_s = time_s
-            if frame is None:
-                self._close(name)
-            else:
-                self._publish(name, frame)
-                self.late += now_ns() - due_ns > _LATE_NS
-
-    @property
-    def is_stopped(self) -> bool:
-        """Whether ``stop`` was called."""
-        return self._stopping
+        if self._start_s > self._recording.duration_s:
+            return
+        self._go_to(self._start_s)
+        if self._paused and not self.frames:  # who is to resume it has to find it
+            self.step()
+        while not self._stopping:
+            if not self._paused and self._next is None:
+                self._next = self._take_next()
+                if self._next is None and not self._end():
+                    return
+            due_ns = now_ns() + WAIT_SLICE_NS if self._next is None or self._paused else self._due_ns(self._next)
+            turned = self._turned
+            if not self._wait(due_ns, tell, every_s) or self._next is None or self._paused or turned != self._turned:
+                continue
+            behind_ns = now_ns() - due_ns
+            if behind_ns > _MOST_BEHIND_NS:
+                self._from_ns += behind_ns
+            if self._next.frame is not None:
+                self.late += behind_ns > _LATE_NS
+            moment, self._next = self._next, None
+            self._goes_on = True
+            self._apply(moment)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
@@ -92,56 +135,187 @@ class Replayer:
 
     def close(self) -> None:
         """Withdraw what is published. Idempotent."""
-        for name in list(self._writers):
-            self._close(name)
+        self._republisher.close()
 
-    def _wait(self, due_ns: int, tell: Callable[[], object]) -> bool:
-        """Until a time; False: it is to end."""
-        while not self._stopping:
+    def watch(self, fd: int, call: Callable[[], object]) -> None:
+        """While it runs, call something whenever a descriptor can be read."""
+        self._republisher.watch(fd, call)
+
+    def unwatch(self, fd: int) -> None:
+        """Not any more."""
+        self._republisher.unwatch(fd)
+
+    # -- operations -----------------------------------------------------------------------------------------------
+
+    def replay(self) -> dict[str, Any]:
+        """Tell the file, time_s, duration_s, speed, and whether it is paused and loops."""
+        return {
+            "file": str(self._recording.path),
+            "time_s": self.time_s,
+            "duration_s": self._recording.duration_s,
+            "speed": self._republisher.speed,
+            "paused": self._paused,
+            "loop": self._loops,
+            "late": self.late,
+        }
+
+    def pause(self) -> dict[str, Any]:
+        """Stop publishing; then as replay."""
+        self._set_paused(True, self.time_s)
+        return self.replay()
+
+    def resume(self) -> dict[str, Any]:
+        """Go on after a pause; then as replay."""
+        self._set_paused(False, self.time_s)
+        return self.replay()
+
+    def step(self, frames: int = 1) -> dict[str, Any]:
+        """Pause, and publish the next of the frames, or as many; back with numbers below 0; then as replay."""
+        if _number(frames, "frames") != int(frames) or not frames:
+            raise ValueError(f"frames={frames!r}: give a whole number, below 0 to go back")
+        self._set_paused(True, self.time_s)
+        if frames < 0:
+            self._step_back(-frames)
+        else:
+            self._step_on(frames)
+        self._from_now(self._reached_s)
+        return self.replay()
+
+    def seek(self, time_s: float) -> dict[str, Any]:
+        """Go to a time, s since the recording began, and publish what was newest then; then as replay."""
+        time_s = _number(time_s, "time_s")
+        self._go_to(min(max(time_s, self._start_s), self._end_s, self._recording.duration_s))
+        return self.replay()
+
+    def speed(self, factor: float) -> dict[str, Any]:
+        """Be so many times as fast as the recording; then as replay."""
+        factor = _number(factor, "factor")
+        if not factor > 0:
+            raise ValueError(f"factor={factor!r}: a speed is above 0; 1 is that of the recording")
+        self._from_now(self.time_s)
+        self._republisher.speed = factor
+        return self.replay()
+
+    def loop(self, on: bool = True) -> dict[str, Any]:
+        """Begin again at the end, or not any more; then as replay."""
+        self._loops = bool(on)
+        return self.replay()
+
+    # -- time -----------------------------------------------------------------------------------------------------
+
+    def _from_now(self, time_s: float) -> None:
+        """From now on time goes on from there; what is waited for is another moment."""
+        self._from_ns, self._from_s = now_ns(), time_s
+        self._turned += 1
+
+    def _due_ns(self, moment: Moment) -> int:
+        return self._from_ns + round((moment.time_s - self._from_s) / self._republisher.speed * NS_PER_S)
+
+    def _wait(self, due_ns: int, tell: Callable[[], object], every_s: float) -> bool:
+        """Until a time; False: something was asked for meanwhile, or it is to end."""
+        turned = self._turned
+        while not self._stopping and self._turned == turned:
             time_ns = now_ns()
             if time_ns >= self._tell_ns:
-                self._tell_ns = time_ns + NS_PER_S
+                self._tell_ns = time_ns + round(every_s * NS_PER_S)
                 tell()
-            if time_ns >= due_ns:
+            if time_ns >= self._tidy_ns:
+                self._tidy_ns = time_ns + _TIDY_NS
+                self._republisher.tidy()
+            left_ns = due_ns - now_ns()
+            if left_ns <= 0:
                 return True
-            time.sleep(min(due_ns - time_ns, WAIT_SLICE_NS) / NS_PER_S)
+            if left_ns > _FINE_NS:
+                self._republisher.answer(min(left_ns - _FINE_NS, WAIT_SLICE_NS) / NS_PER_S)
+            else:
+                time.sleep(left_ns / NS_PER_S)
         return False
 
-    def _publish(self, name: str, frame: RecordedFrame) -> None:
-        generation = self._recording[name].generation(frame.generation)
-        writer = self._writer(name, generation)
-        shift_ns = now_ns() - frame.published_ns
-        for column, into in writer.begin().items():
-            into[...] = frame.column(column)
-            if generation.is_driver and column in _TIMES_OF_DRIVERS:
-                into[into != 0] += shift_ns
-        writer.commit(frame.acquired_ns + shift_ns if frame.acquired_ns else 0, frame.flags)
-        self.frames[name] += 1
+    # -- what is published ----------------------------------------------------------------------------------------
 
-    def _writer(self, name: str, generation: Generation) -> ServiceWriter:
-        writer = self._writers.get(name)
-        if writer is not None and self._generations[name] == generation.generation:
-            return writer
-        schema = generation.schema
-        static = {table: column for table, column in generation.static().items() if table != STATIC_NAME}
-        rate_hz = NS_PER_S / generation.period_ns * self._speed if generation.period_ns else None
-        if writer is not None:
-            writer.restructure(schema.columns, static, rate_hz=rate_hz)
+    def _take_next(self) -> Moment | None:
+        """The next moment, of which the timeline is then behind; None at the end."""
+        moment = self._timeline.next()
+        if moment is not None and moment.time_s >= self._end_s:
+            self._timeline.back()
+            return None
+        return moment
+
+    def _end(self) -> bool:
+        """What is done at the end; False: nothing more."""
+        if self._loops and self._goes_on:
+            self._goes_on = False
+            self._go_to(self._start_s)
+        elif self._stays:
+            self._set_paused(True, self._reached_s)
         else:
-            writer = self._writers[name] = ServiceWriter(
-                name,
-                schema.columns,
-                static,
-                namespace=self._namespace,
-                kind=generation.kind,
-                slots=generation.slot_count,
-                rate_hz=rate_hz,
-                description=schema.description,
-            )
-        self._generations[name] = generation.generation
-        return writer
+            return False
+        return True
 
-    def _close(self, name: str) -> None:
-        writer = self._writers.pop(name, None)
-        if writer is not None:
-            writer.close()
+    def _apply(self, moment: Moment) -> None:
+        self._reached_s = moment.time_s
+        if moment.frame is None:
+            self._republisher.happened(moment.service, moment.event)
+        else:
+            follows = moment.service not in self._jumped
+            self._jumped.discard(moment.service)
+            generation = self._recording[moment.service].generation(moment.frame.generation)
+            self._republisher.publish(moment.service, moment.frame, generation, follows=follows)
+
+    def _set_paused(self, paused: bool, time_s: float) -> None:
+        self._paused = paused
+        self._republisher.pause(paused)
+        self._from_now(time_s)
+
+    def _put_back(self) -> None:
+        """The moment that is waited for comes after the timeline's place again."""
+        if self._next is not None:
+            self._timeline.back()
+            self._next = None
+
+    def _go_to(self, time_s: float) -> None:
+        self._put_back()
+        self._timeline.seek(time_s)
+        self._reached_s = time_s
+        self._show(self._timeline.services)
+        self._from_now(time_s)
+
+    def _step_on(self, frames: int) -> None:
+        while frames and (moment := self._take_next() if self._next is None else self._next) is not None:
+            self._next = None
+            self._apply(moment)
+            frames -= moment.frame is not None
+
+    def _step_back(self, frames: int) -> None:
+        self._put_back()
+        changed: dict[str, None] = {}
+        while frames and (moment := self._timeline.back()) is not None:
+            if moment.time_s < self._start_s:
+                self._timeline.next()
+                break
+            changed[moment.service] = None
+            frames -= moment.frame is not None
+        before = self._timeline.back()
+        if before is not None:
+            self._timeline.next()
+        self._reached_s = self._start_s if before is None else max(self._start_s, before.time_s)
+        self._show(changed)
+
+    def _show(self, services: Collection[str]) -> None:
+        """Make some services what they were at the timeline's place."""
+        so_far = self._timeline.so_far(services)
+        for name in services:
+            self._jumped.add(name)
+            moments = so_far.get(name, [])
+            if moments[-1].event in GONE if moments else self._first_s.get(name, 0.0) > self._reached_s + _NEAR_S:
+                self._republisher.withdraw_later(name)
+                continue
+            for moment in moments:
+                self._apply(moment._replace(time_s=self._reached_s))
+            self._jumped.add(name)
+
+
+def _number(value: Any, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{name}={value!r}: give a number")
+    return float(value)

@@ -206,6 +206,16 @@ class Ownership:
                 self._server.close()  # now: who finds no socket finds no living writer either
             self._name_lock.close()
 
+    def desert(self) -> None:
+        """Give the name back and leave the files as they are, as the kernel does for a writer that is killed."""
+        if self.closed:
+            return
+        with self._changing:
+            self._ring.segment.descriptor.close()
+            if self._server is not None:
+                self._server.abandon()
+            self._name_lock.close()
+
     def _begin_generation(
         self,
         schema: Schema,

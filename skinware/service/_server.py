@@ -7,7 +7,7 @@ import os
 import select
 import socket
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -103,6 +103,9 @@ class RequestServer(ForkGuard):
         operations: descriptions of the operations that the service declares.
 
     Attributes:
+        paused: requests are refused, but those of ``while_paused``.
+        while_paused: names of operations that are carried out also then.
+        why_no_others: told to who asks for an operation that is not declared; empty: nothing is.
         turn_ns: how long one turn may take; at most one packet is begun before it is over and ends after it.
 
     Raises:
@@ -112,6 +115,8 @@ class RequestServer(ForkGuard):
     def __init__(self, namespace: Namespace, name: str, operations: Mapping[str, str]) -> None:
         self.operations: dict[str, str] = dict(operations)
         self.paused = False
+        self.while_paused: Collection[str] = ()
+        self.why_no_others = ""
         self.turn_ns = MOST_TURN_NS
         self._path = namespace.socket_path(name)
         self._inode = 0
@@ -255,7 +260,7 @@ class RequestServer(ForkGuard):
         request = peer.open[ask.id] = Request(self, peer, ask)
         if ask.operation == OPERATIONS:
             request.reply(self.operations)
-        elif self.paused:
+        elif self.paused and ask.operation not in self.while_paused:
             request.fail("the service is paused", "paused")
         elif is_too_much:
             request.fail(f"{_MAX_OPEN_OF_A_PEER} requests wait already", "refused")
@@ -263,7 +268,8 @@ class RequestServer(ForkGuard):
             return request
         elif ask.operation not in self.operations:
             there_are = ", ".join(self.operations) or "none"
-            request.fail(f"no operation {ask.operation!r}; there are: {there_are}", "refused")
+            why = f" ({self.why_no_others})" if self.why_no_others else ""
+            request.fail(f"no operation {ask.operation!r}{why}; there are: {there_are}", "refused")
         elif peer.is_stranger and (why := _too_costly(ask.arguments)):
             request.fail(f"{ask.operation}: {why}", "refused")
         elif (arguments := decode_arguments(ask.arguments)) is None:

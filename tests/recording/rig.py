@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
+import skinware.recording
 from skinware import Frame, ServiceReader, ServiceWriter
 from skinware.recording.files import Files, Target
 from skinware.recording.recorder import Recorder
+from skinware.recording.replaying import Replayer
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 
@@ -33,6 +35,21 @@ def recording(path: Path, target: Target | None = None, **options: Any) -> Itera
     finally:
         recorder.stop()
         thread.join()
+
+
+@contextmanager
+def replaying(file: Path, **options: Any) -> Iterator[Replayer]:
+    """A replay in a thread."""
+    with skinware.recording.open(file) as opened:
+        replayer = Replayer(opened, **options)
+        thread = threading.Thread(target=replayer.run)
+        thread.start()
+        try:
+            yield replayer
+        finally:
+            replayer.stop()
+            thread.join()
+            replayer.close()
 
 
 def has(recorder: Recorder, service: str) -> None:

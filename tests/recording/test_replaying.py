@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +15,7 @@ from skinware.recording import Recording
 from skinware.recording.replaying import Replayer
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
-from tests.recording.rig import contents_of, has, pose_service, publish_pose, recording
+from tests.recording.rig import contents_of, has, pose_service, publish_pose, recording, replaying
 
 TIMES = ("module_time_ns", "bus_since_ns")
 
@@ -40,21 +37,6 @@ def record_two_lives(file: Path) -> None:
                     time.sleep(0.004)
                 total += 25
                 wait_until(lambda total=total: recorder.messages.get("/skin/torso/frame", 0) == total)  # type: ignore[misc]
-
-
-@contextmanager
-def replaying(file: Path, **options: float) -> Iterator[Replayer]:
-    """A replay in a thread, once through."""
-    with skinware.recording.open(file) as opened:
-        replayer = Replayer(opened, **options)  # type: ignore[arg-type]
-        thread = threading.Thread(target=replayer.run)
-        thread.start()
-        try:
-            yield replayer
-        finally:
-            replayer.stop()
-            thread.join()
-            replayer.close()
 
 
 def values_of(opened: Recording, name: str) -> list[dict[str, bytes]]:

@@ -1,0 +1,255 @@
+"""Recorded services, published again under their names: each by a writer of its own, all with the same operations."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy.typing as npt
+
+from skinware.errors import NameInUse
+from skinware.memory.namespace import Namespace
+from skinware.memory.schema import STATIC_NAME
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.recording.frames import RecordedFrame
+from skinware.recording.generation import Generation
+from skinware.recording.timeline import CLOSED, DEAD, LIVE, PAUSED
+from skinware.service import Request, ServiceWriter
+
+_TIMES_OF_DRIVERS = ("module_time_ns", "bus_since_ns")
+"""Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""
+_OTHERS = "this is a recording"
+
+
+@dataclass
+class _Service:
+    """One that is published.
+
+    Attributes:
+        writer: of it.
+        fd: by which requests come.
+        generation: that the newest frame has in the recording.
+        speed: of the replay when the writer's generation began, which told its rate to readers.
+        was_paused: its writer had paused it, in the recording.
+        waiting: who asked for a frame that is acquired from then on, CLOCK_MONOTONIC ns.
+    """
+
+    writer: ServiceWriter
+    fd: int
+    generation: Generation
+    speed: float
+    was_paused: bool = False
+    waiting: list[tuple[int, Request]] = field(default_factory=list)
+
+
+class Republisher:
+    """Publishes frames of a recording.
+
+    Times are moved to now, unless they are to be kept: a frame and all times in it by as much as lies between its
+    publication then and now, so that ages stay as they were, whatever the speed.
+
+    Args:
+        namespace: where to publish.
+        operations: that every service offers, also while it is paused.
+        keeps_times: they stay as they were recorded.
+
+    Attributes:
+        frames: of each service that were published.
+        speed: 2.0: twice as fast as they were recorded; told to readers as the rate.
+    """
+
+    def __init__(
+        self,
+        namespace: Namespace,
+        operations: Mapping[str, Callable[..., object]],
+        *,
+        keeps_times: bool = False,
+    ) -> None:
+        self._namespace, self._operations, self._keeps_times = namespace, operations, keeps_times
+        self._services: dict[str, _Service] = {}
+        self._deserted: dict[str, Generation] = {}
+        self._surplus: list[str] = []
+        self._paused = False
+        self._epoll = select.epoll()
+        self._calls: dict[int, Callable[[], object]] = {}
+        self.frames: Counter[str] = Counter()
+        self.speed: float = 1.0
+
+    def publish(self, name: str, frame: RecordedFrame, generation: Generation, *, follows: bool = True) -> None:
+        """Publish a frame now.
+
+        Args:
+            name: of the service.
+            frame: of it.
+            generation: of the frame.
+            follows: it comes after the frame before, so that a restart between them is one; otherwise only other
+                columns or tables begin a new generation.
+
+        Raises:
+            NameInUse: a running driver or service has the name.
+            NamespaceError: the namespace cannot be used, or shared memory is full.
+        """
+        if name in self._surplus:
+            self._surplus.remove(name)
+        service = self._service(name, generation, follows)
+        writer = service.writer
+        service.was_paused = False
+        if writer.paused:
+            writer.resume()
+        shift_ns = now_ns() - frame.published_ns
+        for column, into in writer.begin().items():
+            into[...] = frame.column(column)
+            if not self._keeps_times and generation.is_driver and column in _TIMES_OF_DRIVERS:
+                into[into != 0] += shift_ns
+        acquired_ns = frame.acquired_ns + shift_ns if frame.acquired_ns else 0
+        writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
+        self.frames[name] += 1
+        self._reply(service, acquired_ns)
+        if self._paused:
+            self._apply_pause(service)
+
+    def happened(self, name: str, event: str) -> None:
+        """What happened to a service in the recording happens to it now."""
+        service = self._services.get(name)
+        if service is None:
+            return
+        if event in (PAUSED, LIVE):
+            service.was_paused = event == PAUSED
+            self._apply_pause(service)
+        elif event in (CLOSED, DEAD):
+            self._remove(name, deserted=event == DEAD)
+
+    def pause(self, paused: bool) -> None:
+        """Pause all services, or let them be as they were recorded."""
+        self._paused = paused
+        for service in self._services.values():
+            self._apply_pause(service)
+
+    def withdraw_later(self, name: str) -> None:
+        """A service is not there any more, from the next ``tidy`` on: who asked for that is answered before."""
+        self._surplus.append(name)
+
+    def tidy(self) -> None:
+        """Withdraw what is not there any more, and keep the files of the others."""
+        for name in self._surplus:
+            if name in self._services:
+                self._remove(name)
+        self._surplus.clear()
+        for service in self._services.values():
+            service.writer.keep_files()
+
+    def watch(self, fd: int, call: Callable[[], object]) -> None:
+        """While requests are waited for, call something whenever a descriptor can be read."""
+        self._calls[fd] = call
+        self._epoll.register(fd, select.EPOLLIN)
+
+    def unwatch(self, fd: int) -> None:
+        """Not any more."""
+        if self._calls.pop(fd, None) is not None:
+            with contextlib.suppress(OSError):  # it is closed
+                self._epoll.unregister(fd)
+
+    def answer(self, timeout_s: float) -> None:
+        """Carry out what is asked for.
+
+        Args:
+            timeout_s: longest wait for something, in full milliseconds.
+        """
+        for fd, _ in self._epoll.poll(timeout_s):
+            call = self._calls.get(fd)
+            if call is not None:
+                call()
+
+    def close(self) -> None:
+        """Withdraw all that is published. Idempotent."""
+        for name in list(self._services):
+            self._remove(name)
+        for name, generation in list(self._deserted.items()):
+            del self._deserted[name]
+            with contextlib.suppress(NameInUse):
+                self._new_writer(name, generation).close()
+        self._epoll.close()
+
+    def _service(self, name: str, generation: Generation, follows: bool) -> _Service:
+        """The service, with the generation of a frame."""
+        service = self._services.get(name)
+        if service is not None and _kind_of(service.generation) != _kind_of(generation):
+            self._remove(name)
+            service = None
+        if service is None:
+            return self._begin(name, generation)
+        before, service.generation = service.generation, generation
+        restarted = follows and before.generation != generation.generation
+        if restarted or before.digest != generation.digest or service.speed != self.speed:
+            static = _tables(generation)
+            service.writer.restructure(generation.schema.columns, static, rate_hz=self._rate_hz(generation))
+            service.speed = self.speed
+        return service
+
+    def _begin(self, name: str, generation: Generation) -> _Service:
+        writer = self._new_writer(name, generation)
+        self._deserted.pop(name, None)
+        server = writer.request_server()
+        server.while_paused, server.why_no_others = frozenset(self._operations), _OTHERS
+        service = self._services[name] = _Service(writer, server.fileno(), generation, self.speed)
+        self.watch(service.fd, lambda: self._take_requests(name))
+        return service
+
+    def _new_writer(self, name: str, generation: Generation) -> ServiceWriter:
+        return ServiceWriter(
+            name,
+            generation.schema.columns,
+            _tables(generation),
+            namespace=self._namespace,
+            kind=generation.kind,
+            slots=generation.slot_count,
+            rate_hz=self._rate_hz(generation),
+            description=generation.schema.description,
+            operations=self._operations,
+        )
+
+    def _rate_hz(self, generation: Generation) -> float | None:
+        return NS_PER_S / generation.period_ns * self.speed if generation.period_ns else None
+
+    def _apply_pause(self, service: _Service) -> None:
+        paused = self._paused or service.was_paused
+        if paused != service.writer.paused:
+            (service.writer.pause if paused else service.writer.resume)()
+        if paused:
+            for _, request in service.waiting:
+                request.fail("the service is paused", "paused")
+            service.waiting.clear()
+
+    def _take_requests(self, name: str) -> None:
+        service = self._services[name]
+        service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
+
+    @staticmethod
+    def _reply(service: _Service, acquired_ns: int) -> None:
+        """Answer those whose frame this is."""
+        answered = [request for time_ns, request in service.waiting if time_ns <= acquired_ns]
+        service.waiting = [(t, r) for t, r in service.waiting if t > acquired_ns and not r.cancelled]
+        for request in answered:
+            request.reply(position=service.writer.position)
+
+    def _remove(self, name: str, *, deserted: bool = False) -> None:
+        service = self._services.pop(name)
+        self.unwatch(service.fd)
+        if deserted:
+            service.writer.desert()
+            self._deserted[name] = service.generation
+        else:
+            service.writer.close()
+
+
+def _kind_of(generation: Generation) -> tuple[str, int]:
+    """What a writer has for good."""
+    return generation.kind, generation.slot_count
+
+
+def _tables(generation: Generation) -> dict[str, npt.NDArray[Any]]:
+    return {table: column for table, column in generation.static().items() if table != STATIC_NAME}

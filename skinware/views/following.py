@@ -186,6 +186,7 @@ class Follower:
         poses: of coordinate frames, by name.
 
     Attributes:
+        namespace, names, calm_namespace: as given.
         drivers: all there are, by name.
         scene: where their taxels are.
         edition: another one whenever drivers or structures are others.
@@ -199,7 +200,7 @@ class Follower:
         calm: Namespace | None = None,
         poses: Mapping[str, Pose] | None = None,
     ) -> None:
-        self.namespace, self.calm_namespace = namespace, calm
+        self.namespace, self.names, self.calm_namespace = namespace, tuple(names), calm
         self.drivers: list[Followed] = []
         self.problem: str | None = None
         self.edition = 0

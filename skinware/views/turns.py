@@ -19,7 +19,7 @@ from skinware.views import operations
 from skinware.views.following import Followed, Follower
 from skinware.views.looks import Look
 from skinware.views.scene import Scene
-from skinware.views.state import ERROR, problems_of, state_of, worst_first
+from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
 
 PROTOCOL = "skinware.view.1"
 _ALIGNMENT = 8
@@ -120,7 +120,7 @@ class Viewer:
         """All that is new for this viewer.
 
         Args:
-            besides: part of the state that the server knows.
+            besides: part of the state that the server knows; its ``problems`` come first among those as bad.
         """
         self._number += 1
         blobs = Blobs()
@@ -139,7 +139,7 @@ class Viewer:
             header["error"], self._error = self._error, None
         if now_ns() >= self._state_due_ns:
             self._state_due_ns = now_ns() + _STATE_EVERY_NS
-            header["state"] = self._state() | besides
+            header["state"] = besides | self._state(besides.get("problems", []))
         return blobs.under(header)
 
     def _see_all_again(self) -> None:
@@ -267,14 +267,13 @@ class Viewer:
             self.refuse(str(error))
             return {}
 
-    def _state(self) -> dict[str, Any]:
-        problems: list[dict[str, Any]] = []
+    def _state(self, problems: list[dict[str, Any]]) -> dict[str, Any]:
         if self._follower.problem is not None:
-            problems.append({"severity": ERROR, "driver": None, "text": self._follower.problem})
+            problems = [*problems, problem_of_all(self._follower.problem)]
         drivers = []
         for driver in self._follower.drivers:
             drivers.append(state_of(driver))
-            problems += problems_of(driver, drivers[-1])
+            problems = problems + problems_of(driver, drivers[-1])
         return {"drivers": drivers, "problems": worst_first(problems)}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -14,6 +15,7 @@ import pytest
 from skinware import Namespace
 from skinware.views.access import Access
 from skinware.views.following import Follower
+from skinware.views.recording import Recording
 from skinware.views.server import ViewServer, show
 from skinware_drivers.testing.waiting import wait_until
 
@@ -42,7 +44,7 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
         *,
         token: str | None = None,
         poses: Mapping[str, Any] | None = None,
-        **options: Any,
+        program: tuple[str, ...] = (sys.executable, "-m", "skinware.cli._record_beside"),
     ) -> Iterator[str]:
         follower = Follower(namespace, names, calm, poses)
         found: list[Any] = []
@@ -50,7 +52,8 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
 
         async def run() -> None:
             stop = asyncio.Event()
-            server = ViewServer(follower, Access("127.0.0.1", token), page_folder, **options)
+            recording = Recording(program, namespace.name, names, page_folder)
+            server = ViewServer(follower, Access("127.0.0.1", token), recording, page_folder)
             loop = asyncio.get_running_loop()
             await show(server, "127.0.0.1", 0, lambda port: found.append((port, loop, stop)), stop)
 

@@ -185,6 +185,22 @@ class Structure:
         """
         return _names.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
 
+    def sensor_names(self, type_name: str) -> list[str]:
+        """``sensor_name`` of all sensors of a type, in the order of ``index(type_name)``.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        of_type, module = self.index(type_name), self.module_of(type_name)
+        lowest = np.full(self.n_modules, np.iinfo(np.uint64).max, np.uint64)
+        np.minimum.at(lowest, self.sensor_module, self.sensor_uid)
+        numbers = (self.sensor_uid[of_type] - lowest[module]).tolist()
+        is_only = (np.bincount(module, minlength=self.n_modules) == 1)[module].tolist()
+        return [
+            _names.joined(self.module_names[of], _names.name_in_module(type_name, number, is_only=only))
+            for of, number, only in zip(module.tolist(), numbers, is_only, strict=True)
+        ]
+
     def name_in_module(self, position: int) -> str:
         """What ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
         of_module = self.module_index(int(self.sensor_module[position]))

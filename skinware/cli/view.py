@@ -114,12 +114,14 @@ def command(
 
 
 async def _serve(follower: Follower, access: Access, host: str, port: int | None, ready: Callable[[int], None]) -> None:
+    from skinware.views.recording import Recording
     from skinware.views.server import ViewServer, show
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    server = ViewServer(follower, access)
+    program = (sys.executable, "-m", "skinware.cli._record_beside")
+    server = ViewServer(follower, access, Recording(program, follower.namespace.name, follower.names))
     try:
         await show(server, host, DEFAULT_PORT if port is None else port, ready, stop)
     except OSError as error:

@@ -21,6 +21,7 @@ from skinware.views.health import LIVE, STARTING, life_of, status_now
 from skinware.views.live import LiveDriver, LiveDrivers
 from skinware.views.past import Past
 from skinware.views.quantities import Quantity, quantities_of
+from skinware.views.rest import Rest
 from skinware.views.scene import Pose, Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
@@ -46,6 +47,7 @@ class Followed:
         status: (n_sensors,) uint8, status of its sensors now, with what the calmed driver knows of their health.
         changes: counts frames and changes of status.
         past: its values of the last seconds.
+        rest: what its sensors read at rest.
         contacts: on it; None where nobody tells any.
         motion: over its regions, likewise.
     """
@@ -87,6 +89,7 @@ class Followed:
         self.frame, self.taken_ns, self.life = frame, now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         self._judge(frame, beside)
+        self.rest.follow(self.all_physical(), self.status == 0, frame.published_ns)
         self.changes += 1
 
     def judge(self, beside: Beside) -> None:
@@ -113,6 +116,10 @@ class Followed:
         frame = self.frame
         assert frame is not None  # noqa: S101 - nobody looks at a driver without frames
         return self.shared(("physical", quantity.name), lambda: frame.physical(quantity.type.name))  # type: ignore[no-any-return]
+
+    def all_physical(self) -> npt.NDArray[np.float32]:
+        """(n_sensors,) float32: values of the sensors of all types, each in its unit."""
+        return self.shared("all", self._all_physical)  # type: ignore[no-any-return]
 
     def calm(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
         """(n,): how far each of them is above its baseline, 0 where nothing touches; None where nobody knows."""
@@ -143,11 +150,18 @@ class Followed:
             )
         return frame if self._calm_fits else None
 
+    def _all_physical(self) -> npt.NDArray[np.float32]:
+        assert self.frame is not None  # noqa: S101 - nobody looks at a driver without frames
+        physical = np.empty(self.structure.n_sensors, np.float32)
+        for sensor_type in self.structure.types:
+            physical[self.structure.index(sensor_type.name)] = self.frame.physical(sensor_type.name)
+        return physical
+
     def _take_structure(self, structure: Structure) -> None:
         self.structure = structure
         self.quantities = quantities_of(structure)
         self.status: npt.NDArray[np.uint8] = np.full(structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
-        self.past = Past(structure.n_sensors, structure.dtype)
+        self.past, self.rest = Past(structure.n_sensors, structure.dtype), Rest(structure)
         self.edition += 1
         self._calm_structure = None
 
@@ -172,6 +186,7 @@ class Follower:
         poses: of coordinate frames, by name.
 
     Attributes:
+        namespace, names, calm_namespace: as given.
         drivers: all there are, by name.
         scene: where their taxels are.
         edition: another one whenever drivers or structures are others.
@@ -185,7 +200,7 @@ class Follower:
         calm: Namespace | None = None,
         poses: Mapping[str, Pose] | None = None,
     ) -> None:
-        self.namespace, self.calm_namespace = namespace, calm
+        self.namespace, self.names, self.calm_namespace = namespace, tuple(names), calm
         self.drivers: list[Followed] = []
         self.problem: str | None = None
         self.edition = 0

@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.structure import Structure
 from skinware.views.following import Followed
 from skinware.views.levels import Levels, levels_of, shear_of
 from skinware.views.quantities import Quantity
@@ -73,7 +72,7 @@ class Look:
     def tare(self) -> None:
         """What comes next is rest; peaks begin anew."""
         for watched in self._watched.values():
-            watched.rest.begin()
+            watched.rest = Rest(watched.structure)
             watched.peak = None
 
     def wipe(self, on: bool) -> None:
@@ -86,12 +85,11 @@ class Look:
     def follow(self, driver: Followed) -> None:
         """Take a new frame of a driver into account."""
         quantity, frame = self.quantity_of(driver), driver.frame
-        if quantity is None or frame is None or (self.mode == "raw" and quantity.shear is None):
+        if quantity is None or frame is None:
             return
-        watched = self._watch(driver)
-        values = driver.shared("all", lambda: _all_physical(driver))
-        fresh = driver.status == 0
-        watched.rest.follow(values, fresh, frame.published_ns)
+        watched, values, fresh = self._watch(driver), driver.all_physical(), driver.status == 0
+        if watched.rest is not driver.rest:
+            watched.rest.follow(values, fresh, frame.published_ns)
         if self.mode == "peak":
             change = driver.calm(quantity)
             change = watched.rest.change(values)[quantity.where] if change is None else np.abs(change)
@@ -138,7 +136,7 @@ class Look:
     def _watch(self, driver: Followed) -> _Watched:
         watched = self._watched.get(driver.number)
         if watched is None or watched.structure is not driver.structure:
-            watched = self._watched[driver.number] = _Watched(driver.structure)
+            watched = self._watched[driver.number] = _Watched(driver)
         return watched
 
     def _values(
@@ -164,7 +162,7 @@ class Look:
         elif calm is not None:
             values = np.abs(calm)
         else:
-            values = watched.rest.change(driver.shared("all", lambda: _all_physical(driver)))[quantity.where]
+            values = watched.rest.change(driver.all_physical())[quantity.where]
         span = watched.spans.setdefault((name, self.mode), ChangeSpan()).follow(
             values[fresh], noise, frame.published_ns
         )
@@ -176,7 +174,7 @@ class Look:
         """How far the two axes within the skin are from rest."""
         if quantity.shear is None or driver.frame is None:
             return None, 0.0
-        values = driver.shared("all", lambda: _all_physical(driver))
+        values = driver.all_physical()
         from_rest = np.where(quantity.shear >= 0, (values - watched.rest.baseline)[quantity.shear], np.float32(0))
         lengths = np.nan_to_num(np.linalg.norm(from_rest, axis=1))
         noise = max(
@@ -193,9 +191,9 @@ class Look:
 class _Watched:
     """What is kept of a driver from frame to frame."""
 
-    def __init__(self, structure: Structure) -> None:
-        self.structure = structure
-        self.rest = Rest(structure)
+    def __init__(self, driver: Followed) -> None:
+        self.structure = driver.structure
+        self.rest = driver.rest
         self.wipe: WipeTest | None = None
         self.peak: tuple[str, npt.NDArray[np.float32]] | None = None
         self.limits: dict[str, ValueLimits] = {}
@@ -207,17 +205,6 @@ class _Watched:
     def peaks(self, quantity: str, n: int) -> npt.NDArray[np.float32]:
         known = self.peak is not None and self.peak[0] == quantity
         return self.peak[1] if known and self.peak is not None else np.zeros(n, np.float32)
-
-
-def _all_physical(driver: Followed) -> npt.NDArray[np.float32]:
-    """(n_sensors,) float32: physical values of the sensors of all types."""
-    frame, structure = driver.frame, driver.structure
-    assert frame is not None  # noqa: S101 - nobody looks at a driver without frames
-    physical = np.zeros(structure.n_sensors, np.float32)
-    for sensor_type in structure.types:
-        where = structure.index(sensor_type.name)
-        physical[where] = frame.physical(sensor_type.name)
-    return physical
 
 
 __all__ = ["DEFAULT_FPS", "Look", "Mode", "Picture", "Wiped"]

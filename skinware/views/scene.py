@@ -23,6 +23,8 @@ FLAT_PITCH_M = 0.0065
 _BETWEEN_MODULES = 1.5
 _BETWEEN_PATCHES = 3.0
 """In pitches."""
+_ROWS_OF_TRIANGLES = 3**0.5 / 2
+"""From row to row, where each is shifted by half a sensor."""
 _BETWEEN_ISLANDS = 0.15
 """Of the width of what is beside each other; at least some pitches."""
 
@@ -171,7 +173,7 @@ def laid_out(structure: Structure, sensors: npt.NDArray[np.int64]) -> Places:
             top, column = top - height, 0
         cells = np.array(shape.cells, np.float32)
         position[group, 0] = column * width + cells[:, 1] / 2
-        position[group, 1] = top - cells[:, 0]
+        position[group, 1] = top - cells[:, 0] * (_ROWS_OF_TRIANGLES if (cells[:, 1] % 2).any() else 1.0)
         column += 1
     return position * np.float32(FLAT_PITCH_M)
 

@@ -21,6 +21,8 @@ from skinware.realtime import NS_PER_S
 from skinware.views import operations
 from skinware.views.access import Access, Refused
 from skinware.views.following import Follower
+from skinware.views.recording import Recording
+from skinware.views.state import problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
 PAGE = Path(__file__).parent / "page"
@@ -47,11 +49,14 @@ class ViewServer:
     Args:
         follower: of the drivers; used in the event loop's thread only.
         access: who may see it.
+        recording: that viewers may begin and end; None: they may not.
         page: folder of the page's files.
     """
 
-    def __init__(self, follower: Follower, access: Access, page: Path = PAGE) -> None:
-        self._follower, self._access, self._page = follower, access, page
+    def __init__(
+        self, follower: Follower, access: Access, recording: Recording | None = None, page: Path = PAGE
+    ) -> None:
+        self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._viewers: set[Viewer] = set()
         self._news = asyncio.Event()
         self._server: Server | None = None
@@ -89,10 +94,12 @@ class ViewServer:
             await asyncio.sleep(_TICK_S)
 
     async def close(self) -> None:
-        """Let go of all viewers."""
+        """Let go of all viewers, and end what they have begun."""
         if self._server is not None:
             self._server.close()
             await self._server.wait_closed()
+        if self._recording is not None:
+            await self._recording.close()
 
     # -- files --------------------------------------------------------------------------------------------------
 
@@ -171,11 +178,20 @@ class ViewServer:
                 viewer.tare()
             case operations.Wipe():
                 viewer.wipe(operation.action == "start")
+            case operations.Record() if self._recording is not None:
+                if operation.action == "start":
+                    self._recording.start()
+                else:
+                    self._recording.stop()
             case _:
                 viewer.refuse("nothing here can do that")
 
     def _besides(self) -> dict[str, Any]:
-        return {"recording": None, "replay": None}
+        recording = self._recording
+        if recording is None:
+            return {"recording": None, "replay": None}
+        problem = [] if recording.problem is None else [problem_of_all(f"recording: {recording.problem}")]
+        return {"recording": recording.state, "replay": None, "problems": problem}
 
 
 async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:

@@ -103,6 +103,11 @@ def problems_of(driver: Followed, state: dict[str, Any]) -> list[dict[str, Any]]
     return [{"severity": severity, "driver": driver.number, "text": text} for severity, text in found]
 
 
+def problem_of_all(text: str) -> dict[str, Any]:
+    """What is wrong with no driver alone."""
+    return {"severity": ERROR, "driver": None, "text": text}
+
+
 def worst_first(problems: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Errors, then warnings, then notes; otherwise in their order."""
     return sorted(problems, key=lambda problem: _SEVERITIES.index(problem["severity"]))
@@ -143,4 +148,4 @@ def _rounded(rate_hz: float | None) -> float | None:
     return None if rate_hz is None else round(rate_hz, 2)
 
 
-__all__ = ["problems_of", "state_of", "worst_first"]
+__all__ = ["problem_of_all", "problems_of", "state_of", "worst_first"]

@@ -19,11 +19,12 @@ from skinware.views import operations
 from skinware.views.following import Followed, Follower
 from skinware.views.looks import Look
 from skinware.views.scene import Scene
-from skinware.views.state import ERROR, problems_of, state_of, worst_first
+from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
 
 PROTOCOL = "skinware.view.1"
 _ALIGNMENT = 8
 _STATE_EVERY_NS = NS_PER_S // 2
+_MOST_QUESTIONS = 64
 
 
 class Blobs:
@@ -69,7 +70,8 @@ class Viewer:
         self._state_due_ns = 0
         self._exact: list[tuple[int, int]] = []
         self._asked = False
-        self._answers: list[tuple[str, Any]] = []
+        self._questions: list[operations.Names | operations.Series] = []
+        self._error: str | None = None
 
     # -- what it asks for ---------------------------------------------------------------------------------------
 
@@ -92,11 +94,14 @@ class Viewer:
 
     def ask(self, question: operations.Names | operations.Series) -> None:
         """Answer in the next turn."""
-        self._answers.append((type(question).__name__.lower(), question))
+        if len(self._questions) == _MOST_QUESTIONS:
+            self.refuse(f"more than {_MOST_QUESTIONS} questions at once")
+        else:
+            self._questions.append(question)
 
     def refuse(self, why: str) -> None:
         """Tell in the next turn that something could not be done."""
-        self._answers.append(("error", why))
+        self._error = why
 
     # -- what it gets -------------------------------------------------------------------------------------------
 
@@ -105,7 +110,8 @@ class Viewer:
         """Whether there is something that this viewer has not seen."""
         return (
             self._asked
-            or bool(self._answers)
+            or bool(self._questions)
+            or self._error is not None
             or self._edition != self._follower.edition
             or any(self._changes.get(driver.number) != _seen(driver) for driver in self._follower.drivers)
         )
@@ -114,7 +120,7 @@ class Viewer:
         """All that is new for this viewer.
 
         Args:
-            besides: part of the state that the server knows.
+            besides: part of the state that the server knows; its ``problems`` come first among those as bad.
         """
         self._number += 1
         blobs = Blobs()
@@ -126,12 +132,14 @@ class Viewer:
         self._add_pictures(header, blobs)
         if self._exact:
             header["exact"] = [told for number, at in self._exact if (told := self._exactly(number, at)) is not None]
-        for name, question in self._answers:
-            header |= self._answer(name, question, blobs)
-        self._answers, self._asked = [], False
+        self._asked = False
+        for question in self._next_questions():
+            header |= self._answer(question, blobs)
+        if self._error is not None:
+            header["error"], self._error = self._error, None
         if now_ns() >= self._state_due_ns:
             self._state_due_ns = now_ns() + _STATE_EVERY_NS
-            header["state"] = self._state() | besides
+            header["state"] = besides | self._state(besides.get("problems", []))
         return blobs.under(header)
 
     def _see_all_again(self) -> None:
@@ -241,27 +249,31 @@ class Viewer:
             "status": int(driver.status[position]),
         }
 
-    def _answer(self, name: str, question: Any, blobs: Blobs) -> dict[str, Any]:
-        if name == "error":
-            return {"error": question}
+    def _next_questions(self) -> list[operations.Names | operations.Series]:
+        """The first question of each kind, taken from those that wait."""
+        firsts = list({type(question): question for question in reversed(self._questions)}.values())
+        self._questions = [question for question in self._questions if question not in firsts]
+        return firsts
+
+    def _answer(self, question: operations.Names | operations.Series, blobs: Blobs) -> dict[str, Any]:
         driver = self._follower.get(question.driver)
         try:
             if driver is None:
                 raise ConfigurationError(f"no driver {question.driver}")
-            if name == "names":
+            if isinstance(question, operations.Names):
                 return {"names": _names(driver, question.type)}
             return {"series": _series(driver, question.position, blobs)}
         except ConfigurationError as error:
-            return {"error": str(error)}
+            self.refuse(str(error))
+            return {}
 
-    def _state(self) -> dict[str, Any]:
-        problems: list[dict[str, Any]] = []
+    def _state(self, problems: list[dict[str, Any]]) -> dict[str, Any]:
         if self._follower.problem is not None:
-            problems.append({"severity": ERROR, "driver": None, "text": self._follower.problem})
+            problems = [*problems, problem_of_all(self._follower.problem)]
         drivers = []
         for driver in self._follower.drivers:
             drivers.append(state_of(driver))
-            problems += problems_of(driver, drivers[-1])
+            problems = problems + problems_of(driver, drivers[-1])
         return {"drivers": drivers, "problems": worst_first(problems)}
 
 
@@ -338,8 +350,7 @@ def _names(driver: Followed, type_name: str) -> dict[str, Any]:
     quantity = driver.quantity(type_name)
     if quantity is None:
         raise ConfigurationError(f"no {type_name!r} in driver {driver.name!r}")
-    names = [driver.structure.sensor_name(position) for position in quantity.index.tolist()]
-    return {"driver": driver.number, "type": type_name, "of": names}
+    return {"driver": driver.number, "type": type_name, "of": driver.structure.sensor_names(quantity.type.name)}
 
 
 def _series(driver: Followed, position: int, blobs: Blobs) -> dict[str, Any]:

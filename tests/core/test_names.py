@@ -20,7 +20,11 @@ def structure_of(*buses: Sequence[Patch]) -> Structure:
 
 
 def names_of_sensors(structure: Structure) -> list[str]:
-    return [structure.sensor_name(position) for position in range(structure.n_sensors)]
+    names = [structure.sensor_name(position) for position in range(structure.n_sensors)]
+    for sensor_type in structure.types:  # all of a type at once are called the same
+        of_type = np.arange(structure.n_sensors)[structure.index(sensor_type.name)]
+        assert structure.sensor_names(sensor_type.name) == [names[position] for position in of_type]
+    return names
 
 
 def test_a_roboskin_board_has_the_names_of_its_triangles_whichever_it_has() -> None:

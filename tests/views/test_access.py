@@ -1,0 +1,106 @@
+"""Who may see a skin in the browser, and what is served besides."""
+
+from __future__ import annotations
+
+import http.client
+from urllib.parse import urlsplit
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from websockets.exceptions import InvalidStatus
+
+from skinware.views.access import Access, Refused, is_loopback
+from skinware_drivers.testing.waiting import PATIENCE_S
+from tests.views.client import page_of
+from tests.views.conftest import INDEX, Serve
+
+TOKEN = "a-token"
+
+
+def get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+    """What a request of a browser gets."""
+    where = urlsplit(url)
+    connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE_S)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    response = connection.getresponse()
+    response.body = response.read()  # type: ignore[attr-defined]
+    connection.close()
+    return response
+
+
+def test_the_page_and_nothing_else(serving: Serve) -> None:
+    with serving() as url:
+        response = get(url)
+        assert (response.status, response.body) == (200, INDEX.encode())  # type: ignore[attr-defined]
+        assert response.headers["Content-Type"].startswith("text/html")
+        assert "default-src 'self'" in response.headers["Content-Security-Policy"]
+        assert response.headers["X-Content-Type-Options"] == "nosniff"
+        assert get(url, "/index.html?x#y").status == 200
+        assert get(url, "/vendor/three.min.js").headers["Content-Type"].startswith("text/javascript")
+        above = ("/secret.txt", "/../secret.txt", "/%2e%2e/secret.txt", "//etc/passwd")
+        for path in (*above, "/vendor", "/vendor/", "/%00"):
+            assert get(url, path).status == 404
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "", "[", "127.0.0.2"])
+def test_a_name_that_somebody_gave_this_machine_is_refused(serving: Serve, host: str) -> None:
+    with serving() as url:
+        assert get(url, Host=host).status == 403
+
+
+def test_names_of_this_machine_are_welcome_through_any_port(serving: Serve) -> None:
+    """An ssh tunnel has another port at its other end."""
+    with serving() as url:
+        for host in ("localhost:9999", "127.0.0.1", "[::1]:1234", "LOCALHOST"):
+            assert get(url, Host=host, Origin=f"http://{host}").status == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://localhost:1", "file://", "http://127.0.0.1"])
+def test_pages_of_other_sites_are_refused(serving: Serve, origin: str) -> None:
+    with serving() as url:
+        with pytest.raises(InvalidStatus, match="403"), page_of(url, origin=origin):
+            pass
+        assert get(url, Origin=origin).status == 403
+        with page_of(url, origin=url.rstrip("/")) as page:
+            assert page.pull()["skin"]["drivers"] == []
+
+
+def test_a_token_is_needed_once(serving: Serve) -> None:
+    with serving(token=TOKEN) as url:
+        where = url.partition("?")[0]
+        for path in ("/", "/?token=wrong", "/?token=", "/vendor/three.min.js", "/live"):
+            assert get(where, path).status == 401
+        with pytest.raises(InvalidStatus, match="401"), page_of(where):
+            pass
+        with page_of(url) as page:
+            page.pull()
+        response = get(where, f"/?token={TOKEN}")
+        assert (response.status, response.headers["Location"]) == (303, "/")
+        cookie = response.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        kept = cookie.partition(";")[0]
+        assert get(where, "/", Cookie=kept).status == 200
+        assert get(where, "/", Cookie="skin-view=wrong; other=1").status == 401
+        with page_of(where, additional_headers={"Cookie": f"other=1; {kept}"}) as page:
+            page.pull()
+
+
+@given(st.dictionaries(st.sampled_from(["Host", "Origin", "Cookie"]), st.text(max_size=30)), st.text(max_size=30))
+def test_any_request_is_judged(headers: dict[str, str], target: str) -> None:
+    for access in (Access("127.0.0.1"), Access("127.0.0.1", TOKEN), Access("0.0.0.0", TOKEN)):
+        try:
+            access.check(target, headers)
+        except Refused:
+            continue
+        assert access.token is None
+        assert headers["Host"].lower().strip("[]:0123456789.") in ("", "localhost") or "@" in headers["Host"]
+
+
+def test_only_this_machine_is_loopback() -> None:
+    assert all(map(is_loopback, ("127.0.0.1", "::1", "localhost", "127.1.2.3")))
+    assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.2", "robot", "")))

@@ -1,0 +1,128 @@
+"""Places of all taxels: each its own, as the geometry says, or in its module's shape beside the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skinware import Structure
+from skinware.geometry import Geometry
+from skinware.sensor_types import FORCE, MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
+from skinware.views.quantities import quantities_of
+from skinware.views.scene import FLAT_PITCH_M, Scene
+from tests.cli.fake_skin import fake_structure
+from tests.tactile.skins import triangles
+
+KINDS = ("triangle", "fingertip", "4x6", "palm", "", "1000000x1", "0x0")
+
+
+def structure_of(modules: list[tuple[int, str, int]], types: tuple[SensorType, ...] = (PRESSURE,)) -> Structure:
+    """Modules of a patch, a kind and so many taxels, each with a sensor of every type."""
+    n_patches = max(patch for patch, _, _ in modules) + 1
+    taxels = [module for module, (_, _, count) in enumerate(modules) for _ in range(count)]
+    return Structure(
+        types=types,
+        buses=["can0"],
+        patch_name=[f"board {patch}" for patch in range(n_patches)],
+        patch_bus=[0] * n_patches,
+        module_patch=[patch for patch, _, _ in modules],
+        module_kind=[kind for _, kind, _ in modules],
+        sensor_uid=np.repeat(np.arange(len(taxels)), len(types)),
+        sensor_type=[t.id for t in types] * len(taxels),
+        sensor_module=np.repeat(taxels, len(types)),
+        dtype="i2",
+    )
+
+
+def scene_of(**structures: Structure) -> Scene:
+    return Scene({name: (structure, quantities_of(structure)) for name, structure in structures.items()})
+
+
+def apart(places: npt.NDArray[np.float32]) -> float:
+    """The least distance between two of them."""
+    away = np.linalg.norm(places[:, None] - places[None, :], axis=2)
+    return float(away[~np.eye(len(places), dtype=bool)].min(initial=np.inf))
+
+
+modules = st.lists(st.tuples(st.integers(0, 3), st.sampled_from(KINDS), st.integers(1, 14)), min_size=1, max_size=9)
+
+
+@given(modules, modules)
+def test_no_two_lie_on_each_other(one: list[tuple[int, str, int]], other: list[tuple[int, str, int]]) -> None:
+    scene = scene_of(a=structure_of(one), b=structure_of(other))
+    placed = [scene.of(name, "pressure") for name in ("a", "b")]
+    places = np.concatenate([found.position for found in placed])
+    assert np.isfinite(places).all()
+    assert apart(places) > 0.9 * FLAT_PITCH_M
+    assert placed[1].position[:, 0].min() > placed[0].position[:, 0].max()
+    for found in placed:
+        assert not found.is_known
+        assert np.array_equal(found.normal, [[0, 0, 1]] * len(found.normal))
+
+
+def test_a_module_has_its_shape() -> None:
+    scene = scene_of(a=structure_of([(0, "triangle", 10), (0, "4x6", 24)]))
+    places = scene.of("a", "pressure").position
+    corners = places[[8, 5, 1]]  # of a triangle
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+    assert np.allclose(sides, 3 * FLAT_PITCH_M)
+    grid = places[10:].reshape(4, 6, 3)
+    assert np.allclose(np.diff(grid[..., 0], axis=1), FLAT_PITCH_M)
+    assert np.allclose(np.diff(grid[..., 1], axis=0), -FLAT_PITCH_M)
+
+
+def test_places_are_those_of_the_geometry_and_the_rest_is_beside() -> None:
+    structure = fake_structure(1, 2)
+    geometry = Geometry.unknown(["pressure"] * 20, structure.sensor_uid[structure.index("pressure")])
+    geometry.position_m[:], geometry.normal[:], geometry.frame[:] = triangles(2, 10), (0, 1, 0), "arm"
+    geometry.radius_m[:] = 0.002
+    geometry.position_m[15:] = np.nan
+    structure = structure.placed(geometry)
+    placed = scene_of(a=structure).of("a", "pressure")
+    assert placed.is_known
+    assert np.allclose(placed.position[:15], geometry.position_m[:15])
+    assert np.array_equal(placed.normal[:15], [[0, 1, 0]] * 15)
+    assert placed.radius[0] == pytest.approx(0.002)
+    assert np.isfinite(placed.position).all()
+    assert placed.position[15:, 0].min() > placed.position[:15, 0].max()
+    assert not scene_of(a=structure).of("a", "temperature").is_known
+
+
+def test_frames_lie_beside_each_other_or_where_they_are_said_to_be() -> None:
+    structures = {}
+    for frame in ("arm", "chest"):
+        structure = fake_structure(1, 2)
+        geometry = Geometry.unknown(["pressure"] * 20, structure.sensor_uid[structure.index("pressure")])
+        geometry.position_m[:], geometry.normal[:], geometry.frame[:] = triangles(2, 10), (0, 0, 1), frame
+        structures[frame] = structure.placed(geometry)
+    scene = scene_of(**structures)
+    arm, chest = (scene.of(frame, "pressure").position for frame in structures)
+    assert np.allclose(arm, triangles(2, 10))
+    assert chest[:, 0].min() > arm[:, 0].max()
+    turned = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], float)
+    scene = Scene({name: (s, quantities_of(s)) for name, s in structures.items()}, {"chest": turned})
+    x, y, z = triangles(2, 10).T
+    assert np.allclose(scene.of("chest", "pressure").position, np.array([1 - y, 2 + x, 3 + z]).T)
+    assert np.array_equal(scene.pose("chest"), turned)
+    assert np.array_equal(scene.pose("nowhere"), np.eye(4))
+
+
+def test_three_axes_are_one_picture() -> None:
+    (force,) = quantities_of(structure_of([(0, "4x6", 24)], FORCE))
+    assert (force.name, force.type.name) == ("force", "force_z")
+    assert force.shear is not None
+    assert force.index.tolist() == list(range(2, 72, 3))
+    assert force.shear.tolist() == [[at, at + 1] for at in range(0, 72, 3)]
+    names = [quantity.name for quantity in quantities_of(structure_of([(0, "", 2)], (*MAGNETIC_FIELD, TEMPERATURE)))]
+    assert names == ["magnetic_field", "temperature"]
+
+
+def test_shear_belongs_to_pressure() -> None:
+    (pressure,) = quantities_of(structure_of([(0, "", 2)], (SHEAR_X, SHEAR_Y, PRESSURE)))
+    assert pressure.shear is not None
+    assert pressure.shear.tolist() == [[0, 1], [3, 4]]
+    incomplete = structure_of([(0, "", 2)], (SHEAR_X, PRESSURE))
+    assert [quantity.name for quantity in quantities_of(incomplete)] == ["shear_x", "pressure"]

@@ -1,0 +1,279 @@
+"""What a page gets of drivers that come, change, die and come back."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+from skinware import Namespace, Status
+from skinware.geometry import Geometry
+from skinware.tactile.contacts_service import ContactsWriter
+from skinware.views import rest
+from skinware.views.turns import PROTOCOL
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
+from tests.tactile.skins import triangles
+from tests.views.client import Page, page_of
+from tests.views.conftest import Serve
+
+
+def types(page: Page, driver: int = 0) -> dict[str, dict[str, object]]:
+    (found,) = (one for one in page.skin["drivers"] if one["id"] == driver)
+    return {one["name"]: one for one in found["types"]}
+
+
+def drivers(page: Page) -> list[str]:
+    return [driver["name"] for driver in page.skin["drivers"]]
+
+
+def test_a_skin_as_it_is(serving: Serve, namespace: Namespace) -> None:
+    with publishing(FakeSkin("torso")) as skin, serving() as url, page_of(url) as page:
+        turn = page.pull_until(lambda turn: turn.header.get("skin", {}).get("drivers"))
+        assert turn["skin"]["protocol"] == PROTOCOL
+        assert turn["skin"]["namespaces"] == [namespace.name]
+        (driver,) = turn["skin"]["drivers"]
+        assert (driver["name"], driver["type"], driver["dtype"]) == ("torso", "fake", "uint8")
+        assert [patch["name"] for patch in driver["patches"]] == ["board 7", "board 8", "board 9", "board 10"]
+        assert driver["modules"][17] == {"name": "board 8, triangle 1", "patch": 1, "kind": "triangle"}
+        pressure = driver["types"][0]
+        assert [t["name"] for t in driver["types"]] == ["pressure", "temperature"]
+        assert (pressure["unit"], pressure["n"], pressure["scale"], pressure["maximum"]) == ("counts", 640, -1.0, 255.0)
+        assert driver["types"][1]["maximum"] is None  # infinite, which JSON does not have
+        structure, where = skin.structure, skin.structure.index("pressure")
+        assert np.array_equal(turn.array(pressure["index"], "I"), np.arange(768)[where])
+        assert np.array_equal(turn.array(pressure["uid"], "Q"), structure.sensor_uid[where])
+        assert np.array_equal(turn.array(pressure["patch"], "H"), structure.sensor_patch[where])
+        assert np.array_equal(turn.array(pressure["module"], "H"), structure.sensor_module[where])
+        position = turn.array(pressure["position"], "f").reshape(-1, 3)
+        assert len(np.unique(position, axis=0)) == 640
+        assert not pressure["placed"]
+        assert np.array_equal(turn.array(pressure["normal"], "f").reshape(-1, 3), [[0, 0, 1]] * 640)
+
+
+def test_raw_levels_are_the_values(serving: Serve) -> None:
+    skin = FakeSkin("torso")
+    skin.values = np.arange(768) % 256
+    skin.status[5] = Status.NEVER_SEEN
+    skin.status[6] = Status.OUT_OF_RANGE
+    with publishing(skin), serving() as url, page_of(url) as page:
+        picture = page.pull_picture()
+        where = skin.structure.index("pressure")
+        physical = (255 - skin.values)[where]
+        expected = np.round(physical / 255 * 250)
+        expected[5] = 255
+        assert np.abs(picture["levels"] - expected).max() <= 1
+        assert picture["levels"][5] == 255
+        assert picture["scale"] == [0.0, 255.0]
+        assert picture["unit"] == "counts"
+        assert np.array_equal(page.status[0, "pressure"], skin.status[where])
+        page.say("look", mode="raw", type="temperature", scale=[0, 100])
+        picture = page.pull_picture(condition=lambda picture: picture["type"] == "temperature")
+        values = skin.values[skin.structure.index("temperature")] * 0.5
+        assert np.abs(picture["levels"] - np.clip(np.round(values * 2.5), 0, 250)).max() <= 1
+
+
+def test_status_is_sent_when_it_changes(serving: Serve) -> None:
+    with publishing(FakeSkin("torso")) as skin, serving() as url, page_of(url) as page:
+        page.pull_picture(condition=lambda picture: "status" in picture)
+        assert "status" not in page.pull_picture()
+        skin.status[7] = Status.NO_ACK
+        picture = page.pull_picture(condition=lambda picture: "status" in picture)
+        assert picture["status"][7] & Status.NO_ACK
+        assert picture["levels"][7] == 255
+
+
+def test_a_killed_driver_is_shown_and_one_that_comes_back_too(serving: Serve) -> None:
+    with serving() as url, page_of(url) as page:
+        with fake_process("torso", "--patches", "1") as process:
+            page.pull_picture()
+            kill(process)
+            turn = page.pull_until(lambda turn: (picture := turn.picture()) and "status" in picture)
+            assert (turn.picture() or {})["status"].all()  # stale, all of them
+            page.pull_until(lambda _: page.state["drivers"] and page.state["drivers"][0]["state"] == "dead")
+            assert page.state["problems"][0]["severity"] == "error"
+            with publishing(FakeSkin("torso", fake_structure(1))):
+                page.pull_until(lambda _: page.state["drivers"] and page.state["drivers"][0]["state"] == "live")
+                assert page.skin["drivers"][0]["id"] == 0
+                wait_until(lambda: page.pull() is not None and not page.status[0, "pressure"].any())
+        page.pull_until(lambda _: page.skin["drivers"] == [])
+
+
+def test_another_structure_comes_whole(serving: Serve) -> None:
+    with FakeSkin("torso", fake_structure(1)) as skin, serving() as url, page_of(url) as page:
+        skin.publish()
+        page.pull_picture()
+        first = page.skin["drivers"][0]["generation"]
+        skin.structure = fake_structure(2)
+        skin.status = np.zeros(skin.structure.n_sensors, np.uint8)
+        skin.writer.restructure(skin.structure)
+        for name in ("patch_state", "patch_counters", "interval_counts", "age_counts"):
+            setattr(skin, name, np.repeat(getattr(skin, name), 2, axis=0))
+        skin.publish()
+        page.pull_until(lambda _: len(page.skin["drivers"][0]["patches"]) == 2)
+        assert page.skin["drivers"][0]["generation"] != first
+        assert len(page.pull_picture(condition=lambda picture: len(picture["levels"]) == 320)["levels"]) == 320
+
+
+def test_no_driver_at_all(serving: Serve, namespace: Namespace) -> None:
+    with serving() as url, page_of(url) as page:
+        turn = page.pull()
+        assert turn["skin"]["drivers"] == []
+        assert turn["state"]["drivers"] == []
+        with publishing(FakeSkin("torso")):
+            page.pull_picture()
+
+
+def test_only_those_that_are_named(serving: Serve) -> None:
+    with ExitStack() as stack:
+        for name in ("arm", "leg", "torso"):
+            stack.enter_context(publishing(FakeSkin(name, fake_structure(1, 2))))
+        page = stack.enter_context(page_of(stack.enter_context(serving(("arm", "torso")))))
+        page.pull_until(lambda _: page.skin["drivers"])
+        assert drivers(page) == ["arm", "torso"]
+
+
+def test_names_series_and_values(serving: Serve) -> None:
+    with publishing(FakeSkin("torso", fake_structure(1, 2))) as skin, serving() as url, page_of(url) as page:
+        page.pull_picture()
+        page.say("names", driver=0, type="pressure")
+        page.say("series", driver=0, position=3)
+        page.say("series", driver=0, position=4)
+        page.say("exact", sensors=[[0, 3], [0, 11], [5, 3], [0, 99_999]])
+        turn = page.pull()
+        assert turn["names"]["of"][3] == "board 7, triangle 0, taxel 3"
+        assert turn["names"]["of"][10] == "board 7, triangle 1, taxel 0"
+        assert turn["series"]["position"] == 3
+        assert page.pull()["series"]["position"] == 4
+        skin.values = np.full(24, 200)
+        turn = page.pull_until(lambda turn: turn["exact"][0]["raw"] == 200)
+        pressure, temperature = turn["exact"]  # the others are not there
+        assert (pressure["position"], pressure["value"], pressure["status"]) == (3, 55.0, 0)
+        assert (temperature["position"], temperature["value"]) == (11, 100.0)
+        assert pressure["age_ms"] >= 0
+
+        def is_long(turn: object) -> bool:
+            page.say("series", driver=0, position=3)
+            return len(page.pull()["series"]["value"]) > 0
+
+        assert is_long(turn)
+        page.say("series", driver=0, position=3)
+        turn = page.pull_until(lambda turn: "series" in turn)
+        times, values = (turn.array(turn["series"][name], "f") for name in ("time_s", "value"))
+        assert len(times) == len(values) > 1
+        assert times[-1] == 0
+        assert (np.diff(times) > 0).all()
+        assert values[-1] == 55
+
+
+def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    skin = FakeSkin("torso", fake_structure(1, 2))
+    skin.values = np.full(24, 240)
+    touched = skin.values.copy()
+    touched[4:8] = 140
+    monkeypatch.setattr(rest, "SETTLING_S", 0.1)
+    with publishing(skin), serving() as url, page_of(url) as page:
+        page.say("look", mode="change")
+        for _ in range(5):
+            assert not page.pull_picture(condition=lambda picture: picture["scale"][1] < 100)["levels"].any()
+        skin.values = touched
+        picture = page.pull_picture(condition=lambda picture: picture["levels"].any())
+        assert np.flatnonzero(picture["levels"]).tolist() == [4, 5, 6, 7]
+        page.say("look", mode="peak")
+        page.pull_picture(condition=lambda picture: picture["levels"][4] > 100)
+        skin.values = np.full(24, 240)
+        for _ in range(5):
+            assert page.pull_picture()["levels"][4] > 100
+        page.say("tare")
+        page.pull_picture(condition=lambda picture: not picture["levels"].any())
+        page.say("look", mode="wipe")
+        turn = page.pull_until(lambda turn: "wipe" in turn)
+        assert turn["wipe"] == {"touched": 0, "of": 20}
+        skin.values = touched
+        turn = page.pull_until(lambda turn: turn.header.get("wipe", {}).get("touched"))
+        assert turn["wipe"] == {"touched": 4, "of": 20}
+        skin.values = np.full(24, 240)
+        picture = page.pull_picture()
+        assert np.flatnonzero(picture["levels"] == 250).tolist() == [4, 5, 6, 7]
+        page.say("wipe", action="start")
+        page.pull_until(lambda turn: turn.header.get("wipe") == {"touched": 0, "of": 20})
+
+
+def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace) -> None:
+    structure = fake_structure(1, 2)
+    geometry = Geometry.unknown(["pressure"] * 20, structure.sensor_uid[structure.index("pressure")])
+    geometry.position_m[:], geometry.normal[:], geometry.frame[:] = triangles(2, 10), (0, 0, 1), "arm"
+    structure = structure.placed(geometry)
+    raw, calm = FakeSkin("torso", structure), FakeSkin("torso", structure, calm_namespace)
+    raw.values = np.full(24, 100)
+    calm.values = np.full(24, 255)  # 0 counts
+    calm.values[[2, 3]] = 255 - 60
+    calm.status[9] = Status.UNHEALTHY
+    pose = np.eye(4)
+    pose[:3, 3] = 1, 2, 3
+    with (
+        publishing(raw),
+        publishing(calm),
+        ContactsWriter(structure, driver="torso", namespace=calm_namespace) as contacts,
+        serving((), calm_namespace, poses={"arm": pose}) as url,
+        page_of(url) as page,
+    ):
+        value = np.zeros(20, np.float32)
+        value[[2, 3]] = 60
+        contacts.publish(value, value > 0, 10**9)
+        page.say("look", mode="change")
+        turn = page.pull_until(lambda turn: turn.header.get("contacts"))
+        (contact,) = turn["contacts"]
+        assert (contact["driver"], contact["taxels"], contact["kind"]) == (0, 2, "touch")
+        assert contact["load"] == pytest.approx(120)
+        middle = geometry.position_m[[2, 3]].mean(axis=0) + np.array([1, 2, 3])
+        assert contact["position"] == pytest.approx(middle.tolist(), abs=1e-6)
+        picture = page.pull_picture(condition=lambda picture: picture["levels"][2] > 100)
+        assert np.flatnonzero(picture["levels"]).tolist() == [2, 3]
+        assert np.flatnonzero(picture["contact_of"] >= 0).tolist() == [2, 3]
+        assert page.status[0, "pressure"][9] & Status.UNHEALTHY
+        assert types(page)["pressure"]["placed"]
+
+
+def test_two_look_differently_at_the_same(serving: Serve) -> None:
+    with publishing(FakeSkin("torso")), serving() as url, page_of(url) as one, page_of(url) as other:
+        one.say("look", mode="raw", type="pressure", scale=[0, 255])
+        other.say("look", mode="raw", type="temperature", scale=[0, 50])
+        for _ in range(3):
+            assert one.pull_picture(condition=lambda picture: picture["scale"] == [0, 255])["type"] == "pressure"
+            assert other.pull_picture(condition=lambda picture: picture["scale"] == [0, 50])["type"] == "temperature"
+
+
+def test_a_scale_of_its_own_where_the_range_is_not_known(serving: Serve) -> None:
+    with publishing(FakeSkin("torso")) as skin, serving() as url, page_of(url) as page:
+        skin.values = np.full(768, 10)
+        page.say("look", type="temperature")
+        page.pull_picture(condition=lambda picture: picture["scale"][0] <= 5.0)
+        skin.values = np.full(768, 30)
+        low, high = page.pull_picture(condition=lambda picture: picture["scale"][1] >= 15.0)["scale"]
+        assert low <= 5
+        assert high >= 15
+
+
+def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:
+    skin = FakeSkin("torso", fake_structure(4, 2, buses=2))
+    skin.break_some()
+    skin.bus_load[0] = 250
+    with publishing(skin), serving() as url, page_of(url) as page:
+        page.pull_picture()
+        page.state = {}
+        page.pull_until(lambda _: page.state)
+        (driver,) = page.state["drivers"]
+        assert (driver["state"], driver["sensors"], driver["lost"], driver["load"]) == ("live", 96, 2, 0.25)
+        assert [bus["name"] for bus in driver["buses"]] == ["can0", "can1"]
+        assert [patch["bus"] for patch in driver["patches"]] == ["can0", "can0", "can1", "can1"]
+        assert driver["patches"][3]["state"] == "stale"
+        severities = [problem["severity"] for problem in page.state["problems"]]
+        assert severities == sorted(severities, key=["error", "warning", "note"].index)
+        texts = [problem["text"] for problem in page.state["problems"]]
+        assert any(text.startswith("board 10 is stale") for text in texts)
+        assert "1 of 96 sensors never seen" in texts
+        assert (page.state["recording"], page.state["replay"]) == (None, None)
+        assert json.dumps(page.state)

@@ -109,6 +109,22 @@ class Structure:
         own = ("types", "buses", "dtype", "geometry", *_OWN_COLUMNS)
         return Structure(**{name: getattr(self, name) for name in own} | changes)
 
+    def only(self, positions: Index) -> Structure:
+        """The same patches and modules with some of their sensors.
+
+        Args:
+            positions: in a frame, of the sensors that stay, in their order.
+
+        Raises:
+            StructureError: there are none.
+        """
+        return self.replace(
+            sensor_uid=self.sensor_uid[positions],
+            sensor_type=self.sensor_type[positions],
+            sensor_module=self.sensor_module[positions],
+            geometry=None if self.geometry is None else self.geometry[positions],
+        )
+
     def placed(self, geometry: Geometry) -> Structure:
         """The same sensors, at the places that a geometry has for them by type and uid."""
         by_id = {t.id: t.name for t in self.types}

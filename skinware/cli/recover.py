@@ -17,7 +17,7 @@ from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print
         "skin-recover walk.mcap -o /mnt/walk.mcap    where there is room",
     ),
 )
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.option(
     "-o",
     "--output",

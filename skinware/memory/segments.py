@@ -189,12 +189,7 @@ def create(
                 raise NamespaceError(f"somebody locked {temporary} as it was made")
             os.posix_fallocate(fd, 0, layout.file_size)
             data = _map(temporary, layout.file_size)
-            table = file_layout.column_table(layout)
-            data[: header.nbytes] = header.view(np.uint8)
-            data[file_layout.COLUMN_OFFSET : file_layout.COLUMN_OFFSET + table.nbytes] = table.view(np.uint8)
-            for column in layout.static:
-                contents = np.ascontiguousarray(static[column.name]).view(np.uint8)
-                data[column.offset : column.offset + contents.nbytes] = contents
+            _write_head(data, header, layout, static)
             os.fchmod(fd, 0o640)
         except BaseException:
             os.unlink(temporary)
@@ -205,6 +200,21 @@ def create(
         raise NamespaceError(f"cannot make {where} ({layout.file_size} bytes): {error.strerror}") from None
     info = os.fstat(fd)
     return Segment(str(temporary), header[0], layout, data, descriptor, (info.st_dev, info.st_ino), schema)
+
+
+def _write_head(
+    data: npt.NDArray[np.uint8],
+    header: npt.NDArray[np.void],
+    layout: Layout,
+    static: Mapping[str, npt.NDArray[Any]],
+) -> None:
+    """Write what is before the slots, but for what changes while a writer runs."""
+    table = file_layout.column_table(layout)
+    data[: header.nbytes] = header.view(np.uint8)
+    data[file_layout.COLUMN_OFFSET : file_layout.COLUMN_OFFSET + table.nbytes] = table.view(np.uint8)
+    for column in layout.static:
+        contents = np.ascontiguousarray(static[column.name]).view(np.uint8)
+        data[column.offset : column.offset + contents.nbytes] = contents
 
 
 def publish(segment: Segment, namespace: Namespace, name: str) -> None:
@@ -310,6 +320,30 @@ def recorded(head: bytes, name: str) -> Segment:
     segment = Segment(name, header, layout, data, Descriptor(-1), (0, 0), Schema())
     segment.schema = from_file(layout, segment.static_columns(), name)
     return segment
+
+
+def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """The head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
+
+    Args:
+        segment: the generation.
+        schema: of the columns of its slots.
+        static: its tables.
+
+    Raises:
+        ConfigurationError: the format cannot hold them.
+    """
+    static = {**static, **schema.for_file(static)}
+    layout = file_layout.plan(static, schema.for_layout(), segment.layout.slot_count)
+    header = np.array([segment.header], file_layout.HEADER)
+    header["file_size"], header["column_count"] = layout.file_size, len(layout.static) + len(layout.slot)
+    header["slot_offset"], header["slot_stride"] = layout.slot_offset, layout.slot_stride
+    header["digest"] = np.frombuffer(layout.digest(static), "V32")
+    data = np.zeros(layout.slot_offset, np.uint8)
+    changing = slice(file_layout.CONTROL_OFFSET, file_layout.COLUMN_OFFSET)
+    data[changing] = segment.data[changing]
+    _write_head(data, header, layout, static)
+    return data.tobytes()
 
 
 def current_inode(path: str | os.PathLike[str]) -> tuple[int, int] | None:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware import driver_service
-from skinware.errors import BadRecording, BadServiceFile
+from skinware.errors import BadRecording, BadServiceFile, StructureError
 from skinware.memory import segments
-from skinware.memory.schema import Schema
+from skinware.memory.schema import STATIC_NAME, Schema
 from skinware.recording.codec import CodedColumn
+from skinware.structure import Index, Structure
+
+PER_SENSOR = ("values", "status")
+"""Columns of a driver that have a number for each sensor."""
 
 
 class Generation:
@@ -40,6 +45,25 @@ class Generation:
             raise BadRecording(str(error).removesuffix("; not attached")) from None
         self.coded: tuple[CodedColumn, ...] = tuple(CodedColumn.of(column) for column in self._segment.layout.slot)
         self._columns = self._segment.slot_formats()
+
+    def only(self, positions: Index) -> Generation:
+        """The same generation of a driver with some of its sensors.
+
+        Args:
+            positions: in a frame, of the sensors that stay.
+
+        Raises:
+            StructureError: there are none, or it is not a driver.
+        """
+        if not isinstance(self.context, Structure):
+            raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
+        structure = self.context.only(positions)
+        static = {name: table for name, table in self.static().items() if name != STATIC_NAME}
+        columns = dict(self.schema.columns)
+        for name in PER_SENSOR:
+            columns[name] = replace(columns[name], shape=(structure.n_sensors,))
+        schema = Schema(columns, self.schema.description)
+        return Generation(segments.head_like(self._segment, schema, {**static, **structure.to_columns()}), self.name)
 
     @property
     def generation(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -25,11 +25,12 @@ class Series:
         columns: (n, ...) by name.
 
     Attributes:
-        time_s: as given.
+        origin, headers, time_s, columns: as given.
         generation: (n,) uint64, which incarnation of the service each frame belongs to.
         sequence: (n,) uint64, number of each within it; a gap are frames that were lost.
         acquired_ns: (n,) int64, newest time stamp of the data in each, CLOCK_MONOTONIC of the machine that recorded.
         published_ns: (n,) int64, when the writer handed it out, likewise.
+        flags: (n,) uint64, bits for the service's own use.
     """
 
     def __init__(
@@ -39,12 +40,27 @@ class Series:
         time_s: npt.NDArray[np.float64],
         columns: Mapping[str, npt.NDArray[Any]],
     ) -> None:
-        self._origin, self._columns = origin, columns
+        self.origin, self.headers, self.columns = origin, headers, columns
         self.time_s = time_s
         self.generation: npt.NDArray[np.uint64] = headers["generation"]
         self.sequence: npt.NDArray[np.uint64] = headers["sequence"]
         self.acquired_ns: npt.NDArray[np.int64] = headers["acquired_ns"]
         self.published_ns: npt.NDArray[np.int64] = headers["published_ns"]
+        self.flags: npt.NDArray[np.uint64] = headers["flags"]
+
+    @classmethod
+    def joined(cls, parts: Sequence[Series]) -> Series:
+        """Frames of one service, one after the other.
+
+        Args:
+            parts: at least one, all with the same columns.
+        """
+        return cls(
+            parts[0].origin,
+            np.concatenate([part.headers for part in parts]),
+            np.concatenate([part.time_s for part in parts]),
+            {name: np.concatenate([part.column(name) for part in parts]) for name in parts[0].columns},
+        )
 
     def __len__(self) -> int:
         return len(self.sequence)
@@ -56,9 +72,9 @@ class Series:
         Raises:
             StructureError: it is not a driver.
         """
-        if not self._origin.is_driver:
-            raise StructureError(f"service {self._origin.name!r} is not a driver: it has no sensors")
-        return cast(Structure, self._origin.context)
+        if not self.origin.is_driver:
+            raise StructureError(f"service {self.origin.name!r} is not a driver: it has no sensors")
+        return cast(Structure, self.origin.context)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """(n, ...) one column of all frames.
@@ -67,10 +83,10 @@ class Series:
             KeyError: no such column, or it was not read.
         """
         try:
-            return self._columns[name]
+            return self.columns[name]
         except KeyError:
-            there_are = f"there are {', '.join(self._columns)}"
-            known = "was not read" if name in self._origin.columns else "is not there"
+            there_are = f"there are {', '.join(self.columns)}"
+            known = "was not read" if name in self.origin.columns else "is not there"
             raise KeyError(f"column {name!r} {known}; {there_are}") from None
 
     # -- by type ------------------------------------------------------------------------------------------------
@@ -102,9 +118,9 @@ class Series:
             type_name: which sensors.
             max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverFrame.fresh`.
         """
-        max_age_ns = age_limit_ns(self._origin.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S)
+        max_age_ns = age_limit_ns(self.origin.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S)
         at_ns = self.published_ns[:, np.newaxis]
         return is_fresh(self.status_of(type_name), self.time_ns(type_name), at_ns=at_ns, max_age_ns=max_age_ns)
 
     def __repr__(self) -> str:
-        return f"<Series of {len(self)} frames of {self._origin.name!r}: {', '.join(self._columns)}>"
+        return f"<Series of {len(self)} frames of {self.origin.name!r}: {', '.join(self.columns)}>"

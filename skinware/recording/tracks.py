@@ -131,21 +131,34 @@ class Track:
             StructureError: the columns or tables changed in between: read the ``parts`` one by one.
             KeyError: no such column.
         """
-        origin = self._only_origin()
-        names = tuple(columns) if columns is not None else _FOR_DRIVERS if origin.is_driver else tuple(origin.columns)
+        origin, names = self._asked(columns)
+        return Series.joined([_nothing(origin, names), *self.blocks(names, start_s=start_s, end_s=end_s)])
+
+    def blocks(
+        self, columns: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+    ) -> Iterator[Series]:
+        """The same in pieces of a quarter of a second, one after the other; for recordings that memory cannot hold.
+
+        Args:
+            columns: as for ``read``, which lists the errors.
+            start_s: likewise.
+            end_s: likewise.
+        """
+        origin, names = self._asked(columns)
         numbers = {column.name: number for number, column in enumerate(origin.coded)}
-        for name in names:
-            if name not in numbers:
-                raise KeyError(f"no column {name!r}; there are {', '.join(numbers)}")
-        headers, times, arrays = [np.zeros(0, HEADER)], [np.zeros(0)], [[_nothing(origin, name)] for name in names]
         for part in self._runs(start_s, end_s):
             rows = _rows(part.time_s, start_s, end_s)
-            headers.append(part.run.headers[rows])
-            times.append(part.time_s[rows])
-            for name, of_column in zip(names, arrays, strict=True):
-                of_column.append(part.column(numbers[name], rows))
-        joined = {name: np.concatenate(of_column) for name, of_column in zip(names, arrays, strict=True)}
-        return Series(origin, np.concatenate(headers), np.concatenate(times), joined)
+            arrays = {name: part.column(numbers[name], rows) for name in names}
+            yield Series(origin, part.run.headers[rows], part.time_s[rows], arrays)
+
+    def _asked(self, columns: Collection[str] | None) -> tuple[Generation, tuple[str, ...]]:
+        """One of the generations, and the names of the columns that are wanted."""
+        origin = self._only_origin()
+        names = tuple(columns) if columns is not None else _FOR_DRIVERS if origin.is_driver else tuple(origin.columns)
+        for name in names:
+            if name not in origin.columns:
+                raise KeyError(f"no column {name!r}; there are {', '.join(origin.columns)}")
+        return origin, names
 
     def _only_origin(self) -> Generation:
         origins = self.generations
@@ -204,10 +217,10 @@ class _PartOfChunk(NamedTuple):
         return wanted.view(np.uint8).view(dtype).reshape(len(wanted), *shape)
 
 
-def _nothing(generation: Generation, name: str) -> npt.NDArray[Any]:
-    """A column of no frames."""
-    shape, dtype, _ = generation.columns[name]
-    return np.zeros((0, *shape), dtype)
+def _nothing(generation: Generation, names: Collection[str]) -> Series:
+    """Columns of no frames."""
+    columns = {name: np.zeros((0, *shape), dtype) for name, (shape, dtype, _) in generation.columns.items()}
+    return Series(generation, np.zeros(0, HEADER), np.zeros(0), {name: columns[name] for name in names})
 
 
 def _rows(time_s: npt.NDArray[np.float64], start_s: float, end_s: float | None) -> slice:

@@ -16,6 +16,7 @@ import pytest
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command as calibrate
+from skinware.cli.convert import command as convert
 from skinware.cli.info import command as info
 from skinware.cli.press import command as press
 from skinware.cli.recover import command as recover
@@ -274,6 +275,7 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
             status = record.wait_for("status", lambda status: bool(status["messages"]))
             check("`skin-record`", ready, status, record.stop())
     check("`skin-recover`", *printing(recover, str(file)))
+    check("`skin-convert`", *printing(convert, str(file), "--to", "csv"))
     check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
 
 

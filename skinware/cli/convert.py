@@ -1,0 +1,121 @@
+"""``skin-convert``: a recording in the formats of other programs, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    DEFAULT_REGIONS,
+    examples,
+    json_option,
+    print_json,
+    run,
+    seconds,
+    signals_end,
+    version_option,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from skinware.conversion import Selection
+
+_FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap")
+
+
+@click.command(
+    "skin-convert",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-convert walk.mcap --to npz                        writes walk.npz",
+        "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
+        "skin-convert walk.mcap --to parquet --region palm -o palm",
+        "skin-convert walk.npz --to mcap -o again.mcap          and back",
+    ),
+)
+@click.argument("file", type=click.Path(path_type=Path, readable=False))
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--to", "format_name", type=click.Choice(_FORMATS), required=True, help="Format to write.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="OUT",
+    type=click.Path(path_type=Path),
+    help="The new file; of csv and parquet, folder.  [default: beside FILE]",
+)
+@click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; repeat it for several.")
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; likewise.")
+@click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; likewise.")
+@click.option(
+    "--regions",
+    "region_files",
+    metavar="FILE",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
+)
+@click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
+@click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
+@json_option
+@version_option
+def command(
+    file: Path,
+    names: tuple[str, ...],
+    format_name: str,
+    output: Path | None,
+    types: tuple[str, ...],
+    patches: tuple[str, ...],
+    in_regions: tuple[str, ...],
+    region_files: tuple[Path, ...],
+    start_s: float,
+    end_s: float | None,
+    as_json: bool,
+) -> None:
+    """Write a recording in another format: all drivers and services in it, or only NAME...
+
+    FILE may also be what this command wrote as npz, hdf5 or parquet. It is only read; what is damaged in it is left out
+    and told. The new file is there when it is complete, not before.
+    """
+    from skinware.conversion import convert
+
+    selection = _selection(names, types, patches, in_regions, region_files)
+    if end_s is not None and end_s <= start_s:
+        raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
+    stop = Event()
+    with signals_end(stop.set):  # not in the middle of what libraries do
+        converted = convert(file, output, format_name, selection, start_s=start_s, end_s=end_s, is_stopped=stop.is_set)
+    for note in converted.notes:
+        warn(note)
+    if as_json:
+        told = {"file": str(converted.path), "format": format_name, "frames": dict(converted.frames)}
+        print_json({"event": "converted", **told, "notes": converted.notes})
+        return
+    frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
+    click.echo(f"{converted.path}: {frames}")
+
+
+def _selection(
+    names: tuple[str, ...],
+    types: tuple[str, ...],
+    patches: tuple[str, ...],
+    in_regions: tuple[str, ...],
+    region_files: tuple[Path, ...],
+) -> Selection:
+    from skinware.conversion import Selection
+    from skinware.tactile.region_files import read_regions
+
+    if not in_regions:
+        if region_files:
+            raise click.UsageError("--regions says where regions are: say which with --region")
+        return Selection(names, types, patches)
+    regions = read_regions(*(region_files or (Path(DEFAULT_REGIONS),)))
+    return Selection(names, types, patches, regions, in_regions)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

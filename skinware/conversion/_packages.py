@@ -1,0 +1,30 @@
+"""Packages of the extra ``convert``, imported when they are needed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from skinware.errors import MissingExtra
+
+
+def h5py() -> Any:
+    """The package h5py.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    return _package("h5py", "HDF5")
+
+
+def pyarrow() -> Any:
+    """The package pyarrow, with its module ``parquet``; likewise."""
+    _package("pyarrow.parquet", "Parquet")
+    return _package("pyarrow", "Parquet")
+
+
+def _package(name: str, what: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError:
+        raise MissingExtra(f"{what} needs a package that is not installed: pip install 'skinware[convert]'") from None

@@ -1,0 +1,196 @@
+"""Conversions: a file into another, which is there only when it is complete."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from skinware.conversion.csv_text import write_csv
+from skinware.conversion.hdf5 import Hdf5Source, write_hdf5
+from skinware.conversion.npz import NpzSource, write_npz
+from skinware.conversion.parquet import DESCRIPTION, ParquetSource, write_parquet
+from skinware.conversion.recorded import RecordedSource
+from skinware.conversion.selection import Selection
+from skinware.conversion.tables import TIME, Block, Source, Table
+from skinware.conversion.to_recording import write_recording
+from skinware.errors import BadRecording, ConfigurationError
+
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+_ZIP_MAGIC = b"PK"
+
+
+class Format(NamedTuple):
+    """A format that can be written.
+
+    Attributes:
+        suffix: of its files, or of its folders.
+        write: writes a source into a path at which nothing is.
+        leaves_out: what of a recording it cannot hold, for people; empty: nothing.
+    """
+
+    suffix: str
+    write: Callable[[Source, Path], None]
+    leaves_out: str = ""
+
+
+FORMATS = {
+    "csv": Format("-csv", write_csv, "counters, histograms and events"),
+    "npz": Format(".npz", write_npz),
+    "parquet": Format("-parquet", write_parquet),
+    "hdf5": Format(".h5", write_hdf5),
+    "mcap": Format(".mcap", write_recording),
+}
+
+
+@dataclass
+class Converted:
+    """What came of a conversion.
+
+    Attributes:
+        path: of the new file or folder.
+        frames: of each table in it.
+        notes: what is wrong with the old file, and what is not in the new one; a line each.
+    """
+
+    path: Path
+    frames: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+
+
+def convert(
+    path: Path,
+    target: Path | None,
+    format_name: str,
+    selection: Selection | None = None,
+    *,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Converted:
+    """Write what is in a recording, or in a file that was made of one, in another format.
+
+    Args:
+        path: a recording, or an NPZ or HDF5 file or Parquet folder that this function wrote; it is only read.
+        target: the new file or folder, at which nothing may be; None: beside the old one, with the format's suffix.
+        format_name: one of :data:`FORMATS`.
+        selection: what of it; None: all.
+        start_s: where to begin, s since it began.
+        end_s: where to end, likewise; None: at its end.
+        is_stopped: asked now and then; True ends it with :class:`KeyboardInterrupt`, and nothing is written.
+
+    Raises:
+        BadRecording: the file is not one of these, or of a newer version, or nothing in it can be used.
+        ConfigurationError: it does not have what is selected.
+        MissingExtra: a package of the extra ``convert`` is not installed.
+        OSError: it cannot be read, or the new one cannot be written.
+    """
+    form = FORMATS[format_name]
+    target = target or path.with_name(path.stem + form.suffix)
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "exists already: give another name, or remove it", str(target))
+    with contextlib.closing(opened(path, start_s, end_s)) as whole:
+        if not whole.tables:
+            raise BadRecording(f"{path}: no frames in it that can be used")
+        source = _Watched((selection or Selection()).of(whole), is_stopped)
+        with _beside(target) as begun:
+            form.write(source, begun)
+            if not source.frames.total():
+                raise ConfigurationError(f"{path}: nothing was recorded of what was asked for in that time")
+        left_out = [f"{target}: {form.leaves_out} are left out: {format_name} does not hold them"] * bool(
+            form.leaves_out
+        )
+        return Converted(target, source.frames, [*source.problems, *left_out])
+
+
+def opened(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Source:
+    """A file as a source, by what is in it.
+
+    Args:
+        path: as for :func:`convert`.
+        start_s: likewise.
+        end_s: likewise.
+
+    Raises:
+        BadRecording, MissingExtra, OSError: likewise.
+    """
+    if path.is_dir():
+        if (path / DESCRIPTION).exists():
+            return ParquetSource(path, start_s, end_s)
+        raise BadRecording(f"{path}: a folder, but not one of Parquet files that skin-convert wrote")
+    with path.open("rb") as file:
+        magic = file.read(len(_HDF5_MAGIC))
+    if magic == _HDF5_MAGIC:
+        return Hdf5Source(path, start_s, end_s)
+    if magic[: len(_ZIP_MAGIC)] == _ZIP_MAGIC:
+        return NpzSource(path, start_s, end_s)
+    return RecordedSource(path, start_s, end_s)
+
+
+@contextlib.contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """A path to write at, which gets its name when all is written; what was begun is removed otherwise."""
+    begun = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        yield begun
+        os.rename(begun, target)
+    except BaseException:
+        if begun.is_dir():
+            shutil.rmtree(begun, ignore_errors=True)
+        else:
+            begun.unlink(missing_ok=True)
+        raise
+
+
+class _Watched:
+    """A source whose frames are counted as they are written, until somebody stops that."""
+
+    def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:
+        self._source = source
+        self.path: Path = source.path
+        self.start_ns: int = source.start_ns
+        self.frames: Counter[str] = Counter()
+        self.tables: Sequence[Table] = [_WatchedTable(table, self.frames, is_stopped) for table in source.tables]
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """See :class:`skinware.conversion.tables.Source`."""
+        return self._source.events
+
+    @property
+    def clock(self) -> list[dict[str, Any]]:
+        """Likewise."""
+        return self._source.clock
+
+    @property
+    def problems(self) -> list[str]:
+        """Likewise."""
+        return self._source.problems
+
+    def close(self) -> None:
+        """Likewise."""
+        self._source.close()
+
+
+class _WatchedTable(Table):
+    """A table that notes how many frames its last pass gave."""
+
+    def __init__(self, table: Table, frames: Counter[str], is_stopped: Callable[[], bool]) -> None:
+        super().__init__(table.name, table.service, table.generations)
+        self.sensor_names = table.sensor_names
+        self._table, self._frames, self._is_stopped = table, frames, is_stopped
+
+    def blocks(self, names: Collection[str]) -> Iterator[Block]:
+        """See :class:`Table`."""
+        self._frames[self.name] = 0
+        for block in self._table.blocks(names):
+            if self._is_stopped():
+                raise KeyboardInterrupt
+            self._frames[self.name] += len(block[TIME])
+            yield block

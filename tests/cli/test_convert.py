@@ -1,0 +1,150 @@
+"""skin-convert as people and scripts use it."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skinware.cli._command import exit_status
+from skinware.cli.convert import _FORMATS
+from skinware.cli.convert import command as convert
+from skinware.conversion import FORMATS
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import fake_structure
+from tests.commands import BIN, PATIENCE_S
+from tests.recording.made import made_recording
+from tests.unprivileged import without_rights_to_all_files
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recording of a driver, in the present folder."""
+    monkeypatch.chdir(tmp_path)
+    made_recording(Path("walk.mcap"), fake_structure(2, 2), 100)
+    return Path("walk.mcap")
+
+
+def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(convert, [str(file), "--to", "npz"]) == 0
+    assert capsys.readouterr().out == "walk.npz: 100 frames of torso\n"
+    assert exit_status(convert, [str(file), "--to", "csv", "--start", "0.2", "--end", "0.5", "--json"]) == 0
+    out, err = capsys.readouterr()
+    note = "walk-csv: counters, histograms and events are left out: csv does not hold them"
+    assert err == f"skin-convert: {note}\n"
+    told = {"event": "converted", "file": "walk-csv", "format": "csv", "frames": {"torso": 30}, "notes": [note]}
+    assert json.loads(out) == told
+    assert exit_status(convert, ["walk.npz", "--to", "mcap", "-o", "again.mcap"]) == 0
+    regions = 'format = "skinware-regions"\nversion = 1\n\n[[region]]\nname = "palm"\nuid = [1000, 1002, 1010]\n'
+    Path("regions.toml").write_text(regions)
+    options = ["--region", "palm", "--type", "pressure", "-o", "palm.npz"]
+    assert exit_status(convert, ["again.mcap", "torso", "--to", "npz", *options]) == 0
+    with np.load("palm.npz") as arrays:
+        assert arrays["torso/sensors/uid"].tolist() == [1000, 1002]
+    assert [entry.name for entry in sorted(tmp_path.iterdir())] == [
+        *("again.mcap", "palm.npz", "regions.toml", "walk-csv", "walk.mcap", "walk.npz")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nothing.mcap", "--to", "npz"], 1, "nothing.mcap: No such file or directory"),
+        (["walk.mcap", "--to", "xls"], 2, "'xls' is not one of"),
+        (["walk.mcap", "--to", "npz", "-o", "walk.mcap"], 1, "walk.mcap: exists already: give another name"),
+        (["walk.mcap", "--to", "npz", "-o", "nowhere/x.npz"], 1, "No such file or directory"),
+        (["walk.mcap", "--to", "npz", "-o", "/proc/x.npz"], 1, "No such file or directory"),
+        (["walk.mcap", "--to", "npz", "--start", "2", "--end", "1"], 2, "--end 1 is not after --start 2"),
+        (["walk.mcap", "leg", "--to", "npz"], 2, "no service 'leg'; there are: torso"),
+        (["walk.mcap", "--to", "npz", "--region", "palm"], 2, "regions.toml"),
+        (["walk.mcap", "--to", "npz", "--regions", "r.toml"], 2, "say which with --region"),
+        (["walk.mcap", "--to", "npz", "--start", "9"], 2, "nothing was recorded of what was asked for in that time"),
+    ],
+)
+def test_mistakes_are_one_line(
+    file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    code: int,
+    words: str,
+) -> None:
+    before = file.read_bytes()
+    assert exit_status(convert, arguments) == code
+    errors = capsys.readouterr().err
+    assert words in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == [tmp_path / "walk.mcap"]
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("format_name", ["csv", "npz"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, number: int) -> None:
+    file, out = tmp_path / "long.mcap", tmp_path / "out"
+    made_recording(file, fake_structure(4, 16), 2000)
+    command = [str(BIN / "skin-convert"), str(file), "--to", format_name, "-o", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 2)
+        process.send_signal(number)
+        printed = process.communicate(timeout=PATIENCE_S)
+    assert printed == ("", "")
+    assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("format_name", sorted(FORMATS))
+def test_no_room_is_one_line_and_leaves_nothing(file: Path, tmp_path: Path, format_name: str) -> None:
+    done = subprocess.run(
+        [BIN / "skin-convert", file, "--to", format_name, "-o", "out"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2_000, 2_000)),
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("skin-convert: ")
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == [tmp_path / "walk.mcap"]
+
+
+def test_no_permission_is_one_line(file: Path, tmp_path: Path) -> None:
+    closed, unreadable = tmp_path / "closed", tmp_path / "unreadable.mcap"
+    closed.mkdir(mode=0o500)
+    unreadable.write_bytes(file.read_bytes())
+    unreadable.chmod(0)
+    for arguments, where in (
+        ([str(file), "-o", str(closed / "x.npz")], str(closed)),
+        ([str(unreadable), "-o", "x.npz"], "unreadable.mcap"),
+    ):
+        done = subprocess.run(
+            [BIN / "skin-convert", *arguments, "--to", "npz"],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            preexec_fn=without_rights_to_all_files,
+        )
+        assert done.returncode == 1, done.stderr
+        assert where in done.stderr
+        assert done.stderr.endswith(": Permission denied\n")
+        assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("package", "format_name"), [("h5py", "hdf5"), ("pyarrow", "parquet")])
+def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: str, format_name: str) -> None:
+    code = f"import sys; sys.modules[{package!r}] = None\nfrom skinware.cli.convert import main; main()"
+    command = [sys.executable, "-c", code, str(file), "--to", format_name]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 1
+    assert "pip install 'skinware[convert]'" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_it_offers_what_there_is() -> None:
+    assert set(_FORMATS) == set(FORMATS)

@@ -19,6 +19,7 @@ from skinware.geometry import Geometry
 from skinware.status import BusReason
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.samples import Samples
+from skinware_drivers.wire_tap import WireTap
 
 EXTENDED_FLAG = 0x8000_0000
 """Identifier bit of a 29-bit CAN frame (``CAN_EFF_FLAG`` of linux/can.h).
@@ -177,6 +178,7 @@ class Bus(ABC):
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
+        tap: what goes over the wire, in both directions, as long as somebody wants it.
         narrows: it can leave out frames that nobody wants, see ``narrow``.
         bit_rate: of the wire, bit/s; 0 where it is not known, or not all frames are seen.
         wire_bits: about how many bits of that rate the frames seen so far took; counted where the bit rate is known.
@@ -213,6 +215,7 @@ class Bus(ABC):
         self.listen_only = listen_only
         self.counters: BusCounters = BusCounters()
         self.samples: Samples = Samples()
+        self.tap: WireTap = WireTap()
         self.narrows = False
         self.bit_rate = 0
         self.wire_bits: float = 0.0

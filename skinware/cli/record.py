@@ -65,6 +65,7 @@ def past(text: str) -> float:
         "skin-record torso -o walk.mcap -T 60  one driver, one minute",
         "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
         "skin-record --last 60s               kill -USR1 saves the last minute",
+        "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
@@ -89,6 +90,7 @@ def past(text: str) -> float:
     type=past,
     help="Keep only the last TIME (60s, 5min), in memory; saved on SIGUSR1 and at the end.",
 )
+@click.option("--wire", "with_wires", is_flag=True, help="Record the frames and bytes on the drivers' buses, too.")
 @namespace_option
 @json_option
 @version_option
@@ -99,6 +101,7 @@ def command(
     split_size: int | None,
     max_size: int | None,
     last_s: float | None,
+    with_wires: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
@@ -119,7 +122,7 @@ def command(
     place = Namespace(namespace)
     path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
-    recorder = Recorder(target, names=names or None, namespace=place)
+    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires)
     report = _Report(recorder, target, path, as_json)
     failed = True
     with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):

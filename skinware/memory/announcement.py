@@ -11,6 +11,7 @@ import os
 import secrets
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
 
@@ -72,10 +73,14 @@ class Announcement:
         self._descriptor: Descriptor | None = None
         self._make()
 
-    def write(self, record: ReaderRecord) -> None:
-        """Tell the present figures; makes the file again if there was no place for it yet, or somebody removed it."""
+    def keep(self) -> None:
+        """Make the file again if there was no place for it yet, or somebody removed it."""
         if self._descriptor is None or (self._descriptor.fd >= 0 and os.fstat(self._descriptor.fd).st_nlink == 0):
             self._make()
+
+    def write(self, record: ReaderRecord) -> None:
+        """Tell the present figures, in a file that is there if there is a place for it (``keep``)."""
+        self.keep()
         if self._descriptor is None or self._descriptor.fd < 0:
             return
         text = msgspec.json.encode(record)[: _SIZE - 9].ljust(_SIZE - 9)
@@ -109,6 +114,20 @@ def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
             yield record
 
 
+def is_wished(namespace: Namespace, what: str) -> bool:
+    """Whether somebody who lives announces ``what`` in the place of a service's name: a wish to those who publish."""
+    for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
+        if path.name.startswith(f"{what}."):
+            with contextlib.suppress(OSError):
+                fd = _open(path)
+                try:
+                    if is_locked(fd):
+                        return True
+                finally:
+                    os.close(fd)
+    return False
+
+
 def sweep(namespace: Namespace) -> None:
     """Remove what dead readers left behind, as far as this user may.
 
@@ -123,7 +142,7 @@ def _living(namespace: Namespace) -> Iterator[int]:
     """Open announcements of readers that are alive; those of dead ones are removed."""
     for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
         with contextlib.suppress(OSError):
-            fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            fd = _open(path)
             try:
                 if is_locked(fd):
                     yield fd
@@ -131,6 +150,11 @@ def _living(namespace: Namespace) -> Iterator[int]:
                     path.unlink()
             finally:
                 os.close(fd)
+
+
+def _open(path: Path) -> int:
+    """A descriptor of a file that anybody may have put there, and that need be none."""
+    return os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 def _read(fd: int) -> ReaderRecord | None:

@@ -25,8 +25,19 @@ from skinware.recording.frames import RecordedDriverFrame, RecordedFrame, Record
 from skinware.recording.reading import Recording
 from skinware.recording.series import Series
 from skinware.recording.tracks import Track
+from skinware.recording.wires import WirePiece, WireTrack
 
-__all__ = ["RecordedDriverFrame", "RecordedFrame", "RecordedSnapshot", "Recording", "Series", "Track", "open"]
+__all__ = [
+    "RecordedDriverFrame",
+    "RecordedFrame",
+    "RecordedSnapshot",
+    "Recording",
+    "Series",
+    "Track",
+    "WirePiece",
+    "WireTrack",
+    "open",
+]
 
 
 def open(path: str | Path) -> Recording:  # noqa: A001, as of gzip and others

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple, Protocol
 
 from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, StructureChanged
 from skinware.memory import futex, segments
+from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service._tap import Tap, wake_word_of
+from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50
 """Between two looks for new services: of a ring of 8 slots at 100 Hz nothing is lost meanwhile."""
@@ -76,11 +78,16 @@ class Collector:
         namespace: where they are.
         names: of services; None: all there are.
         listener: who is told.
+        with_wires: drivers are asked to publish what goes over their wires; it is taken, too.
     """
 
-    def __init__(self, namespace: Namespace, names: Collection[str] | None, listener: Listener) -> None:
+    def __init__(
+        self, namespace: Namespace, names: Collection[str] | None, listener: Listener, *, with_wires: bool = False
+    ) -> None:
         self._namespace = namespace
         self._names = None if names is None else frozenset(names)
+        self._wish = Announcement(namespace, WISH) if with_wires else None
+        self._left_out: set[str] = set()
         self._listener = listener
         self._sources: dict[str, _Source] = {}
         self._next_discovery_ns = self._next_life_ns = 0
@@ -132,6 +139,8 @@ class Collector:
         """Let go of all services. Idempotent."""
         for source in self._sources.values():
             source.reader.close()
+        if self._wish is not None:
+            self._wish.close()
 
     def _take_from(self, name: str, source: _Source) -> Iterator[_Taken]:
         for frame in self._frames(name, source):
@@ -182,15 +191,22 @@ class Collector:
         return latest is not None and latest != source.reader.last_taken
 
     def _discover(self) -> None:
+        if self._wish is not None:
+            self._wish.keep()
         try:
             found = self._namespace.services()
         except NamespaceError as error:
             self._tell_trouble("", str(error))
             return
         for name in found:
-            if name not in self._sources and (self._names is None or name in self._names):
+            if name not in self._sources and name not in self._left_out and self._is_wanted(name):
                 self._attach(name)
         self._is_first_look = False
+
+    def _is_wanted(self, name: str) -> bool:
+        if self._names is None or name in self._names:
+            return True
+        return self._wish is not None and any(name == service_name(driver) for driver in self._names)
 
     def _attach(self, name: str) -> None:
         if segments.living_inode(self._namespace, name) is None:
@@ -201,6 +217,10 @@ class Collector:
             return
         except (BadServiceFile, NamespaceError) as error:
             self._tell_trouble(name, str(error))
+            return
+        if reader.kind == KIND and self._wish is None:  # somebody else wants it
+            reader.close()
+            self._left_out.add(name)
             return
         reader.begin_in_order(with_first=not self._is_first_look)
         self._sources[name] = _Source(reader)

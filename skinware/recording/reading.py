@@ -14,8 +14,9 @@ from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
 from skinware.recording.generation import Generation
 from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource
 from skinware.recording.timeline import GONE, LIVE, PAUSED, Moment, Timeline
-from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of
+from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
+from skinware.recording.wires import WireTrack
 from skinware.skin_layout import SkinLayout
 
 
@@ -53,6 +54,7 @@ class Recording:
         self.start_ns: int = min((place.start_ns for place in self._source.chunks), default=0)
         self.end_ns: int = max((place.end_ns for place in self._source.chunks), default=0)
         self._topics: dict[str, int] = {}
+        self._wires: dict[tuple[str, str], WireTrack] = {}
         self._problems: dict[str, None] = {}
         self._damaged: set[int] = set()
         try:
@@ -70,6 +72,11 @@ class Recording:
     def drivers(self) -> tuple[str, ...]:
         """Names of those that are drivers."""
         return tuple(name for name in self.services if self[name].is_driver)
+
+    @property
+    def wires(self) -> tuple[WireTrack, ...]:
+        """What went over the wires of the drivers, bus by bus, if that was recorded (``skin-record --wire``)."""
+        return tuple(self._wires[key] for key in sorted(self._wires))
 
     @property
     def duration_s(self) -> float:
@@ -239,6 +246,9 @@ class Recording:
             if newer is not None:
                 raise BadRecording(f"{self.path}: recorded by a newer version ({newer}): update skinware to read it")
             self._topics[channel.topic] = channel.id
+            wire = wire_of(channel)
+            if wire is not None:
+                self._wires[wire] = WireTrack(self, *wire, channel.id)
             found = service_of(channel)
             if found is not None:
                 service = services.setdefault(found[0], _Service())

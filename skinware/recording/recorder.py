@@ -24,6 +24,8 @@ from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
+from skinware.recording.wires import message_of
+from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
 """A chunk is closed so long after its first message: that much is lost with a killed recorder."""
@@ -66,6 +68,7 @@ class Recorder:
         target: where the recording goes; the recorder completes it.
         names: of services; None: all there are and come.
         namespace: where they are.
+        with_wires: record also what goes over the wires of the drivers.
     """
 
     def __init__(
@@ -74,12 +77,13 @@ class Recorder:
         *,
         names: Collection[str] | None = None,
         namespace: Namespace | str | None = None,
+        with_wires: bool = False,
     ) -> None:
         self._target = target
         self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
         self._coder = _Coder(target, self._jobs)
-        self._collector = Collector(Namespace.of(namespace), names, self)
+        self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # what comes later is recorded from its first frame on
         self._stopping = False
 
@@ -169,6 +173,14 @@ class _Stream:
     encoder: Encoder
 
 
+@dataclass(frozen=True)
+class _WireStream:
+    """What goes over the wires of a driver, with their names."""
+
+    driver: str
+    buses: list[str]
+
+
 class _Coder(threading.Thread):
     """Codes frames, fills chunks, and hands them to the target when they are due."""
 
@@ -178,7 +190,7 @@ class _Coder(threading.Thread):
         self.bytes_done = 0
         self.failure: Exception | None = None
         self._target, self._jobs = target, jobs
-        self._streams: dict[str, _Stream] = {}
+        self._streams: dict[str, _Stream | _WireStream] = {}
         self._chunk = OpenChunk()
         self._heads: set[Head] = set()
         self._due_ns = 0
@@ -211,7 +223,11 @@ class _Coder(threading.Thread):
             return True
         match job:
             case _Took(service, frame):
-                self._add_frame(self._streams[service], service, frame)
+                match self._streams[service]:
+                    case _WireStream() as stream:
+                        self._add_wire(stream, frame)
+                    case _Stream() as stream:
+                        self._add_frame(stream, service, frame)
                 self.bytes_done += len(frame.slot)
             case _Began(service, head):
                 self._begin(service, head)
@@ -225,10 +241,15 @@ class _Coder(threading.Thread):
         return True
 
     def _begin(self, service: str, head: bytes) -> None:
+        segment = segments.recorded(head, service)
+        wires = _wires_of(segment)
+        if wires is not None:
+            self._streams[service] = wires
+            return
         before = self._streams.get(service)
-        number = 1 if before is None else before.head.sequence + 1
+        number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
         channel, schema = self.channels.of_service(service, GENERATION)
-        columns = segments.recorded(head, service).layout.slot
+        columns = segment.layout.slot
         encoder = Encoder([CodedColumn.of(column) for column in columns])
         self._streams[service] = _Stream(Head(channel, schema, number, head), encoder)
 
@@ -239,6 +260,13 @@ class _Coder(threading.Thread):
         self._heads.add(stream.head)
         time_ns = frame.published_ns + self._offset_ns
         self._add(channel, schema, frame.sequence, time_ns, stream.encoder.encode(frame))
+
+    def _add_wire(self, stream: _WireStream, frame: Frame) -> None:
+        bus = int(frame.column("bus")[()])
+        if bus >= len(stream.buses):
+            return
+        channel, schema = self.channels.of_wire(stream.driver, stream.buses[bus])
+        self._add(channel, schema, frame.sequence, frame.published_ns + self._offset_ns, message_of(frame))
 
     def _add_json(self, topic: str, data: dict[str, Any]) -> None:
         channel, schema = self.channels.of_all(topic)
@@ -261,6 +289,16 @@ class _Coder(threading.Thread):
         chunk, heads = self._chunk.close(), self._heads
         self._chunk, self._heads = OpenChunk(), set()
         self._target.add(chunk, heads)
+
+
+def _wires_of(segment: segments.Segment) -> _WireStream | None:
+    """What goes over the wires of a driver; None if a service is not one that tells that."""
+    columns = {column.name for column in segment.layout.slot}
+    if bytes(segment.header["kind"]).decode() != KIND or columns != COLUMNS.keys():
+        return None
+    tables = segment.static_columns()
+    texts = [bytes(text).decode(errors="replace") for name in ("driver", "bus_name") for text in tables.get(name, ())]
+    return _WireStream(texts[0], texts[1:]) if texts else None
 
 
 def _boot() -> str:

@@ -12,6 +12,9 @@ ENCODING = f"skinware/{FORMAT}"
 _FAMILY = "skinware/"
 FRAME, GENERATION = "frame", "generation"
 EVENTS, CLOCK = "/skin/events", "/skin/clock"
+WIRE = "wire"
+WIRE_ENCODING = "skinware-wire/1"
+"""Of messages with what went over a wire."""
 
 _EVENT = {
     "type": "object",
@@ -35,6 +38,10 @@ _CLOCK = {
 _FRAME_TEXT = b"""\
 One frame: u8 generation, u8 sequence, i8 acquired_ns, i8 published_ns, u8 flags, u8 after, little-endian; a byte for
 each column, how it is coded; u4 of each, its size; what changed in each since frame `after`."""
+_WIRE_TEXT = b"""\
+What went over a wire: u8 generation, u8 sequence, i8 published_ns, u8 lost, little-endian; then pieces: u4 size,
+u4 count, u1 form (1: struct can_frame, 2: struct canfd_frame, 3: bytes), u1 is_sent, 6 bytes; i8 time_ns of each frame,
+or one of all bytes; the frames, or bytes up to a multiple of 8."""
 _GENERATION_TEXT = b"""\
 The file of a service in shared memory (version 1.0), up to its slots: header, column table, static columns."""
 
@@ -43,6 +50,7 @@ SCHEMAS = {
     GENERATION: Schema(2, _GENERATION_TEXT, ENCODING, "skinware.Generation"),
     EVENTS: Schema(3, json.dumps(_EVENT).encode(), "jsonschema", "skinware.Event"),
     CLOCK: Schema(4, json.dumps(_CLOCK).encode(), "jsonschema", "skinware.Clock"),
+    WIRE: Schema(5, _WIRE_TEXT, WIRE_ENCODING, "skinware.Wire"),
 }
 
 
@@ -60,14 +68,20 @@ class Channels:
         """The channel of events, or of the clock."""
         return self._of(topic, "json", SCHEMAS[topic])
 
+    def of_wire(self, driver: str, bus: str) -> tuple[Channel, Schema]:
+        """The channel of what went over a bus of a driver."""
+        return self._of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
+
     def names(self) -> dict[int, str]:
         """Topics by number."""
         return {channel.id: topic for topic, channel in self._channels.items()}
 
-    def _of(self, topic: str, encoding: str, schema: Schema) -> tuple[Channel, Schema]:
+    def _of(
+        self, topic: str, encoding: str, schema: Schema, metadata: dict[str, str] | None = None
+    ) -> tuple[Channel, Schema]:
         channel = self._channels.get(topic)
         if channel is None:
-            channel = Channel(len(self._channels) + 1, topic, encoding, {}, schema.id)
+            channel = Channel(len(self._channels) + 1, topic, encoding, metadata or {}, schema.id)
             self._channels[topic] = channel
         return channel, schema
 
@@ -78,6 +92,13 @@ def service_of(channel: Channel) -> tuple[str, str] | None:
     if channel.message_encoding != ENCODING or len(parts) != 4 or parts[3] not in (FRAME, GENERATION):
         return None
     return parts[2], parts[3]
+
+
+def wire_of(channel: Channel) -> tuple[str, str] | None:
+    """(driver, name of its bus) of a channel with what went over a wire; None of any other."""
+    told = channel.metadata
+    is_wire = channel.message_encoding == WIRE_ENCODING and "driver" in told and "bus" in told
+    return (told["driver"], told["bus"]) if is_wire else None
 
 
 def newer_format(channel: Channel) -> str | None:

@@ -15,14 +15,16 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
-from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch, identifier_text
+from skinware.wire import IS_FD
+from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch, identifier_text
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.samples import Samples
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
+_SWITCHED, _PASSIVE = 0x01, 0x02
+"""Flags of a CAN FD frame: bit rate switched, sender error passive."""
 _CLOSE_S = 0.8
 """How long an interface may take to be closed; a driver ends within a second or so, whatever its interfaces do."""
 _NUMBERS = (int, float)
@@ -92,7 +94,7 @@ class PythonCanBus(Bus):
             why = f"bus {self.interface}:{self.channel} cannot be opened: {error}"
             raise BusNotAvailable(why, reason=BusReason.FAILED) from None
         self._was_open = True
-        self._messages = _Messages(self._bus, f"bus {self.interface}:{self.channel}", self.counters, self.samples)
+        self._messages = _Messages(self._bus, f"bus {self.interface}:{self.channel}", self.counters)
 
     @property
     def note(self) -> str:
@@ -124,8 +126,13 @@ class PythonCanBus(Bus):
             os.eventfd_read(messages.fd)
         count = 0
         while messages.queue and batch.free:
-            time_ns, identifier, payload = messages.queue.popleft()
-            if len(payload) > batch.payload_size:
+            time_ns, identifier, payload, flags = messages.queue.popleft()
+            if self.tap.is_open:
+                self.tap.keep_frame(time_ns, identifier, payload, flags=flags)
+            if identifier & ERROR_FLAG:
+                self.counters.errors += 1
+                continue
+            if identifier & REMOTE_FLAG or len(payload) > batch.payload_size:
                 self.counters.refused += 1
                 self.samples.note(Unused.REFUSED, identifier, payload)
                 continue
@@ -153,6 +160,8 @@ class PythonCanBus(Bus):
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier_text(identifier)} not sent ({error})") from None
         self.counters.sent += 1
+        if self.tap.is_open:
+            self.tap.keep_frame(now_ns(), identifier, payload, is_sent=True)
 
     def close(self) -> None:
         """Stop taking messages and shut the interface down. Idempotent.
@@ -170,19 +179,19 @@ class _Messages:
     Args:
         bus: the interface.
         name: of the bus, for messages.
-        counters, samples: the bus' own.
+        counters: the bus' own.
 
     Attributes:
-        queue: of each that waits: time of its arrival, identifier (with its flag), payload.
+        queue: of each that waits: time of its arrival, identifier (with its flags), payload, flags of CAN FD.
         failure: why no more come; None as long as they may.
         fd: an eventfd that was written to whenever one of the two changed; the thread's, until it ends.
     """
 
-    def __init__(self, bus: can.BusABC, name: str, counters: BusCounters, samples: Samples) -> None:
-        self.queue: deque[tuple[int, int, bytes]] = deque()
+    def __init__(self, bus: can.BusABC, name: str, counters: BusCounters) -> None:
+        self.queue: deque[tuple[int, int, bytes, int]] = deque()
         self.failure: str | None = None
         self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._bus, self._name, self._counters, self._samples = bus, name, counters, samples
+        self._bus, self._name, self._counters = bus, name, counters
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
@@ -214,17 +223,26 @@ class _Messages:
                 self._take(message)
 
     def _take(self, message: can.Message) -> None:
-        identifier = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
-        if message.is_error_frame:
-            self._counters.errors += 1
-        elif message.is_remote_frame:
-            self._counters.refused += 1
-            self._samples.note(Unused.REFUSED, identifier, b"")
-        elif len(self.queue) >= _QUEUE_FRAMES:
+        if len(self.queue) >= _QUEUE_FRAMES:
             self._counters.lost += 1
-        else:
-            self.queue.append((now_ns(), identifier, bytes(message.data)))
-            os.eventfd_write(self.fd, 1)
+            return
+        identifier = message.arbitration_id
+        for is_so, flag in (
+            (message.is_extended_id and not message.is_error_frame, EXTENDED_FLAG),
+            (message.is_remote_frame, REMOTE_FLAG),
+            (message.is_error_frame, ERROR_FLAG),
+        ):
+            identifier |= flag if is_so else 0
+        payload = b"" if message.is_remote_frame else bytes(message.data)
+        self.queue.append((now_ns(), identifier, payload, _fd_flags(message)))
+        os.eventfd_write(self.fd, 1)
+
+
+def _fd_flags(message: can.Message) -> int:
+    """As linux/can.h has them."""
+    if not message.is_fd:
+        return 0
+    return IS_FD | (_SWITCHED if message.bitrate_switch else 0) | (_PASSIVE if message.error_state_indicator else 0)
 
 
 def _typed(text: str) -> int | float | bool | str:

@@ -64,7 +64,7 @@ class Rows:
         self._headers["iov_count"] = 2 if beyond > 0 else 1
         self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
         self._control_length = self._headers["control_length"]
-        self._flags = self._headers["flags"]
+        self._flags, self._length = self._headers["flags"], self._headers["length"]
         self.headers_address: int = self._headers.ctypes.data
 
     def receive(self, fd: int, free: slice) -> int:
@@ -86,6 +86,11 @@ class Rows:
         """(n,) bool: which of them were."""
         found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
         return found
+
+    def are_fd(self, rows: slice) -> npt.NDArray[np.bool_]:
+        """(n,) bool: which of them came as CAN FD frames, whatever their flags say; only right after receiving."""
+        found: npt.NDArray[np.bool_] = (self._length[rows] & np.uint64(0xFFFF_FFFF)) == _FD_FRAME_BYTES
+        return found | self.cut(rows)
 
 
 _rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()

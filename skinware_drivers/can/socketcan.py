@@ -57,6 +57,7 @@ MOST_FILTERS = 512
 """``CAN_RAW_FILTER_MAX`` of linux/can/raw.h."""
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
+_FLAGS_AT = 5  # in struct canfd_frame
 _SMALL_BUFFER = 1 << 17  # it may be full before so many frames wait that C asks for losses
 
 WANTED_BUFFER_BYTES = 8 << 20
@@ -224,6 +225,8 @@ class SocketCanBus(KernelBus):
         new = slice(first, first + count)
         batch.time_ns[new] = self._stamper.read(rows.control[new])
         batch.bus[new] = ordinal
+        if self.tap.is_open:
+            self.tap.keep_rows(batch.wire[new], batch.time_ns[new], rows.are_fd(new))
         kept = self.sort_out(batch, new)
         batch.stop += kept
         self.counters.frames += kept
@@ -242,7 +245,7 @@ class SocketCanBus(KernelBus):
         if self._socket is None or not self.reads_natively:
             return False
         rows = rows_of(batch)
-        source.fd, source.stream = self._socket.fileno(), None
+        source.fd, source.stream, source.tap = self._socket.fileno(), None, self.tap.address
         source.headers, source.control = rows.headers_address, rows.control.ctypes.data
         source.offset_ns, source.last_poll_ns = self._stamper.state
         source.lost_before, source.lost, source.frames = self._lost_before, self.counters.lost, 0
@@ -271,6 +274,9 @@ class SocketCanBus(KernelBus):
             why = f"frame {identifier_text(identifier)} not sent ({error.strerror})"
             raise BusSendError(f"bus {self.channel}: {why}") from None
         self.counters.sent += 1
+        if self.tap.is_open:
+            flags = frame[_FLAGS_AT] if len(payload) > 8 else 0
+            self.tap.keep_frame(now_ns(), identifier, payload, flags=flags, is_sent=True)
 
     def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
         """``struct canfd_frame``, filled up with zeros to the next length that CAN FD has."""

@@ -22,8 +22,12 @@ static bool read_chunk(struct path *path, struct source *source)
             return false;
         }
     }
-    if (total)
-        end_chunk(stream, total, path_time_ns(path));
+    if (total) {
+        int64_t time_ns = path_time_ns(path);
+        if (source->tap)
+            keep_bytes(source->tap, at, total, time_ns);
+        end_chunk(stream, total, time_ns);
+    }
     return total > 0;
 }
 

@@ -133,6 +133,8 @@ bool receive(struct path *path, struct source *source)
         if (n <= 0)
             break;
         stamp(path, source, first, n);
+        if (source->tap)
+            keep_frames(path, source, first, n);
         for (int64_t row = first; row < first + n; row++)
             batch->bus[row] = (uint16_t)source->bus;
         kept = is_usual(path, source, first, n) ? n : path->plan->hooks.sort_out(source->bus, first, n);

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware_drivers.wire_tap import Kept
+
 _WHOLE, _POINTER, _REAL = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
 
 
@@ -253,7 +255,7 @@ class Source(ctypes.Structure):
 
     _fields_ = [
         *_fields("fd bus"),
-        *_fields("stream", _POINTER),
+        *_fields("stream tap", _POINTER),
         *_fields("headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
         *_fields("is_counted is_watched is_small"),
         *_fields("speed_up wire_bits fullest", _REAL),
@@ -277,6 +279,7 @@ SIZES = (
         ctypes.sizeof(each)
         for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source, Framing, Stream)
     ),
+    ctypes.sizeof(Kept),
     UPDATE.itemsize,
 )
 """As ``skinware_path_size`` tells them."""

@@ -35,6 +35,7 @@ from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.places import put_in_place
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.running.serving import Serving
+from skinware_drivers.running.wires import Wires
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -120,6 +121,7 @@ class Runner:
         self._serving = Serving(
             self.lines, listen_only, lambda: self.generation, self._built, self._build, self._tell_ready, self.fail
         )
+        self._wires = Wires(name, self.lines, self._namespace, group)
         self._timer: asyncio.TimerHandle | None = None
         self._flows = False
 
@@ -146,6 +148,7 @@ class Runner:
 
     async def _run(self, loop: asyncio.AbstractEventLoop) -> None:
         self._namespace.create(self._group)
+        self._wires.begin()
         beginning = loop.create_task(self._begin())
         beginning.add_done_callback(self._has_begun)
         try:
@@ -235,6 +238,7 @@ class Runner:
         left_s = max(_LEAST_FOR_CLOSING_S, begun_s + _END_S - loop.time())
         await asyncio.gather(*(line.close(left_s) for line in self.lines))
         self._epoll.close()
+        await self._wires.end()
         if self.writer is not None:
             self.writer.close()
 

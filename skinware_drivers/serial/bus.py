@@ -153,6 +153,7 @@ class SerialBus(KernelBus):
         self._stay_readable(False)  # C asks the stream itself
         self._handed = stream, port
         source.fd, source.stream = self.fileno(), stream.hand_over(port.fileno(), batch)
+        source.tap = self.tap.address
         return True
 
     def take_back(self, source: Source) -> None:  # noqa: ARG002
@@ -220,7 +221,12 @@ class SerialBus(KernelBus):
                 break
             chunk += more
         if chunk:
-            self._stream.add(chunk, now_ns())
+            self._hear(chunk, now_ns())
+
+    def _hear(self, chunk: bytes, time_ns: int) -> None:
+        """What was read at this time."""
+        self.tap.keep_bytes(time_ns, chunk)
+        self._stream.add(chunk, time_ns)
 
     def _tell_garbled(self, time_ns: int) -> None:
         """Whether more was skipped than was good since it was last told, which is to be told now and then."""
@@ -256,6 +262,7 @@ class SerialBus(KernelBus):
             written = port.write(self._unsent)
         except OSError as error:
             raise BusNotAvailable(f"{self!r} went away, perhaps unplugged ({error.strerror or error})") from None
+        self.tap.keep_bytes(now_ns(), self._unsent[:written], is_sent=True)
         self._unsent = self._unsent[written:]
         wanted = select.EPOLLIN | (select.EPOLLOUT if self._unsent else 0)
         with contextlib.suppress(OSError):

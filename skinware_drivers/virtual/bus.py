@@ -168,6 +168,8 @@ class VirtualCanBus(Bus):
             raise
         self.hardware.receive(identifier, payload, self._clock())
         self.counters.sent += 1
+        if self.tap.is_open:
+            self.tap.keep_frame(self._clock(), identifier, payload, is_sent=True)
         self._wake_when_due()
 
     def close(self) -> None:
@@ -204,6 +206,7 @@ class VirtualCanBus(Bus):
             if len(frame.payload) > self.payload_size:
                 self.counters.refused += 1
                 self.samples.note(Unused.REFUSED, frame.identifier, frame.payload)
+                self.tap.keep_frame(*frame)
         self._pending += fitting
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
@@ -214,6 +217,8 @@ class VirtualCanBus(Bus):
         batch.wire[batch.stop : stop] = np.frombuffer(rows, batch.wire.dtype)
         batch.time_ns[batch.stop : stop] = [frame.time_ns for frame in frames]
         batch.bus[batch.stop : stop] = ordinal
+        if self.tap.is_open:
+            self.tap.keep_rows(batch.wire[batch.stop : stop], batch.time_ns[batch.stop : stop])
         batch.stop = stop
 
     def _wake_when_due(self, rest_until_ns: int = _AT_ONCE) -> None:

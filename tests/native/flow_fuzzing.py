@@ -21,6 +21,7 @@ from unittest import mock
 import numpy as np
 
 from skinware.driver_service import DriverWriter
+from skinware.wire import read_pieces
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.can.adapter import CanAdapter
@@ -90,8 +91,18 @@ class _Wire(ABC):
 
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
+        self.bus.tap.open()
         self.sent = 0
         self.is_whole = True
+        self._kept = 0
+
+    def kept(self) -> int:
+        """Frames or bytes that the tap kept so far."""
+        for batch in self.bus.tap.fetch():
+            pieces, is_whole = read_pieces(batch)
+            assert is_whole
+            self._kept += sum(len(piece.data) if piece.frames is None else len(piece.frames) for piece in pieces)
+        return self._kept
 
     @abstractmethod
     def frame(self, identifier: int, payload: bytes) -> bytes:
@@ -146,6 +157,7 @@ class _Can(_Wire):
         counters = self.bus.counters
         counted = counters.frames + counters.errors + counters.refused + counters.lost
         assert counted == self.sent or not self.is_whole, f"{self.sent} datagrams, {counters}"
+        assert self.kept() + self.bus.tap.lost == counted - counters.lost, f"{self._kept} kept, {counters}"
 
     def close(self) -> None:
         self.bus.close()
@@ -178,6 +190,7 @@ class _Line(_Wire):
     def check(self) -> None:
         found = self.bus.counters.framing
         assert found.bytes_in == self.sent or not self.is_whole, f"{self.sent} bytes, {found}"
+        assert self.kept() + self.bus.tap.lost == found.bytes_in, f"{self._kept} bytes kept, {found}"
         assert 0 <= found.frame_bytes + found.idle_bytes + found.skipped_bytes <= found.bytes_in
 
     def close(self) -> None:

@@ -1,0 +1,161 @@
+"""What went over the wires of drivers: frames of CAN buses, and bytes of serial lines.
+
+A message is that of a frame of the driver's service (:mod:`skinware.wire`)::
+
+    header      32 bytes: u8 generation, u8 sequence, i8 published_ns, u8 lost
+    pieces      of one bus
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.memory.ring import Frame
+from skinware.realtime import NS_PER_S
+from skinware.recording.tracks import ChunkSource
+from skinware.wire import read_pieces
+
+_HEADER = struct.Struct("<QQqQ")
+"""Generation and sequence of the frame, when it was published, how much of the bus was lost so far."""
+_LATEST_S = 1.0
+"""What goes over a wire is published so soon."""
+
+FRAME = np.dtype(
+    [
+        ("time_ns", "<i8"),
+        ("epoch_ns", "<i8"),
+        ("identifier", "<u4"),
+        ("length", "u1"),
+        ("flags", "u1"),
+        ("is_sent", "?"),
+        ("payload", "u1", (64,)),
+    ]
+)
+"""A CAN frame; the columns are those of :class:`WirePiece` and ``skinware.wire.ROWS``."""
+
+
+def message_of(frame: Frame) -> bytes:
+    """The message of a frame of a driver's wire service."""
+    used = int(frame.column("used")[()])
+    header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("lost")[()]))
+    return header + frame.column("pieces")[:used].tobytes()
+
+
+class WirePiece(NamedTuple):
+    """Frames of a CAN bus, or bytes of a serial line, that came or were sent together.
+
+    Attributes:
+        is_sent: by the driver, not received.
+        time_ns: (n,) int64, CLOCK_MONOTONIC, of each frame; (1,) of bytes.
+        epoch_ns: the same times, ns since 1970.
+        frames: (n,) of ``skinware.wire.ROWS``; None of bytes.
+        data: the bytes; empty of frames.
+    """
+
+    is_sent: bool
+    time_ns: npt.NDArray[np.int64]
+    epoch_ns: npt.NDArray[np.int64]
+    frames: npt.NDArray[np.void] | None
+    data: bytes
+
+
+class WireTrack:
+    """What went over one bus of a driver, as the driver received it, and what it sent.
+
+    Args:
+        recording: where it is.
+        driver: name of the driver.
+        bus: name of the bus.
+        channel: number of its channel.
+
+    Attributes:
+        driver, bus: as above.
+    """
+
+    def __init__(self, recording: ChunkSource, driver: str, bus: str, channel: int) -> None:
+        self._recording = recording
+        self.driver: str = driver
+        self.bus: str = bus
+        self.channel: int = channel
+
+    @property
+    def lost(self) -> int:
+        """Frames, or bytes, that the driver had no room for, as far as is recorded.
+
+        What was lost before the driver got it is counted in the frames of the driver (``bus_counters``).
+        """
+        lost: dict[int, int] = {}
+        for generation, count, _, _ in self._batches(0.0, None):
+            lost[generation] = max(lost.get(generation, 0), count)
+        return sum(lost.values())
+
+    def pieces(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WirePiece]:
+        """Everything, as it came; what is damaged is left out, and said in the recording's ``problems``.
+
+        Args:
+            start_s: where to begin, s since the recording began.
+            end_s: where to end, likewise; default: with the last.
+        """
+        first_ns = self._recording.start_ns + round(start_s * NS_PER_S) if start_s else None
+        end_ns = None if end_s is None else self._recording.start_ns + round(end_s * NS_PER_S)
+        for _, _, offset_ns, data in self._batches(start_s, end_s):
+            pieces, is_whole = read_pieces(data)
+            if not is_whole:
+                self._recording.note(f"wire of {self.bus}: damaged frames or bytes left out")
+            for piece in pieces:
+                epoch_ns = piece.time_ns + offset_ns
+                wanted = np.ones(len(epoch_ns), bool)
+                if first_ns is not None:
+                    wanted &= epoch_ns >= first_ns
+                if end_ns is not None:
+                    wanted &= epoch_ns < end_ns
+                if wanted.all():
+                    yield WirePiece(piece.is_sent, piece.time_ns, epoch_ns, piece.frames, piece.data)
+                elif piece.frames is not None and wanted.any():
+                    frames = piece.frames[wanted]
+                    yield WirePiece(piece.is_sent, piece.time_ns[wanted], epoch_ns[wanted], frames, b"")
+
+    def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> npt.NDArray[np.void]:
+        """(n,) of :data:`FRAME`: all frames of a CAN bus by time; none of a serial line.
+
+        Args:
+            start_s: as for :meth:`pieces`.
+            end_s: likewise.
+        """
+        found = [np.zeros(0, FRAME)]
+        for piece in self.pieces(start_s=start_s, end_s=end_s):
+            if piece.frames is None:
+                continue
+            rows = np.zeros(len(piece.frames), FRAME)
+            rows["time_ns"], rows["epoch_ns"], rows["is_sent"] = piece.time_ns, piece.epoch_ns, piece.is_sent
+            for name in ("identifier", "length", "flags"):
+                rows[name] = piece.frames[name]
+            payload = piece.frames["payload"]
+            rows["payload"][:, : payload.shape[1]] = payload
+            found.append(rows)
+        frames = np.concatenate(found)
+        return frames[np.argsort(frames["time_ns"], kind="stable")]
+
+    def _batches(self, start_s: float, end_s: float | None) -> Iterator[tuple[int, int, int, memoryview]]:
+        """(generation, lost so far, what makes CLOCK_MONOTONIC ns since 1970, pieces) of every message."""
+        until_s = None if end_s is None else end_s + _LATEST_S
+        for contents in self._recording.chunks({self.channel}, start_s, until_s):
+            for message in contents.messages:
+                if message.channel_id != self.channel:
+                    continue
+                if len(message.data) < _HEADER.size:
+                    self._recording.note(f"wire of {self.bus}: a message is shorter than its header")
+                    continue
+                generation, _, published_ns, lost = _HEADER.unpack_from(message.data)
+                yield generation, lost, message.time_ns - published_ns, message.data[_HEADER.size :]
+
+    def __repr__(self) -> str:
+        return f"<WireTrack of {self.bus!r} of {self.driver!r}>"
+
+
+__all__ = ["FRAME", "WirePiece", "WireTrack", "message_of"]

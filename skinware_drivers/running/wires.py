@@ -1,0 +1,127 @@
+"""What goes over the wires of a driver, published while somebody wants it: ``skin-record --wire``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+
+from skinware import wire
+from skinware.errors import SkinwareError
+from skinware.memory.announcement import is_wished
+from skinware.memory.namespace import Namespace
+from skinware.realtime import now_ns
+from skinware.service import ServiceWriter
+from skinware_drivers.running.bus_line import BusLine
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_BEGINNING_S = 0.3
+"""What the driver and its devices say to each other at first is kept so long, in case that somebody wants it."""
+_LOOK_S = 0.5
+"""Between two looks whether somebody does."""
+_TURN_S = 0.05
+_SLOTS = 64
+
+
+class Wires:
+    """The service with the wires of a driver. A frame of it has what went over one bus since the one before.
+
+    Args:
+        name: of the driver.
+        lines: its buses; the list may change.
+        namespace, group: as of the driver.
+    """
+
+    def __init__(self, name: str, lines: Sequence[BusLine], namespace: Namespace, group: str | None) -> None:
+        self._name, self._lines, self._namespace, self._group = name, lines, namespace, group
+        self._writer: ServiceWriter | None = None
+        self._buses: tuple[str, ...] = ()
+        self._task: asyncio.Task[None] | None = None
+
+    def begin(self) -> None:
+        """Begin to keep what goes over the wires, before there is anything; in the running loop."""
+        self._open_taps()
+        self._task = asyncio.get_running_loop().create_task(self._serve())
+
+    async def end(self) -> None:
+        """Publish the rest, if somebody wants it, and withdraw the service. Idempotent."""
+        if self._task is None:
+            return
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        self._task = None
+        try:
+            if self._writer is not None or is_wished(self._namespace, wire.WISH):
+                self._publish()
+        except (SkinwareError, OSError) as error:
+            self._tell_trouble(error)
+        self._withdraw()
+
+    async def _serve(self) -> None:
+        await asyncio.sleep(_BEGINNING_S)
+        try:
+            while True:
+                if is_wished(self._namespace, wire.WISH):
+                    await self._publish_for_a_while()
+                else:
+                    self._withdraw()
+                    await asyncio.sleep(_LOOK_S)
+        except (SkinwareError, OSError) as error:  # the driver goes on
+            self._tell_trouble(error)
+            self._withdraw()
+
+    async def _publish_for_a_while(self) -> None:
+        self._open_taps()
+        for _ in range(round(_LOOK_S / _TURN_S)):
+            self._publish()
+            await asyncio.sleep(_TURN_S)
+
+    def _publish(self) -> None:
+        writer = self._writer_for(tuple(line.name for line in self._lines))
+        for line in self._lines:
+            for batch in line.bus.tap.fetch():
+                columns = writer.begin()
+                columns["bus"][()], columns["used"][()] = line.ordinal, len(batch)
+                columns["lost"][()] = line.bus.tap.lost
+                columns["pieces"][: len(batch)] = np.frombuffer(batch, np.uint8)
+                writer.commit(now_ns())
+
+    def _writer_for(self, buses: tuple[str, ...]) -> ServiceWriter:
+        static = {
+            "driver": np.array([self._name.encode()]),
+            "bus_name": np.array([name.encode() for name in buses]),
+        }
+        rate_hz = len(buses) / _TURN_S
+        if self._writer is None:
+            self._writer = ServiceWriter(
+                wire.service_name(self._name),
+                wire.COLUMNS,
+                static,
+                namespace=self._namespace,
+                kind=wire.KIND,
+                slots=_SLOTS,
+                rate_hz=rate_hz,
+                group=self._group,
+                description=f"what goes over the wires of {self._name}",
+            )
+        elif buses != self._buses:
+            self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
+        self._buses = buses
+        return self._writer
+
+    def _open_taps(self) -> None:
+        for line in self._lines:
+            line.bus.tap.open()
+
+    def _withdraw(self) -> None:
+        for line in self._lines:
+            line.bus.tap.close()
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
+
+    def _tell_trouble(self, error: Exception) -> None:
+        log.warning("what goes over the wires of %s is not published: %s", self._name, error)

@@ -1,0 +1,169 @@
+"""Keeps what goes over a wire, while somebody wants it, until it is fetched. C puts things in, too."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.wire import (
+    BATCH_BYTES,
+    BYTES,
+    CLASSIC,
+    FD,
+    IS_CUT,
+    IS_FD,
+    MOST_BYTES,
+    MOST_FRAMES,
+    PIECE,
+    ROWS,
+    size_of,
+)
+
+_ROOM = 1 << 20
+"""Bytes that wait to be fetched."""
+_CLASSIC_PAYLOAD, _FD_PAYLOAD = 8, 64
+_PLACES = np.arange(_FD_PAYLOAD)
+_SIZE = PIECE.fields["size"][1] if PIECE.fields is not None else 0
+
+
+class Kept(ctypes.Structure):
+    """``struct tap``: what is kept, and how much had no room."""
+
+    _fields_ = [
+        ("bytes", ctypes.c_void_p),
+        ("room", ctypes.c_int64),
+        ("size", ctypes.c_int64),
+        ("lost", ctypes.c_int64),
+    ]
+
+
+class WireTap:
+    """What goes over one wire, as pieces (:mod:`skinware.wire`). Closed at first: nothing is kept."""
+
+    def __init__(self) -> None:
+        self._kept = Kept()
+        self._memory: npt.NDArray[np.uint8] | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether things are kept."""
+        return self._memory is not None
+
+    @property
+    def address(self) -> int:
+        """Of the ``struct tap``, for C; 0 while closed."""
+        return 0 if self._memory is None else ctypes.addressof(self._kept)
+
+    @property
+    def lost(self) -> int:
+        """Frames, or bytes, for which there was no room since it was opened."""
+        return int(self._kept.lost)
+
+    def open(self) -> None:
+        """Keep what comes from now on. Idempotent."""
+        if self._memory is None:
+            self._memory = np.zeros(_ROOM, np.uint8)
+            self._kept = Kept(self._memory.ctypes.data, _ROOM, 0, 0)
+
+    def close(self) -> None:
+        """Keep nothing, and forget what was kept. Idempotent."""
+        self._memory = None
+        self._kept = Kept()
+
+    def fetch(self) -> Iterator[memoryview]:
+        """What was kept, in batches of at most ``BATCH_BYTES``, and forgotten then: to be copied at once."""
+        if self._memory is None:
+            return
+        data, begin, end = self._memory[: self._kept.size].data, 0, 0
+        while end < len(data):
+            size = int.from_bytes(data[end + _SIZE : end + _SIZE + 4], "little")
+            if end + size - begin > BATCH_BYTES:
+                yield data[begin:end]
+                begin = end
+            end += size
+        if end > begin:
+            yield data[begin:end]
+        self._kept.size = 0
+
+    def keep_rows(
+        self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], is_fd: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        """Keep frames of a batch; none of one with longer frames than CAN has.
+
+        Args:
+            wire: (n,) of :func:`skinware_drivers.bus.wire_dtype`.
+            time_ns: (n,) int64.
+            is_fd: (n,) bool, which are CAN FD, where their flags need not say so.
+        """
+        known = wire.dtype["payload"].shape[0]
+        if known > _FD_PAYLOAD:
+            return
+        form = CLASSIC if known == _CLASSIC_PAYLOAD else FD
+        for begin in range(0, len(wire), MOST_FRAMES):
+            some = slice(begin, begin + MOST_FRAMES)
+            count = len(wire[some])
+            into = self._begin(form, count, False)
+            if into is None:
+                continue
+            into[: 8 * count].view("<i8")[:] = time_ns[some]
+            rows = into[8 * count :].view(ROWS[form])
+            for name in ("identifier", "length", "flags"):
+                rows[name] = wire[name][some]
+            rows["payload"][:, :known] = wire["payload"][some]
+            if is_fd is not None:
+                rows["flags"][is_fd[some]] |= IS_FD
+            rows["flags"][rows["length"] > known] |= IS_CUT
+            rows["length"] = np.minimum(rows["length"], known)
+            # behind a short frame there is what was there before
+            rows["payload"][_PLACES[: rows["payload"].shape[1]] >= rows["length"][:, np.newaxis]] = 0
+            rows["reserved"] = 0
+
+    def keep_frame(
+        self, time_ns: int, identifier: int, payload: bytes, *, flags: int = 0, is_sent: bool = False
+    ) -> None:
+        """Keep one CAN frame; none that is longer than CAN has them.
+
+        Args:
+            time_ns: when it was received or sent.
+            identifier: with the flags of linux/can.h.
+            payload: of it.
+            flags: of CAN FD; with more than 8 bytes it always is FD.
+            is_sent: by the driver.
+        """
+        form = CLASSIC if len(payload) <= _CLASSIC_PAYLOAD else FD
+        into = self._begin(form, 1, is_sent) if len(payload) <= _FD_PAYLOAD else None
+        if into is not None:
+            into[:8].view("<i8")[0] = time_ns
+            rows = into[8:].view(ROWS[form])
+            padded = payload.ljust(_CLASSIC_PAYLOAD if form == CLASSIC else _FD_PAYLOAD, b"\0")
+            flags = flags | IS_FD if form == FD else flags
+            rows[0] = (identifier, len(payload), flags, 0, np.frombuffer(padded, np.uint8))
+
+    def keep_bytes(self, time_ns: int, data: bytes, *, is_sent: bool = False) -> None:
+        """Keep bytes of a serial line that were read, or written, together."""
+        for begin in range(0, len(data), MOST_BYTES):
+            some = data[begin : begin + MOST_BYTES]
+            into = self._begin(BYTES, len(some), is_sent)
+            if into is not None:
+                into[:8].view("<i8")[0] = time_ns
+                into[8:] = np.frombuffer(some.ljust(len(into) - 8, b"\0"), np.uint8)
+
+    def _begin(self, form: int, count: int, is_sent: bool) -> npt.NDArray[np.uint8] | None:
+        """Begin a piece: where its times and contents go; None if nothing is kept, or there is no room."""
+        if self._memory is None:
+            return None
+        kept, size = self._kept, size_of(form, count)
+        begin = int(kept.size)
+        if begin + size > kept.room:
+            kept.lost += count
+            return None
+        kept.size = begin + size
+        head = self._memory[begin : begin + PIECE.itemsize].view(PIECE)
+        head[0] = (size, count, form, is_sent, np.zeros(6, np.uint8))
+        return self._memory[begin + PIECE.itemsize : begin + size]
+
+
+__all__ = ["Kept", "WireTap"]

@@ -175,6 +175,7 @@ class Bus(ABC):
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
+        device_end: class of the end at which emulated devices are; None: both ends are alike.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
         narrows: it can leave out frames that nobody wants, see ``narrow``.
@@ -198,6 +199,7 @@ class Bus(ABC):
 
     medium: ClassVar[str | None] = None
     opens_slowly: ClassVar[bool] = False
+    device_end: ClassVar[type[Bus] | None] = None
 
     def __init__(
         self,

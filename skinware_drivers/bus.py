@@ -176,6 +176,7 @@ class Bus(ABC):
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
+        device_end: class of the end at which emulated devices are; None: both ends are alike.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
         tap: what goes over the wire, in both directions, as long as somebody wants it.
@@ -200,6 +201,7 @@ class Bus(ABC):
 
     medium: ClassVar[str | None] = None
     opens_slowly: ClassVar[bool] = False
+    device_end: ClassVar[type[Bus] | None] = None
 
     def __init__(
         self,

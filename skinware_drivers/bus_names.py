@@ -14,6 +14,8 @@ _PLACING: dict[str, dict[str, str]] = {
     "socketcand": {"host": "", "port": ""},
 }
 """By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
+NETWORKS = ("tcp", "udp")
+"""Interfaces of serial devices that are reached over a network."""
 
 
 class BusName(NamedTuple):
@@ -37,7 +39,8 @@ def parse_bus_name(name: str) -> BusName:
     """Take a bus' name apart.
 
     ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
-    (``/dev/ttyUSB0``, ``./port``), is a serial port; pyserial's URLs (``socket://host:port``) are serial, too.
+    (``/dev/ttyUSB0``, ``./port``), is a serial port; ``tcp://HOST:PORT`` and ``udp://HOST:PORT`` are streams over a
+    network. pyserial's URLs (``rfc2217://host:port``) are serial, too.
     python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:
@@ -53,6 +56,11 @@ def parse_bus_name(name: str) -> BusName:
     except ValueError:
         raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
     return BusName(*_split(address), options)
+
+
+def is_over_network(name: str) -> bool:
+    """Whether a bus' name means a serial device that is reached over a network."""
+    return _split(name.partition("?")[0])[0] in NETWORKS
 
 
 def place_of_bus(name: str) -> BusPlace:
@@ -72,6 +80,8 @@ def place_of_bus(name: str) -> BusPlace:
 def _split(address: str) -> tuple[str, str]:
     """Interface and channel."""
     interface, colon, channel = address.partition(":")
+    if interface in NETWORKS and channel.startswith("//"):
+        return interface, channel[2:]
     if "/" in interface or channel.startswith("//"):  # a path, or one of pyserial's URLs
         return "serial", address
     if colon:

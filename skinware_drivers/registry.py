@@ -18,7 +18,14 @@ DEFAULT_DRIVER = "roboskin"
 _DRIVER = Kind("driver", DRIVERS, "CanAdapter", lambda found: issubclass(found, Adapter))
 
 
-def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, driver: str = DEFAULT_DRIVER) -> Bus:
+def make_bus(
+    name: str,
+    *,
+    payload_size: int = 8,
+    listen_only: bool = False,
+    driver: str = DEFAULT_DRIVER,
+    for_devices: bool = False,
+) -> Bus:
     """The bus of a name, not opened yet.
 
     Args:
@@ -26,6 +33,7 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
         payload_size: longest payload that the layout knows.
         listen_only: refuse to send.
         driver: whose devices the bus ``virtual`` emulates, if its name does not say; registered, or a file.
+        for_devices: the end at which emulated devices are, where that is another.
 
     Raises:
         ConfigurationError: no such interface, or a bad option.
@@ -36,6 +44,8 @@ def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, dri
     transports = {entry.name: entry for entry in entry_points(group=TRANSPORTS)}
     if interface in transports:
         bus_class = transports[interface].load()
+        if for_devices:
+            bus_class = getattr(bus_class, "device_end", None) or bus_class
         bus: Bus = bus_class(channel, options, payload_size=payload_size, listen_only=listen_only)
         return bus
     import can

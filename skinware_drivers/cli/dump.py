@@ -11,12 +11,13 @@ import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, print_json, run, warn
 from skinware.cli.dump import command as frames_command
+from skinware_drivers.bus_names import NETWORKS
 
 if TYPE_CHECKING:
     from skinware_drivers.bus import Bus, FrameBatch
 
 _CAN_PAYLOAD = 64
-_SERIAL = ("serial", "pty")
+_SERIAL = ("serial", "pty", *NETWORKS)
 _SHARED = ("socketcan", "udp_multicast", "virtual")
 """Interfaces on which a second listener takes nothing away from the first."""
 _OF_DRIVERS = {"name": "NAME", "type_name": "--type", "rate_hz": "--rate", "counts": "--counts"}
@@ -84,7 +85,7 @@ def _refuse_what_has_one_owner(bus_name: str, interface: str) -> None:
 
     if interface in _SERIAL:
         raise ConfigurationError(
-            f"{bus_name}: a serial port has one owner, so no other program can listen; to see the data of its driver:"
+            f"{bus_name}: a serial line has one owner, so no other program can listen; to see the data of its driver:"
             " skin-dump NAME"
         )
     owner = None if interface in _SHARED else driver_on(bus_name, running_drivers())

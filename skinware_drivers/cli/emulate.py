@@ -45,6 +45,7 @@ class EmulateCommand(HardwareCommand):
         "skin-emulate --bus vcan0 --boards 7,8                  ROBOSKIN boards",
         "skin-emulate --bus vcan0 --lose 0.01 --restart 7       with faults",
         "skin-emulate --driver openpatch --bus pty:/tmp/skin    on a serial line",
+        "skin-emulate --driver skintalk --bus tcp://:5000       to be called over TCP",
         "skin-emulate --driver xela --help                      options of another",
     ),
 )
@@ -106,9 +107,10 @@ def command(
     given = {name: text for name, text in hardware_options.items() if text is not None}
     options = options_from_strings(emulator.Options, given)
     medium = medium_of(emulator)
-    bus = make_bus(bus_name, payload_size=getattr(emulator, "payload_size", _LONGEST_COMMAND[medium]))
+    longest = getattr(emulator, "payload_size", _LONGEST_COMMAND[medium])
+    bus = make_bus(bus_name, payload_size=longest, for_devices=True)
     if not bus.fits(medium):
-        such_as = "vcan0 or can0" if medium == "can" else "pty:./port, or a port that is there"
+        such_as = "vcan0 or can0" if medium == "can" else "pty:./port, a port that is there, or tcp://127.0.0.1:5000"
         raise ConfigurationError(
             f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"
         )

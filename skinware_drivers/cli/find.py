@@ -96,6 +96,7 @@ async def look(
         ConfigurationError: one of ``driver_names`` is not there.
     """
     from skinware.errors import BusNotAvailable
+    from skinware_drivers.bus_names import is_over_network
     from skinware_drivers.finding.adapters import Detection, detect_adapters
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import can_interfaces
@@ -105,7 +106,8 @@ async def look(
     drivers = known_drivers("can", driver_names)
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
-    buses_to_hear = [one.name for one in interfaces if one.up] + others
+    buses_to_hear = [one.name for one in interfaces if one.up]
+    buses_to_hear += [name for name in others if not is_over_network(name)]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
     detection: Detection
     detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
@@ -113,7 +115,8 @@ async def look(
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
         raise BusNotAvailable(problems[0])
-    answers = await _ask(heard, ports, running, force, driver_names) if probe else {}
+    networks = [name for name in others if is_over_network(name)]
+    answers = await _ask(heard, ports, networks, running, force, driver_names) if probe else {}
     return {
         "can": _can_data(interfaces, heard, answers, running, whole=not buses),
         "buses": [_heard_data(name, heard, answers, running) for name in others],
@@ -153,6 +156,7 @@ def _chosen(
 async def _ask(
     heard: dict[str, HeardOnBus],
     ports: list[SerialPort],
+    networks: list[str],
     running: list[RunningDriver],
     force: bool,
     driver_names: tuple[str, ...],
@@ -167,6 +171,10 @@ async def _ask(
         answers[name] = await ask(
             one, known_drivers("can", driver_names), force=force, owner="" if owner is None else str(owner)
         )
+    for name in networks:
+        owner = driver_on(name, running)
+        refused = Answer(name, refused=f"{owner} has it")
+        answers[name] = refused if owner else await ask_port(name, known_drivers("serial", driver_names))
     for port in ports:
         owner = driver_on(port.path, running)
         users = [f"{user.program} (pid {user.pid})" for user in port.users]

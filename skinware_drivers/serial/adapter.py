@@ -53,7 +53,7 @@ class SerialAdapter(Adapter[OptionsT]):
 
     def wire_s(self, poll: Poll) -> float:
         """Question, and the shortest answer that has data; 10 bits a byte."""
-        if self._line is None:
+        if self._line is None or not self._line.baudrate:
             return 0.0
         size = _size(self.commands or self.framing, poll.identifier, poll.payload)
         if (answer := poll.answer) is not None:

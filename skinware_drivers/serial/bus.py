@@ -23,7 +23,6 @@ from skinware_drivers.serial.ports import DescriptorPort, Port, PtyPort
 from skinware_drivers.serial.stream import CHUNK, Stream
 
 _MORE_WAITS = 2048  # a read that gave so much is followed by another
-_MOST_UNSENT = 1 << 16
 _SPAN_NS = NS_PER_S
 """What was skipped is held against what was good so often."""
 
@@ -237,12 +236,12 @@ class SerialBus(KernelBus):
         self._told, self._told_ns = replace(now), time_ns
 
     def _send(self, identifier: int, payload: bytes) -> None:
-        self.may_send_by(self._port)
+        port = self.may_send_by(self._port)
         try:
             data = self._commands.encode(identifier, payload)
         except ValueError as error:
             raise BusSendError(f"{self!r}: {error}") from None
-        if len(self._unsent) + len(data) > _MOST_UNSENT:
+        if self._unsent and len(self._unsent) + len(data) > port.longest_wait:
             raise BusSendError(f"{self!r}: the port takes nothing any more ({len(self._unsent)} bytes wait)")
         waited = bool(self._unsent)
         self._unsent += data

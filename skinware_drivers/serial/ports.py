@@ -29,9 +29,11 @@ class Port(ABC):
 
     Attributes:
         note: what a person should know about it.
+        longest_wait: bytes that may wait until it takes them. 0: what is written at once stays one piece.
     """
 
     note = ""
+    longest_wait = 1 << 16
 
     @abstractmethod
     def fileno(self) -> int:

@@ -299,7 +299,7 @@ def test_signals_wake_the_wait_and_handlers_are_put_back(number: signal.Signals)
 def host_buses(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[HostBus]]:
     made: list[HostBus] = []
 
-    def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False) -> Bus:
+    def make_bus(name: str, *, payload_size: int = 8, listen_only: bool = False, for_devices: bool = False) -> Bus:
         if name == "nonsense":
             raise ConfigurationError("no such bus")
         bus = HostBus(name, payload_size=payload_size, listen_only=listen_only)

@@ -1,0 +1,256 @@
+"""A stream of bytes over TCP as a bus; what is in it is found by the framings of serial lines.
+
+A connection that the other end closes is lost as a serial port is when it is unplugged, and is opened again with the
+same pauses. One whose other end has gone without a word (its plug was pulled, its cable cut) is noticed because the
+kernel asks it now and then whether it is still there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+from typing import Annotated, ClassVar
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import BusNotAvailable
+from skinware_drivers.bus import Bus
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import DescriptorPort, Port
+from skinware_drivers.streams.address import Address, parse_address, unknown_name
+
+_CONNECTING_S = 5.0
+_WAITING_CALLERS = 4
+
+
+class TcpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a bus over TCP."""
+
+    patience_s: Annotated[
+        int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
+    ] = 5
+
+
+class TcpPort(DescriptorPort):
+    """A connection.
+
+    Args:
+        name: for messages.
+        connection: stays the owner of the descriptor.
+        patience_s: seconds without a sign of the other end until it is given up.
+    """
+
+    def __init__(self, name: str, connection: socket.socket, patience_s: int) -> None:
+        super().__init__(name, connection)
+        keep_alive(connection, patience_s)
+
+    def gone(self, number: int) -> BusNotAvailable:
+        """What an error of the system means; 0: the other end has closed the connection."""
+        why = os.strerror(number) if number else "closed by the other end"
+        return BusNotAvailable(f"{self._name}: the connection is lost ({why})")
+
+
+class ListeningPort(Port):
+    """The device's end: waits to be called, by one at a time. Others are hung up on while the first is there.
+
+    What is written while nobody is connected is for nobody, as on a line that nobody listens to.
+
+    Args:
+        address: at which it listens; port 0: any that is free, which ``note`` tells.
+        patience_s: seconds without a sign of the caller until it is given up.
+
+    Raises:
+        BusNotAvailable: it cannot listen there.
+    """
+
+    def __init__(self, address: Address, patience_s: int) -> None:
+        self._patience_s = patience_s
+        family, numbers = address.resolve(socket.SOCK_STREAM)
+        try:
+            self._listener = socket.create_server(numbers, family=family, backlog=_WAITING_CALLERS)
+        except OSError as error:
+            raise BusNotAvailable(f"cannot listen on {address}: {error.strerror or error}") from None
+        self._listener.setblocking(False)
+        self._epoll = select.epoll()
+        self._epoll.register(self._listener, select.EPOLLIN)
+        self._caller: socket.socket | None = None
+        self.address = Address(*self._listener.getsockname()[:2])
+        self.note: str = f"listens on {self.address}"
+
+    def fileno(self) -> int:
+        """An epoll's descriptor."""
+        return self._epoll.fileno()
+
+    def read(self, size: int) -> bytes:
+        """What the caller has sent."""
+        self._answer_callers()
+        if self._caller is None:
+            return b""
+        try:
+            data = self._caller.recv(size)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            data = b""
+        if not data:
+            self._hang_up()
+        return data
+
+    def write(self, data: bytes) -> int:
+        """What fits into the kernel's buffer."""
+        if self._caller is None:
+            return len(data)
+        try:
+            written = self._caller.send(data)
+        except BlockingIOError:
+            written = 0
+        except OSError:
+            self._hang_up()
+            return len(data)
+        more = select.EPOLLOUT if written < len(data) else 0
+        self._epoll.modify(self._caller, select.EPOLLIN | more)  # which makes the epoll's own descriptor readable
+        return written
+
+    def close(self) -> None:
+        """Hang up, and listen no more."""
+        self._hang_up()
+        self._epoll.close()
+        self._listener.close()
+
+    def _answer_callers(self) -> None:
+        while True:
+            try:
+                caller, _ = self._listener.accept()
+            except (BlockingIOError, ConnectionError):
+                return
+            if self._caller is not None and _has_gone(self._caller):
+                self._hang_up()
+            if self._caller is not None:
+                caller.close()
+                continue
+            caller.setblocking(False)
+            keep_alive(caller, self._patience_s)
+            self._epoll.register(caller, select.EPOLLIN)
+            self._caller = caller
+
+    def _hang_up(self) -> None:
+        if self._caller is not None:
+            with contextlib.suppress(OSError):
+                self._epoll.unregister(self._caller)
+            self._caller.close()
+            self._caller = None
+
+
+class TcpServerBus(SerialBus):
+    """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
+
+    ``note`` tells where it listens.
+
+    Raises:
+        ConfigurationError: no such address, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        self._address = parse_address("tcp", channel, needs_host=False)
+        self._options = options_from_strings(TcpOptions, options or {})
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus tcp://{self.channel}"
+
+    @property
+    def baudrate(self) -> int:
+        """0: a network has none."""
+        return 0
+
+    def _open_port(self) -> Port:
+        return ListeningPort(self._address, self._options.patience_s)
+
+
+class TcpBus(SerialBus):
+    """A connection to a device, or to a converter of serial lines. Its name is ``tcp://HOST:PORT?key=value``.
+
+    Args:
+        channel: ``HOST:PORT``; an IPv6 address stands in brackets.
+        options: see :class:`TcpOptions`.
+        payload_size: longest body that fits into a batch.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        ConfigurationError: no such address, or an option is unknown or has a bad value.
+    """
+
+    device_end: ClassVar[type[Bus] | None] = TcpServerBus
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        self._address = parse_address("tcp", channel)
+        self._options = options_from_strings(TcpOptions, options or {})
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus tcp://{self.channel}"
+
+    @property
+    def baudrate(self) -> int:
+        """0: a network has none."""
+        return 0
+
+    def _open_port(self) -> Port:
+        return TcpPort(f"tcp://{self._address}", connect(self._address), self._options.patience_s)
+
+
+def connect(address: Address) -> socket.socket:
+    """Call a device; blocks for seconds if it does not answer.
+
+    Raises:
+        BusNotAvailable: its name is not known, it does not answer, or nobody listens at that port.
+    """
+    where = f"tcp://{address}"
+    try:
+        connection = socket.create_connection(address, _CONNECTING_S)
+    except socket.gaierror as error:
+        raise unknown_name(address, error) from None
+    except ConnectionRefusedError:
+        raise BusNotAvailable(f"{where}: the host is there, but nothing listens at this port") from None
+    except TimeoutError:
+        raise BusNotAvailable(f"{where}: no answer within {_CONNECTING_S:g} s") from None
+    except OSError as error:
+        raise BusNotAvailable(f"{where}: {error.strerror or error}") from None
+    if connection.getsockname() == connection.getpeername():  # a local port nobody listens at, and we happened to get
+        connection.close()
+        raise BusNotAvailable(f"{where}: nothing listens at this port")
+    return connection
+
+
+def keep_alive(connection: socket.socket, patience_s: int) -> None:
+    """Send what is written at once, and have the kernel give up another end of which there is no sign for so long."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, patience_s // 2))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, patience_s)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * patience_s)
+
+
+def _has_gone(connection: socket.socket) -> bool:
+    try:
+        return not connection.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+__all__ = ["ListeningPort", "TcpBus", "TcpOptions", "TcpPort", "TcpServerBus", "connect", "keep_alive"]

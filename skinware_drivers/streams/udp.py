@@ -1,0 +1,196 @@
+"""Datagrams as a bus: what is in each is found by the framings of serial lines, or is a frame as it is.
+
+Who sends is known from the address, and only one is heard. The network may lose datagrams, and may bring them in
+another order: where a protocol numbers its frames, its layout says so, and what is lost is counted.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.serial.stream import CHUNK
+from skinware_drivers.streams.address import Address, parse_address
+
+_RECEIVE_BUFFER = 1 << 20
+_MOST_DATAGRAMS = 512
+"""Datagrams of a take, before other buses have their turn."""
+_SILENT_NS = 2 * NS_PER_S
+_ANY_HOST = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
+
+
+class UdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a bus over UDP."""
+
+    local: Annotated[
+        Annotated[int, Meta(ge=1, le=65535)] | None,
+        Meta(description="port of this computer, for devices that send to a certain one; default: any that is free"),
+    ] = None
+
+
+class UdpPort(Port):
+    """A socket for datagrams, and the one other end that is heard.
+
+    Args:
+        address: with a host: of the other end; without: the port of this computer, to which one will speak.
+        local: port of this computer, if the other end is given.
+
+    Attributes:
+        foreign: datagrams of others, which were dropped.
+        peer: the other end; None: nobody has spoken yet.
+
+    Raises:
+        BusNotAvailable: the name of the host is not known, or the port is taken.
+    """
+
+    longest_wait = 0
+
+    def __init__(self, address: Address, local: int | None = None) -> None:
+        self.foreign = 0
+        self.peer: tuple[str, int] | None = None
+        self._may_change = not address.host
+        self._heard_ns = -_SILENT_NS
+        family = socket.AF_INET
+        if address.host:
+            family, self.peer = address.resolve(socket.SOCK_DGRAM)
+        port = (local or 0) if address.host else address.port
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        try:
+            self._socket.bind((_ANY_HOST[family], port))
+        except OSError as error:
+            self._socket.close()
+            raise BusNotAvailable(f"udp port {port} of this computer: {error.strerror or error}") from None
+        if not address.host and not port:
+            self.note = f"port {self._socket.getsockname()[1]} of this computer"
+
+    def fileno(self) -> int:
+        """The socket's descriptor."""
+        return self._socket.fileno()
+
+    def read(self, size: int) -> bytes:
+        """The next datagram of the other end; none if there is none. Empty ones do not count.
+
+        Raises:
+            BusNotAvailable: the socket cannot be used any more.
+        """
+        while True:
+            try:
+                data, sender = self._socket.recvfrom(size)
+            except BlockingIOError:
+                return b""
+            except OSError as error:
+                raise BusNotAvailable(f"udp: {os.strerror(error.errno or 0)}") from None
+            if not self._is_heard(sender[:2]):
+                self.foreign += 1
+            elif data:
+                return data
+
+    def write(self, data: bytes) -> int:
+        """Send one datagram; while nobody has spoken yet, it is for nobody."""
+        if self.peer is None:
+            return len(data)
+        try:
+            return self._socket.sendto(data, self.peer)
+        except BlockingIOError:
+            return 0
+        except ConnectionRefusedError:  # of a datagram before
+            return self._socket.sendto(data, self.peer)
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._socket.close()
+
+    def _is_heard(self, sender: tuple[str, int]) -> bool:
+        """Where the other end is not given it is who speaks first; another one only after a silence of two seconds."""
+        time_ns = now_ns()
+        if self._may_change and sender != self.peer and time_ns - self._heard_ns > _SILENT_NS:
+            self.peer = sender
+        if sender == self.peer:
+            self._heard_ns = time_ns
+        return sender == self.peer
+
+
+class UdpBus(SerialBus):
+    """Datagrams to and from one other end. Its name is ``udp://HOST:PORT`` or ``udp://:PORT``, with ``?key=value``.
+
+    With a host: what is sent goes there, and only what comes from there (that host and port) is received. Without one,
+    PORT is that of this computer, and the other end is who speaks first. Datagrams of others are counted as refused.
+
+    A framing finds frames in what datagrams contain one after the other, as converters of serial lines send it. With
+    ``Unframed`` each datagram is a frame.
+
+    Args:
+        channel: ``HOST:PORT`` or ``:PORT``.
+        options: see :class:`UdpOptions`.
+        payload_size: longest body that fits into a batch.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        ConfigurationError: no such address, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        self._address = parse_address("udp", channel, needs_host=False)
+        self._options = options_from_strings(UdpOptions, options or {})
+        if self._options.local and not self._address.host:
+            raise ConfigurationError(f"{self.name}: its port is that of this computer already; leave local out")
+        self._udp: UdpPort | None = None
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus udp://{self.channel}"
+
+    @property
+    def baudrate(self) -> int:
+        """0: a network has none."""
+        return 0
+
+    @property
+    def reads_natively(self) -> bool:
+        """No: who has sent a datagram is looked at in Python."""
+        return False
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append the frames of the datagrams that have arrived, at most ``batch.free``.
+
+        Raises:
+            BusNotAvailable: the socket cannot be used any more.
+        """
+        taken = 0
+        for _ in range(_MOST_DATAGRAMS):
+            bytes_before = self.counters.framing.bytes_in
+            taken += super().receive(batch, ordinal)
+            if not batch.free or self.counters.framing.bytes_in == bytes_before:
+                break
+        return taken
+
+    def _open_port(self) -> Port:
+        self._udp = UdpPort(self._address, self._options.local)
+        return self._udp
+
+    def _read(self, port: Port) -> None:
+        """One datagram: never two as one."""
+        if datagram := port.read(CHUNK):
+            self._stream.add(datagram, now_ns())
+        if self._udp is not None:
+            self.counters.refused += self._udp.foreign
+            self._udp.foreign = 0
+
+
+__all__ = ["UdpBus", "UdpOptions", "UdpPort"]

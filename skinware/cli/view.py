@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import re
 import secrets
 import signal
 import socket
@@ -34,8 +35,20 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 8736
 _CALM = "calm"
+_TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
 _NEEDED = "websockets>=15"
 """What the extra ``view`` brings."""
+
+
+def token_text(text: str) -> str:
+    """A token that can stand in an address as it is; for ``click.option(type=...)``.
+
+    Raises:
+        click.BadParameter: it cannot.
+    """
+    if not _TOKEN.fullmatch(text):
+        raise click.BadParameter("give letters, digits, '_', '.', '~' or '-'.")
+    return text
 
 
 @click.command(
@@ -57,6 +70,7 @@ _NEEDED = "websockets>=15"
 @click.option(
     "--token",
     metavar="TEXT",
+    type=token_text,
     help="That the address needs.  [default: a random one, if other machines can connect]",
 )
 @click.option("--no-browser", is_flag=True, help="Only print the address.")

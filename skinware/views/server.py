@@ -32,6 +32,8 @@ _TICK_S = 0.01
 _LONGEST_TURN_S = 0.5
 _MOST_VIEWERS = 32
 _LONGEST_OPERATION = 1 << 16
+_CLOSE_TIMEOUT_S = 1.0
+"""What a viewer that goes, or is sent away, may take for it."""
 _HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline';"
@@ -78,6 +80,7 @@ class ViewServer:
             compression=None,
             max_size=_LONGEST_OPERATION,
             server_header=None,
+            close_timeout=_CLOSE_TIMEOUT_S,
         )
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
@@ -97,7 +100,8 @@ class ViewServer:
         """Let go of all viewers, and end what they have begun."""
         if self._server is not None:
             self._server.close()
-            await self._server.wait_closed()
+            with contextlib.suppress(TimeoutError):  # of who connected and said nothing
+                await asyncio.wait_for(self._server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
         if self._recording is not None:
             await self._recording.close()
 

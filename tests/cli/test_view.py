@@ -1,0 +1,106 @@
+"""skin-view as people and scripts use it; what it serves is tested in tests/views."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from contextlib import closing
+
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from skinware import Namespace
+from skinware.cli import view as view_module
+from skinware.cli._command import exit_status
+from skinware.cli.view import command as view
+from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
+from tests.commands import run, running
+from tests.views.client import page_of
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int) -> None:
+    with publishing(FakeSkin("torso", fake_structure(1, 2))), publishing(FakeSkin("arm", fake_structure(1, 2))):
+        with running("skin-view", "torso", "--port", "0", "--no-browser") as server:
+            ready = server.wait_for("ready")
+            assert (ready["namespace"], ready["names"]) == (namespace.name, ["torso"])
+            with page_of(ready["url"]) as viewer:
+                viewer.pull_until(lambda _: viewer.skin["drivers"])
+                assert [driver["name"] for driver in viewer.skin["drivers"]] == ["torso"]
+                assert server.stop(number) == {}
+                assert (server.process.returncode, server.errors) == (0, "")
+
+
+def test_its_address_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(view_module.webbrowser, "open", opened.append)
+    monkeypatch.setattr(view_module, "_serve", ready_at_once)
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert exit_status(view, ["torso", "arm"]) == 0
+    assert capsys.readouterr().out == "http://127.0.0.1:5/ shows torso, arm (Ctrl-C ends)\n"
+    assert exit_status(view, ["--no-browser", "--host", "::1"]) == 0
+    assert capsys.readouterr().out.startswith("http://[::1]:5/ shows all drivers of namespace ")
+    monkeypatch.delenv("DISPLAY")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert exit_status(view, []) == 0
+    assert opened == ["http://127.0.0.1:5/"]
+
+
+async def ready_at_once(_follower: object, _access: object, _host: str, _port: object, ready: object) -> None:
+    ready(5)  # type: ignore[operator]
+
+
+def test_other_machines_need_a_token() -> None:
+    with running("skin-view", "--port", "0", "--no-browser", "--host", "0.0.0.0") as server:
+        url = server.wait_for("ready")["url"]
+        where, _, token = url.partition("?token=")
+        assert len(token) > 20
+        port = where.rstrip("/").rpartition(":")[2]
+        with pytest.raises(InvalidStatus, match="401"), page_of(f"http://127.0.0.1:{port}/"):
+            pass
+        with page_of(f"http://127.0.0.1:{port}/?token={token}") as page:
+            page.pull()
+
+
+def test_a_token_of_ones_own() -> None:
+    with running("skin-view", "--port", "0", "--no-browser", "--token", "sesame") as server:
+        assert server.wait_for("ready")["url"].endswith("/?token=sesame")
+
+
+def test_a_port_that_is_in_use() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as other:
+        port = str(other.getsockname()[1])
+        result = run("skin-view", "--port", port, "--no-browser")
+        assert (result.returncode, result.stdout) == (1, "")
+        why = "in use: give another --port, or 0 for any that is free"
+        assert result.stderr == f"skin-view: 127.0.0.1, port {port}: {why}\n"
+
+
+def test_another_port_where_the_usual_one_is_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    with running("skin-view", "--no-browser") as one, running("skin-view", "--no-browser") as other:
+        assert one.wait_for("ready")["url"] != other.wait_for("ready")["url"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "why"),
+    [
+        (("--port", "99999"), 2, "99999"),
+        (("--port", "0", "--host", "no.such.host.invalid"), 1, "no.such.host.invalid"),
+        (("--port", "0", "--host", "192.0.2.1"), 1, "192.0.2.1"),
+        (("--port", "0", "no driver"), 2, "driver name 'no driver'"),
+        (("--port", "0", "--namespace", "a/b"), 2, "namespace name 'a/b'"),
+        (("--port", "0", "--token", "with space"), 2, "--token"),
+    ],
+)
+def test_bad_input_is_said_in_a_line(arguments: tuple[str, ...], status: int, why: str) -> None:
+    result = run("skin-view", "--no-browser", *arguments)
+    assert (result.returncode, result.stdout) == (status, "")
+    assert why in result.stderr
+    assert result.stderr.strip().count("\n") <= (3 if status == 2 else 0)
+    assert "Traceback" not in result.stderr
+
+
+def test_without_its_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(view_module, "find_spec", lambda _: None)
+    assert exit_status(view, ["--no-browser"]) == 1
+    assert "pip install 'websockets" in capsys.readouterr().err

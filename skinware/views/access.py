@@ -12,7 +12,7 @@ import ipaddress
 from collections.abc import Mapping
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
 
 _COOKIE = "skin-view"
 
@@ -67,6 +67,11 @@ class Access:
         """Whether the token is in an address."""
         given = parse_qs(urlsplit(target).query).get("token", [""])[0]
         return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
+
+    def without_token(self, target: str) -> str:
+        """The query of an address, without the token."""
+        left = [(name, value) for name, value in parse_qsl(urlsplit(target).query, True) if name != "token"]
+        return f"?{urlencode(left)}" if left else ""
 
     @property
     def cookie(self) -> str:

@@ -38,6 +38,7 @@ class Wiped(NamedTuple):
 
     touched: int
     of: int
+    running: bool
 
 
 class Look:
@@ -125,13 +126,14 @@ class Look:
             return None
         touched = of = 0
         for driver in drivers:
-            quantity, watched = self.quantity_of(driver), self._watched.get(driver.number)
-            if quantity is None or watched is None or watched.wipe is None:
+            quantity = self.quantity_of(driver)
+            if quantity is None:
                 continue
             of += len(quantity)
-            noise = watched.rest.noise(quantity.type.name)
-            touched += len(quantity) - len(watched.wipe.never_moved(quantity.type.name, noise))
-        return Wiped(touched, of)
+            watched, name = self._watch(driver), quantity.type.name
+            if watched.wipe is not None:
+                touched += len(quantity) - len(watched.wipe.never_moved(name, watched.rest.noise(name)))
+        return Wiped(touched, of, self._wiping)
 
     def _watch(self, driver: Followed) -> _Watched:
         watched = self._watched.get(driver.number)

@@ -75,7 +75,7 @@ class Replay(msgspec.Struct, tag_field="op", tag="replay"):
     """Controls the replay that is shown."""
 
     action: Literal["pause", "resume", "step", "seek", "speed", "loop"]
-    value: float | bool | None = None
+    value: int | float | bool | None = None
 
 
 Operation = Next | Choose | Exact | Names | Series | Tare | Wipe | Record | Replay

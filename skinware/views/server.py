@@ -22,6 +22,7 @@ from skinware.views import operations
 from skinware.views.access import Access, Refused
 from skinware.views.following import Follower
 from skinware.views.recording import Recording
+from skinware.views.replaying import ReplayControl
 from skinware.views.state import problem_of_all
 from skinware.views.turns import PROTOCOL, Viewer
 
@@ -59,6 +60,7 @@ class ViewServer:
         self, follower: Follower, access: Access, recording: Recording | None = None, page: Path = PAGE
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
+        self._replay = ReplayControl()
         self._viewers: set[Viewer] = set()
         self._news = asyncio.Event()
         self._server: Server | None = None
@@ -92,6 +94,7 @@ class ViewServer:
                 for driver in self._follower.take(period_ns):
                     for viewer in self._viewers:
                         viewer.look.follow(driver)
+                self._replay.follow(self._follower.drivers)
                 self._news.set()
                 self._news.clear()
             await asyncio.sleep(_TICK_S)
@@ -121,7 +124,7 @@ class ViewServer:
     def _file(self, path: str, request: Request) -> Response:
         if path == "/" and self._access.has_token(request.path):  # kept by the browser, and out of the address
             response = _response(HTTPStatus.SEE_OTHER, b"", "text/plain")
-            response.headers["Location"] = "/"
+            response.headers["Location"] = "/" + self._access.without_token(request.path)
             response.headers["Set-Cookie"] = self._access.cookie
             return response
         files = {f"/{file.relative_to(self._page).as_posix()}": file for file in self._page.rglob("*")}
@@ -151,11 +154,11 @@ class ViewServer:
         async for text in connection:
             try:
                 operation = operations.operation_of(text)
+                if not isinstance(operation, operations.Next):
+                    self._do(viewer, operation)
+                    continue
             except ConfigurationError as error:
                 viewer.refuse(str(error))
-                continue
-            if not isinstance(operation, operations.Next):
-                self._do(viewer, operation)
                 continue
             if operation.protocol not in (None, PROTOCOL):
                 viewer.refuse(f"this server speaks {PROTOCOL}: reload the page")
@@ -187,15 +190,17 @@ class ViewServer:
                     self._recording.start()
                 else:
                     self._recording.stop()
+            case operations.Replay():
+                self._replay.act(operation.action, operation.value, viewer.refuse)
             case _:
-                viewer.refuse("nothing here can do that")
+                raise ConfigurationError("nothing here can do that")
 
     def _besides(self) -> dict[str, Any]:
-        recording = self._recording
+        recording, replay = self._recording, self._replay.state
         if recording is None:
-            return {"recording": None, "replay": None}
+            return {"recording": None, "replay": replay}
         problem = [] if recording.problem is None else [problem_of_all(f"recording: {recording.problem}")]
-        return {"recording": recording.state, "replay": None, "problems": problem}
+        return {"recording": recording.state, "replay": replay, "problems": problem}
 
 
 async def show(server: ViewServer, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:

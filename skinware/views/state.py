@@ -60,11 +60,12 @@ def state_of(driver: Followed) -> dict[str, Any]:
     }
     if frame is None or frame.structure is not live.reader.structure:  # it is just changing
         return told
+    was = "was " if life in WITHOUT_NEWS else ""
     buses: list[dict[str, Any]] = []
     for bus, counters in enumerate(live.reader.bus_counters(frame)):
         own = {
             "name": frame.structure.buses[bus],
-            "state": bus_state_name(int(frame.bus_state[bus])),
+            "state": was + bus_state_name(int(frame.bus_state[bus])),
             "reason": bus_reason_name(int(frame.bus_reason[bus])),
             "load": load_report(int(frame.bus_load[bus]))["load"],
         }
@@ -121,11 +122,12 @@ def _patches(driver: Followed) -> list[dict[str, Any]]:
     fresh = np.bincount(structure.sensor_patch[driver.status == 0], minlength=structure.n_patches).tolist()
     ages_ns, rates_hz = patch_ages_ns(frame), driver.live.patch_rates_hz
     counters = driver.live.reader.patch_counters(frame)
+    was = "was " if driver.life in WITHOUT_NEWS else ""
     return [
         {
             "name": name,
             "bus": structure.buses[int(structure.patch_bus[patch])],
-            "state": patch_state_name(int(frame.patch_state[patch])),
+            "state": was + patch_state_name(int(frame.patch_state[patch])),
             "age_ms": None if ages_ns[patch] is None else round((ages_ns[patch] or 0) / 1e6, 3),
             "sensors": sensors[patch],
             "fresh": fresh[patch],

@@ -20,6 +20,7 @@ from skinware.views.following import Followed, Follower
 from skinware.views.looks import Look
 from skinware.views.scene import Scene
 from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
+from skinware.views.touches import places_of
 
 PROTOCOL = "skinware.view.1"
 _ALIGNMENT = 8
@@ -203,25 +204,26 @@ class Viewer:
 
     def _contacts(self, driver: Followed) -> list[dict[str, Any]]:
         """The contacts on a driver where the viewer sees them, the oldest first."""
-        quantity = self.look.quantity_of(driver)
-        if quantity is None or driver.contacts is None or driver.contact_of(quantity) is None:
+        quantity, frame = self.look.quantity_of(driver), driver.contacts
+        if quantity is None or frame is None or frame.source.type_name != quantity.type.name:
             return []
-        placed = self._follower.scene.of(driver.name, quantity.name)
+        laid_out = self._follower.scene.of(driver.name, quantity.name).position
         told = []
-        for contact in driver.contacts:
+        for contact, unit, sensor, _ in places_of(frame, driver.structure):
             pose = self._follower.scene.pose(contact.frame)
             position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
             if not np.isfinite(position).all():  # without places: in the middle of where its taxels are laid out
-                position = placed.position[contact.taxels].mean(axis=0)
+                position = laid_out[contact.taxels].mean(axis=0)
             told.append(
                 {
                     "id": contact.id,
                     "driver": driver.number,
+                    "sensor": sensor,
                     "kind": contact.kind.name.lower(),
                     "position": position.tolist(),
                     "normal": normal.tolist(),
                     "load": contact.load,
-                    "unit": driver.contacts.source.unit,
+                    "unit": unit,
                     "area_m2": contact.area_m2,
                     "speed": float(np.linalg.norm(contact.velocity_m_s)),
                     "age_s": contact.age_s,

@@ -80,6 +80,7 @@ def test_a_token_is_needed_once(serving: Serve) -> None:
             page.pull()
         response = get(where, f"/?token={TOKEN}")
         assert (response.status, response.headers["Location"]) == (303, "/")
+        assert get(where, f"/?flat=&token={TOKEN}&x=%20").headers["Location"] == "/?flat=&x=+"
         cookie = response.headers["Set-Cookie"]
         assert "HttpOnly" in cookie
         assert "SameSite=Strict" in cookie

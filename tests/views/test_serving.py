@@ -190,15 +190,15 @@ def test_changes_peaks_and_wipes(serving: Serve, monkeypatch: pytest.MonkeyPatch
         page.pull_picture(condition=lambda picture: not picture["levels"].any())
         page.say("look", mode="wipe")
         turn = page.pull_until(lambda turn: "wipe" in turn)
-        assert turn["wipe"] == {"touched": 0, "of": 20}
+        assert turn["wipe"] == {"touched": 0, "of": 20, "running": True}
         skin.values = touched
         turn = page.pull_until(lambda turn: turn.header.get("wipe", {}).get("touched"))
-        assert turn["wipe"] == {"touched": 4, "of": 20}
+        assert turn["wipe"] == {"touched": 4, "of": 20, "running": True}
         skin.values = np.full(24, 240)
         picture = page.pull_picture()
         assert np.flatnonzero(picture["levels"] == 250).tolist() == [4, 5, 6, 7]
         page.say("wipe", action="start")
-        page.pull_until(lambda turn: turn.header.get("wipe") == {"touched": 0, "of": 20})
+        page.pull_until(lambda turn: turn.header.get("wipe") == {"touched": 0, "of": 20, "running": True})
 
 
 def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace) -> None:

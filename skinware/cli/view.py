@@ -14,6 +14,7 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -27,6 +28,7 @@ from skinware.cli._command import (
     print_json,
     run,
     version_option,
+    warn,
 )
 
 if TYPE_CHECKING:
@@ -57,6 +59,7 @@ def token_text(text: str) -> str:
     epilog=examples(
         "skin-view                       all drivers, in the browser",
         "skin-view torso --no-browser    one driver; prints the address to open",
+        "skin-view --links robot.urdf    on the meshes of a robot",
         "skin-view --host 0.0.0.0        for other machines too: the address has a token",
     ),
 )
@@ -73,6 +76,12 @@ def token_text(text: str) -> str:
     type=token_text,
     help="That the address needs.  [default: a random one, if other machines can connect]",
 )
+@click.option(
+    "--links",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Links of the robot, which say where coordinate frames are and may have meshes: TOML, or a URDF.",
+)
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
 @namespace_option
 @json_option
@@ -82,6 +91,7 @@ def command(
     port: int | None,
     host: str,
     token: str | None,
+    links: Path | None,
     no_browser: bool,
     namespace: str | None,
     as_json: bool,
@@ -97,6 +107,7 @@ def command(
     from skinware.memory.namespace import Namespace, check_name
     from skinware.views.access import Access, is_loopback
     from skinware.views.following import Follower
+    from skinware.views.robot import read_robot
 
     for name in names:
         check_name(name, "driver")
@@ -104,7 +115,10 @@ def command(
     calm = None if place.name == _CALM else Namespace(_CALM)
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(16)
-    follower = Follower(place, names, calm)
+    robot = None if links is None else read_robot(links)
+    for what in () if robot is None else robot.left_out:
+        warn(f"left out of {links}: {what}")
+    follower = Follower(place, names, calm, robot)
     access = Access(host, token)
 
     def ready(found: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,8 @@ from skinware.views.live import LiveDriver, LiveDrivers
 from skinware.views.past import Past
 from skinware.views.quantities import Quantity, quantities_of
 from skinware.views.rest import Rest
-from skinware.views.scene import Pose, Scene
+from skinware.views.robot import Robot
+from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
 _SLACK_NS = 5_000_000
@@ -183,10 +184,10 @@ class Follower:
         namespace: of the drivers.
         names: of those to follow; default: all.
         calm: namespace where calmed drivers are; None: nowhere.
-        poses: of coordinate frames, by name.
+        robot: under the skin.
 
     Attributes:
-        namespace, names, calm_namespace: as given.
+        namespace, names, calm_namespace, robot: as given.
         drivers: all there are, by name.
         scene: where their taxels are.
         edition: another one whenever drivers or structures are others.
@@ -198,14 +199,14 @@ class Follower:
         namespace: Namespace,
         names: Collection[str] = (),
         calm: Namespace | None = None,
-        poses: Mapping[str, Pose] | None = None,
+        robot: Robot | None = None,
     ) -> None:
         self.namespace, self.names, self.calm_namespace = namespace, tuple(names), calm
         self.drivers: list[Followed] = []
         self.problem: str | None = None
         self.edition = 0
-        self.scene = Scene({}, poses)
-        self._poses = poses
+        self.robot = robot or Robot()
+        self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[str, int] = {}
         self._live = LiveDrivers(namespace, names)
         self._beside = Beside(self._live, names, calm)
@@ -268,7 +269,9 @@ class Follower:
 
     def _arrange(self) -> None:
         self.edition += 1
-        self.scene = Scene({driver.name: (driver.structure, driver.quantities) for driver in self.drivers}, self._poses)
+        self.scene = Scene(
+            {driver.name: (driver.structure, driver.quantities) for driver in self.drivers}, self.robot.poses
+        )
 
 
 __all__ = ["Followed", "Follower"]

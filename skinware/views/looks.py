@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.views.following import Followed
-from skinware.views.levels import Levels, levels_of, shear_of
+from skinware.views.levels import HIGHEST, Levels, levels_of, shear_of
 from skinware.views.quantities import Quantity
 from skinware.views.rest import Rest
 from skinware.views.scales import ChangeSpan, ValueLimits
@@ -112,11 +112,13 @@ class Look:
         status = driver.status[quantity.where]
         watched = self._watch(driver)
         values, fitting = self._values(driver, quantity, watched, status == 0)
-        scale = self.scale or fitting
+        scale = fitting if self.mode == "wipe" else self.scale or fitting
         if self.mode == "raw":
             levels = driver.shared((quantity.name, scale), lambda: levels_of(values, status, *scale))
         else:
             levels = levels_of(values, status, *scale)
+        if self.mode == "wipe":  # only what has moved by more has the highest level, whatever rounding says
+            levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
         shear, longest = self._shear(driver, quantity, watched)
         return Picture(quantity, levels, scale, shear, longest)
 

@@ -128,6 +128,7 @@ class ViewServer:
             response.headers["Set-Cookie"] = self._access.cookie
             return response
         files = {f"/{file.relative_to(self._page).as_posix()}": file for file in self._page.rglob("*")}
+        files |= {f"/mesh/{number}": mesh.file for number, mesh in enumerate(self._follower.robot.meshes)}
         file = files.get("/index.html" if path == "/" else path)
         if file is None or not file.is_file():
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")

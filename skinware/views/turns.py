@@ -147,13 +147,20 @@ class Viewer:
         self._changes, self._status = {}, {}
 
     def _skin(self, blobs: Blobs) -> dict[str, Any]:
-        follower = self._follower
+        follower, scene = self._follower, self._follower.scene
         namespaces = [follower.namespace, *([follower.calm_namespace] if follower.calm_namespace else [])]
         return {
             "protocol": PROTOCOL,
             "namespaces": [namespace.name for namespace in namespaces],
-            "drivers": [_driver(driver, follower.scene, blobs) for driver in follower.drivers],
-            "links": [],
+            "drivers": [_driver(driver, scene, blobs) for driver in follower.drivers],
+            "links": [
+                {
+                    "frame": mesh.frame,
+                    "mesh": f"mesh/{number}",
+                    "pose": (scene.pose(mesh.frame) @ mesh.pose).ravel().tolist(),
+                }
+                for number, mesh in enumerate(follower.robot.meshes)
+            ],
         }
 
     def _add_pictures(self, header: dict[str, Any], blobs: Blobs) -> None:

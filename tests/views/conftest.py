@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from skinware import Namespace
 from skinware.views.access import Access
 from skinware.views.following import Follower
 from skinware.views.recording import Recording
+from skinware.views.robot import Robot
 from skinware.views.server import ViewServer, show
 from skinware_drivers.testing.waiting import wait_until
 
@@ -43,10 +44,10 @@ def serving(namespace: Namespace, page_folder: Path) -> Serve:
         calm: Namespace | None = None,
         *,
         token: str | None = None,
-        poses: Mapping[str, Any] | None = None,
+        robot: Robot | None = None,
         program: tuple[str, ...] = (sys.executable, "-m", "skinware.cli._record_beside"),
     ) -> Iterator[str]:
-        follower = Follower(namespace, names, calm, poses)
+        follower = Follower(namespace, names, calm, robot)
         found: list[Any] = []
         failed: list[BaseException] = []
 

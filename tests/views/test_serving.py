@@ -12,6 +12,7 @@ from skinware import Namespace, Status
 from skinware.geometry import Geometry
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import rest
+from skinware.views.robot import Robot
 from skinware.views.turns import PROTOCOL
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
@@ -217,7 +218,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         publishing(raw),
         publishing(calm),
         ContactsWriter(structure, driver="torso", namespace=calm_namespace) as contacts,
-        serving((), calm_namespace, poses={"arm": pose}) as url,
+        serving((), calm_namespace, robot=Robot({"arm": pose})) as url,
         page_of(url) as page,
     ):
         value = np.zeros(20, np.float32)

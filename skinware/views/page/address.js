@@ -1,0 +1,46 @@
+// The view in the part of the address behind "#": whoever opens it sees the same.
+
+const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
+
+/**
+ * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
+ *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`; what is missing is left out.
+ */
+export function toHash(view) {
+  const parts = new URLSearchParams();
+  if (view.camera) parts.set("eye", numbers([...view.camera.position, ...view.camera.target]));
+  if (view.mode && view.mode !== "raw") parts.set("mode", view.mode);
+  if (view.type) parts.set("type", view.type);
+  if (view.scale) parts.set("scale", numbers(view.scale));
+  if (view.selected) parts.set("selected", view.selected);
+  for (const pin of view.pins ?? []) parts.append("pin", pin);
+  if (view.normals) parts.set("normals", "1");
+  if (view.theme) parts.set("theme", view.theme);
+  return `#${parts}`;
+}
+
+/** The view of a hash; what is not in it, or not understood, is left out. */
+export function fromHash(hash) {
+  const parts = new URLSearchParams(hash.replace(/^#/, ""));
+  const list = (name, length) => {
+    const text = parts.get(name);
+    if (!text || !NUMBERS.test(text)) return null;
+    const found = text.split(",").map(Number);
+    return found.length === length && found.every(Number.isFinite) ? found : null;
+  };
+  const eye = list("eye", 6);
+  const theme = parts.get("theme");
+  return {
+    camera: eye && { position: eye.slice(0, 3), target: eye.slice(3) },
+    mode: parts.get("mode") ?? undefined,
+    type: parts.get("type") ?? undefined,
+    scale: list("scale", 2),
+    selected: parts.get("selected"),
+    pins: parts.getAll("pin"),
+    normals: parts.get("normals") === "1",
+    theme: theme === "dark" || theme === "light" ? theme : undefined,
+    flat: parts.get("flat") === "1",
+  };
+}
+
+const numbers = (list) => list.map((x) => Number(x.toPrecision(5))).join(",");

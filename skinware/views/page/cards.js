@@ -1,0 +1,128 @@
+// Cards that tell all of one taxel: the one under the pointer, and those that are pinned.
+
+import { h, setChildren, setHidden, setText } from "./dom.js";
+import { age, figure, measure } from "./format.js";
+import { statusText } from "./marks.js";
+import { polyline } from "./spark.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+const ROWS = ["raw", "age", "noise", "uid", "driver"];
+const [WIDTH, HEIGHT] = [220, 44];
+const SHOWN_S = 10;
+
+class Card {
+  constructor(probe, close) {
+    this.probe = probe;
+    this.letter = h("b", { class: "letter" });
+    this.name = h("strong");
+    this.value = h("output", { class: "value" });
+    this.status = h("span", { class: "status" });
+    this.cells = Object.fromEntries(ROWS.map((row) => [row, h("dd")]));
+    this.line = document.createElementNS(SVG, "polyline");
+    this.svg = document.createElementNS(SVG, "svg");
+    this.svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
+    this.svg.setAttribute("preserveAspectRatio", "none");
+    this.svg.setAttribute("role", "img");
+    this.svg.append(this.line);
+    this.span = h("small");
+    this.element = h(
+      "article",
+      { class: "card", "data-role": close ? "pin" : null, "data-key": probe.key },
+      h(
+        "header",
+        {},
+        close ? this.letter : null,
+        this.name,
+        close ? h("button", { type: "button", class: "plain", "aria-label": "Let go", onclick: close }, "✕") : null,
+      ),
+      h("p", {}, this.value, this.status),
+      this.svg,
+      this.span,
+      h("dl", {}, ...ROWS.flatMap((row) => [h("dt", {}, row), this.cells[row]])),
+    );
+  }
+
+  update(past) {
+    const { probe } = this;
+    const { sheet, i } = probe;
+    const shown = past ? past(probe) : probe.exact;
+    setText(this.letter, probe.letter);
+    setText(this.name, probe.name);
+    setText(this.value, `${past ? "≈ " : ""}${measure(shown?.value, sheet.unit)}`);
+    const status = shown?.status ?? sheet.shown.status[i];
+    const isOld = sheet.driver.isOld && !past;
+    setText(this.status, isOld && status === 0 ? "stale: driver silent" : statusText(status));
+    this.status.dataset.fresh = String(status === 0 && !isOld);
+    setText(this.cells.raw, figure(past ? null : shown?.raw));
+    setText(this.cells.age, age(past ? null : shown?.age_ms));
+    setText(this.cells.noise, past ? figure(null) : measure(shown?.noise, sheet.unit));
+    setText(this.cells.uid, sheet.uid ? `0x${sheet.uid[i].toString(16)}` : figure(null));
+    setText(this.cells.driver, `${sheet.driver.name}, sensor ${probe.position}`);
+    this.#draw();
+  }
+
+  #draw() {
+    if (!this.probe.series || this.drawn === this.probe.series) return;
+    this.drawn = this.probe.series;
+    const { points, low, high } = polyline(this.drawn.time_s, this.drawn.value, WIDTH, HEIGHT, SHOWN_S);
+    this.line.setAttribute("points", points);
+    const text = points ? `last ${SHOWN_S} s: ${figure(low)} to ${measure(high, this.probe.sheet.unit)}` : "";
+    setText(this.span, text);
+    this.svg.setAttribute("aria-label", text || "no values yet");
+  }
+}
+
+export class Cards {
+  #cards = new Map();
+
+  /**
+   * @param {HTMLElement} tip where the card of the hovered taxel is.
+   * @param {HTMLElement} pins where those of pinned taxels are.
+   * @param {(probe: object) => void} release called to unpin.
+   */
+  constructor(tip, pins, release) {
+    this.tip = tip;
+    this.pins = pins;
+    this.release = release;
+    this.empty = h(
+      "p",
+      { class: "hint" },
+      "Point at a taxel to see its values; click to pin it here. Without a mouse: ",
+      h("kbd", {}, "j"),
+      " ",
+      h("kbd", {}, "k"),
+      " and ",
+      h("kbd", {}, "p"),
+      ".",
+    );
+  }
+
+  /**
+   * @param {object} probes
+   * @param {?Function} past of a probe, what was shown of it then; null: now.
+   */
+  update(probes, past) {
+    const hovered = probes.hovered && !probes.pins.includes(probes.hovered) ? probes.hovered : null;
+    if (hovered !== this.hovered) {
+      this.hovered = hovered;
+      this.tipCard = hovered && new Card(hovered, null);
+      this.tip.replaceChildren(...(hovered ? [this.tipCard.element] : []));
+    }
+    setHidden(this.tip, !hovered);
+    this.tipCard?.update(past);
+    for (const probe of this.#cards.keys()) if (!probes.pins.includes(probe)) this.#cards.delete(probe);
+    for (const probe of probes.pins) {
+      if (!this.#cards.has(probe)) this.#cards.set(probe, new Card(probe, () => this.release(probe)));
+      this.#cards.get(probe).update(past);
+    }
+    const cards = probes.pins.map((probe) => this.#cards.get(probe).element);
+    setChildren(this.pins, cards.length ? cards : [this.empty]);
+  }
+
+  /** Put the card of the hovered taxel beside a place of the view. */
+  place(x, y, width, height) {
+    const left = x + 18 + this.tip.offsetWidth < width ? x + 18 : Math.max(4, x - 18 - this.tip.offsetWidth);
+    const top = Math.max(4, Math.min(y - 20, height - this.tip.offsetHeight - 8));
+    this.tip.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;
+  }
+}

@@ -1,0 +1,58 @@
+// What keys do, and the page that tells it.
+
+import { h } from "./dom.js";
+import { FRESH, MARKS } from "./marks.js";
+import { picture } from "./legend.js";
+
+export const KEYS = [
+  ["1 2 3 4", "values, change, peaks, wipe test"],
+  ["t", "next type of sensor"],
+  ["b", "zero: what is felt now becomes rest"],
+  ["w l", "start or end the wipe test; save its list"],
+  ["space", "pause, and go on"],
+  ["[ ]", "scroll back and forth while paused"],
+  ["r", "record"],
+  ["s", "save a picture"],
+  ["f", "show all; what is selected, if something is"],
+  ["arrows + -", "go around, nearer, away"],
+  ["j k", "next, previous taxel"],
+  ["p", "pin the taxel that is pointed at, or let it go"],
+  ["n", "normals"],
+  ["a", "scale as it fits"],
+  ["d", "light, dark"],
+  ["esc", "select nothing, let all pins go"],
+  ["?", "this page"],
+];
+
+/** Fill the dialog of keys and marks. */
+export function fillHelp(dialog, theme) {
+  const keys = KEYS.flatMap(([names, text]) => [
+    h("dt", {}, ...names.split(" ").map((name) => h("kbd", {}, name))),
+    h("dd", {}, text),
+  ]);
+  const marks = MARKS.flatMap(({ name, sign }, mark) =>
+    mark === FRESH ? [] : [h("dt", {}, picture(mark, theme)), h("dd", {}, `${name}: ${sign}`)],
+  );
+  dialog.replaceChildren(
+    h("header", {}, h("h2", {}, "Keys and marks"), h("button", { type: "button", class: "plain", "aria-label": "Close", onclick: () => dialog.close() }, "✕")),
+    h("div", { class: "columns" }, h("dl", {}, ...keys), h("dl", {}, ...marks)),
+    h("p", { class: "hint" }, "The mouse turns, the right button or shift moves, the wheel zooms; on a touch screen one finger turns, two move and zoom."),
+  );
+}
+
+/**
+ * Listen to keys.
+ * @param {Object<string, Function>} actions by the key's name; those with alt, ctrl or meta are the browser's.
+ */
+export function listen(actions) {
+  document.addEventListener("keydown", (event) => {
+    if (event.altKey || event.ctrlKey || event.metaKey || event.defaultPrevented) return;
+    if (event.target.closest("input:not([type=range]), select, dialog")) return;
+    const isSpaceOfButton = event.key === " " && event.target.closest("button, [role=treeitem]");
+    const isArrowOfOther = event.key.startsWith("Arrow") && event.target.closest("input, [role=treeitem], [role=radio]");
+    const action = actions[event.key];
+    if (!action || isSpaceOfButton || isArrowOfOther) return;
+    event.preventDefault();
+    action(event);
+  });
+}

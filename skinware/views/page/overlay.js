@@ -1,0 +1,171 @@
+// What is drawn over the taxels: normals, shear, contacts, regions' names, and rings around taxels that are looked at.
+
+import { GROUND, INK } from "./palette.js";
+
+const MOST_ARROWS = 8000;
+const NORMAL_LENGTH = 1.6; // in radii of a taxel
+const SHEAR_LENGTH = 2.4; // in radii, of the strongest shear
+const LEAST_SHEAR = 3; // of 127
+const HIDDEN = 0.35; // how much of a contact on the far side is seen
+
+export class Overlay {
+  #isEmpty = true;
+
+  constructor(host) {
+    this.canvas = document.createElement("canvas");
+    this.canvas.className = "over";
+    this.context = this.canvas.getContext("2d");
+    host.append(this.canvas);
+  }
+
+  /**
+   * @param {object} stage where things are.
+   * @param {object} what `theme`, `normals` (shown or not), `contacts`, `hovered` ({sheet, i} or null),
+   *     `pins` ([{sheet, i, letter}]).
+   */
+  draw(stage, what) {
+    const ratio = Math.min(devicePixelRatio, 2);
+    const [width, height] = [Math.round(stage.width * ratio), Math.round(stage.height * ratio)];
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      this.canvas.width = width;
+      this.canvas.height = height;
+    } else if (!this.#isEmpty) this.context.clearRect(0, 0, width, height);
+    this.#isEmpty = true;
+    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.ink = `rgb(${INK[what.theme]})`;
+    this.ground = `rgb(${GROUND[what.theme]})`;
+    for (const sheet of stage.sheets) {
+      if (what.normals) this.#normals(stage, sheet);
+      if (sheet.shown.shear) this.#shear(stage, sheet);
+    }
+    for (const contact of what.contacts) this.#contact(stage, contact);
+    for (const { sheet, i, letter } of what.pins) this.#ring(stage, sheet, i, letter);
+    if (what.hovered) this.#ring(stage, what.hovered.sheet, what.hovered.i, "");
+  }
+
+  #normals(stage, sheet) {
+    this.#isEmpty = false;
+    const { context } = this;
+    context.beginPath();
+    for (let i = 0; i < Math.min(sheet.n, MOST_ARROWS); i++) {
+      const { at, normal, isAway } = facing(stage, sheet, i);
+      if (isAway || !(normal[0] || normal[1] || normal[2])) continue;
+      const length = NORMAL_LENGTH * sheet.radius[i];
+      const [x, y, depth] = stage.project(...at);
+      if (depth <= 0) continue;
+      context.moveTo(x, y);
+      context.lineTo(...stage.project(...at.map((v, c) => v + length * normal[c])).slice(0, 2));
+    }
+    this.#stroke(1);
+  }
+
+  /** Arrows in the plane of the skin; those too short to mean anything are left out. */
+  #shear(stage, sheet) {
+    const { shear } = sheet.shown;
+    const { context } = this;
+    context.beginPath();
+    for (let i = 0; i < Math.min(sheet.n, MOST_ARROWS); i++) {
+      const [along, across] = [shear[2 * i], shear[2 * i + 1]];
+      if (Math.hypot(along, across) < LEAST_SHEAR) continue;
+      const { at, normal, isAway } = facing(stage, sheet, i);
+      if (isAway) continue;
+      const [e1, e2] = planeOf(normal);
+      const scale = (SHEAR_LENGTH * sheet.radius[i]) / 127;
+      const tip = at.map((v, c) => v + scale * (along * e1[c] + across * e2[c]));
+      const [x1, y1, depth] = stage.project(...at);
+      if (depth <= 0) continue;
+      const [x2, y2] = stage.project(...tip);
+      this.#isEmpty = false;
+      arrow(context, x1, y1, x2, y2);
+    }
+    this.#stroke(1.6);
+  }
+
+  #contact(stage, contact) {
+    const at = contact.at;
+    const [x, y, depth] = stage.project(...at);
+    if (depth <= 0) return;
+    this.#isEmpty = false;
+    const { context } = this;
+    const eye = stage.camera.position.toArray();
+    const normal = contact.normal ?? [0, 0, 0];
+    const isAway = normal.reduce((sum, n, c) => sum + n * (eye[c] - at[c]), 0) < 0;
+    const size = Math.max(10, (Math.sqrt((contact.area_m2 || 0) / Math.PI) * stage.pixels) / depth);
+    context.globalAlpha = isAway ? HIDDEN : 1;
+    context.beginPath();
+    context.arc(x, y, size, 0, 2 * Math.PI);
+    this.#stroke(2);
+    if (normal.some((n) => n)) {
+      context.beginPath();
+      const [nx, ny] = stage.project(...at.map((v, c) => v + 0.02 * normal[c]));
+      arrow(context, x, y, nx, ny);
+      this.#stroke(2);
+    }
+    this.#tag(String(contact.id), x + 0.72 * size + 8, y - 0.72 * size - 8);
+    context.globalAlpha = 1;
+  }
+
+  #ring(stage, sheet, i, letter) {
+    const [x, y, depth] = stage.project(...sheet.place(i));
+    if (depth <= 0) return;
+    this.#isEmpty = false;
+    const size = Math.max((sheet.radius[i] * stage.pixels) / depth, 3) + 3;
+    this.context.beginPath();
+    this.context.arc(x, y, size, 0, 2 * Math.PI);
+    this.#stroke(1.8);
+    if (letter) this.#tag(letter, x + 0.7 * size + 8, y - 0.7 * size - 8);
+  }
+
+  /** Ink with a hem of the ground, which is seen on every colour. */
+  #stroke(width) {
+    const { context } = this;
+    context.lineWidth = width + 2;
+    context.strokeStyle = this.ground;
+    context.stroke();
+    context.lineWidth = width;
+    context.strokeStyle = this.ink;
+    context.stroke();
+  }
+
+  #tag(text, x, y) {
+    const { context } = this;
+    context.font = "600 11px system-ui, sans-serif";
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    const half = Math.max(8, context.measureText(text).width / 2 + 5);
+    context.beginPath();
+    context.roundRect(x - half, y - 8, 2 * half, 16, 8);
+    context.fillStyle = this.ink;
+    context.fill();
+    context.fillStyle = this.ground;
+    context.fillText(text, x, y + 0.5);
+  }
+}
+
+function facing(stage, sheet, i) {
+  const at = [...sheet.place(i)];
+  const normal = [...sheet.normal.subarray(3 * i, 3 * i + 3)];
+  const eye = stage.camera.position;
+  const isAway = normal[0] * (eye.x - at[0]) + normal[1] * (eye.y - at[1]) + normal[2] * (eye.z - at[2]) < 0;
+  return { at, normal, isAway };
+}
+
+/** Two directions in the plane of a normal: the first as near to x as it can be. */
+export function planeOf([x, y, z]) {
+  if (!(x || y || z)) return [[1, 0, 0], [0, 1, 0]];
+  const first = Math.abs(x) < 0.95 ? [1 - x * x, -x * y, -x * z] : [-y * x, 1 - y * y, -y * z];
+  const length = Math.hypot(...first);
+  const e1 = first.map((v) => v / length);
+  return [e1, [y * e1[2] - z * e1[1], z * e1[0] - x * e1[2], x * e1[1] - y * e1[0]]];
+}
+
+function arrow(context, x1, y1, x2, y2) {
+  context.moveTo(x1, y1);
+  context.lineTo(x2, y2);
+  const angle = Math.atan2(y2 - y1, x2 - x1);
+  const head = Math.min(6, 0.4 * Math.hypot(x2 - x1, y2 - y1));
+  for (const side of [-0.5, 0.5]) {
+    context.moveTo(x2, y2);
+    context.lineTo(x2 - head * Math.cos(angle + side), y2 - head * Math.sin(angle + side));
+  }
+}

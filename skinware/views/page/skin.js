@@ -1,0 +1,205 @@
+// What the page knows of the skin: drivers, their sheets of taxels, and the newest values as they came.
+
+import { fillMarks } from "./marks.js";
+import { TOP } from "./palette.js";
+
+const NOTHING = 255;
+const DRAWN_PART = 0.44; // radius of a disc, of the distance to its neighbour
+
+/** n taxels of one type of a driver. */
+export class Sheet {
+  constructor(driver, told, blob) {
+    this.driver = driver;
+    this.type = told.name;
+    this.unit = told.unit ?? "";
+    this.n = told.n;
+    this.hasShear = Boolean(told.axes);
+    this.index = blob(told.index, Uint32Array); // positions in a frame
+    this.uid = told.uid ? blob(told.uid, BigUint64Array) : null;
+    this.patch = blob(told.patch, Uint16Array);
+    this.module = blob(told.module, Uint16Array);
+    this.arrange(told, blob);
+    this.names = null; // asked for when somebody points at one
+    this.status = new Uint8Array(this.n).fill(1); // never seen, until a picture says more
+    this.levels = new Uint8Array(this.n).fill(NOTHING);
+    this.shear = null;
+    this.scale = [0, 1];
+    this.mode = "raw";
+    this.dimmed = null;
+    this.shown = { marks: new Uint8Array(this.n) };
+    this.marksVersion = 0;
+    this.show();
+  }
+
+  /** Where the taxels are; that may change while they stay the same. */
+  arrange(told, blob) {
+    this.placed = told.placed;
+    this.position = blob(told.position, Float32Array);
+    this.normal = withZeros(told.normal ? blob(told.normal, Float32Array) : new Float32Array(3 * this.n));
+    const spacing = told.neighbour_spacing_m || smallestStep(this.position);
+    const given = told.radius ? blob(told.radius, Float32Array) : new Float32Array(this.n).fill(NaN);
+    this.radius = given.map((r) => (spacing > 0 ? DRAWN_PART * spacing : r > 0 ? r : 0.002));
+  }
+
+  /** Take a picture of a turn; arrays are kept, never written to again. */
+  take(picture, mode, blob) {
+    this.levels = blob(picture.levels, Uint8Array);
+    if (picture.status) this.status = blob(picture.status, Uint8Array);
+    this.shear = picture.shear ? blob(picture.shear, Int8Array) : null;
+    this.scale = picture.scale ?? this.scale;
+    this.mode = mode;
+    this.sequence = picture.sequence;
+  }
+
+  /** Show the newest, or a picture of the past. */
+  show(picture = this) {
+    const { levels, status, shear, scale, mode } = picture;
+    Object.assign(this.shown, { levels, status, shear, scale, mode });
+    this.fill();
+  }
+
+  fill() {
+    const { status, levels, marks, mode } = this.shown;
+    const how = { dimmed: this.dimmed, isOld: this.driver.isOld, isWipe: mode === "wipe" };
+    if (fillMarks(status, levels, marks, how)) this.marksVersion++;
+  }
+
+  /** The value that is shown of a taxel, as exactly as its level tells it; null if there is none. */
+  valueOf(i) {
+    const { levels, scale } = this.shown;
+    return levels[i] > TOP ? null : scale[0] + (levels[i] / TOP) * (scale[1] - scale[0]);
+  }
+
+  /** Where a taxel is, m. */
+  place(i) {
+    return this.position.subarray(3 * i, 3 * i + 3);
+  }
+}
+
+/** A driver of a generation. */
+export class Driver {
+  constructor(told, blob) {
+    this.id = told.id;
+    this.name = told.name;
+    this.namespace = told.namespace;
+    this.key = keyOf(told);
+    this.generation = told.generation;
+    this.buses = told.buses ?? [];
+    this.patches = told.patches ?? [];
+    this.modules = told.modules ?? [];
+    this.state = "live";
+    this.isCut = false; // the connection to the server is lost
+    this.sheets = new Map(told.types.map((type) => [type.name, new Sheet(this, type, blob)]));
+  }
+
+  get isOld() {
+    return this.isCut || this.state !== "live";
+  }
+}
+
+export class Skin {
+  drivers = new Map(); // by id
+  links = [];
+  namespaces = [];
+  scale = { low: 0, high: 1, unit: "", mode: "raw" };
+
+  /**
+   * Take what a turn tells of the skin itself and of values.
+   * @returns {boolean} the structure is another one.
+   */
+  take(header, blob) {
+    if (header.skin) {
+      this.namespaces = header.skin.namespaces ?? [];
+      this.links = header.skin.links ?? [];
+      this.drivers = new Map(header.skin.drivers.map((told) => [told.id, this.#driver(told, blob)]));
+    }
+    if (header.scale) this.scale = header.scale;
+    for (const told of header.state?.drivers ?? []) {
+      const driver = this.drivers.get(told.id);
+      if (driver) driver.state = told.state;
+    }
+    for (const picture of header.pictures ?? []) {
+      const sheet = this.sheet(picture.driver, picture.type);
+      if (sheet && sheet.driver.generation === picture.generation) sheet.take(picture, this.scale.mode, blob);
+    }
+    return Boolean(header.skin);
+  }
+
+  /** A driver whose structure is known is kept, with what is known of its taxels. */
+  #driver(told, blob) {
+    const driver = this.drivers.get(told.id);
+    if (driver?.generation !== told.generation || driver.key !== keyOf(told)) return new Driver(told, blob);
+    for (const type of told.types) driver.sheets.get(type.name).arrange(type, blob);
+    return driver;
+  }
+
+  sheet(driver, type) {
+    return this.drivers.get(driver)?.sheets.get(type);
+  }
+
+  /** All sheets, or those of a type. */
+  sheets(type) {
+    const all = [...this.drivers.values()].flatMap((driver) => [...driver.sheets.values()]);
+    return type === undefined ? all : all.filter((sheet) => sheet.type === type);
+  }
+
+  /** What is drawn: the sheets of a type; of none, the first of each driver. */
+  shown(type) {
+    const firsts = [...this.drivers.values()].map((driver) => driver.sheets.values().next().value);
+    return type ? this.sheets(type) : firsts.filter(Boolean);
+  }
+
+  /** Names of the types, the most taxels first. */
+  types() {
+    const counts = new Map();
+    for (const sheet of this.sheets()) counts.set(sheet.type, (counts.get(sheet.type) ?? 0) + sheet.n);
+    return [...counts].sort((a, b) => b[1] - a[1]).map(([name]) => name);
+  }
+
+  /** Where a sensor of a driver is drawn: its sheet and the taxel's place in it; null if it is not. */
+  find(driver, position) {
+    for (const sheet of this.drivers.get(driver)?.sheets.values() ?? []) {
+      const i = sheet.index.indexOf(position);
+      if (i >= 0) return { sheet, i };
+    }
+    return null;
+  }
+
+  /** The connection is lost, or back. */
+  cut(isCut) {
+    for (const driver of this.drivers.values()) driver.isCut = isCut;
+    for (const sheet of this.sheets()) sheet.fill();
+  }
+}
+
+const keyOf = ({ namespace, name }) => `${namespace}/${name}`;
+
+function withZeros(normals) {
+  return normals.map((x) => (Number.isNaN(x) ? 0 : x));
+}
+
+/** The distance between the first taxel and its nearest neighbour, m; 0 if there is one alone. */
+function smallestStep(position) {
+  let best = Infinity;
+  for (let i = 3; i < position.length; i += 3) {
+    const d = Math.hypot(...[0, 1, 2].map((c) => position[i + c] - position[c]));
+    if (d > 0 && d < best) best = d;
+  }
+  return best === Infinity ? 0 : best;
+}
+
+/** Smallest and greatest coordinates of some taxels: [x, y, z, x, y, z], m; null of none. */
+export function boxOf(sheets, isIn = () => true) {
+  const box = [Infinity, Infinity, Infinity, -Infinity, -Infinity, -Infinity];
+  for (const sheet of sheets) {
+    for (let i = 0; i < sheet.n; i++) {
+      if (!isIn(sheet, i)) continue;
+      for (let c = 0; c < 3; c++) {
+        const x = sheet.position[3 * i + c];
+        if (x < box[c]) box[c] = x;
+        if (x > box[3 + c]) box[3 + c] = x;
+      }
+    }
+  }
+  return box[0] === Infinity ? null : box;
+}

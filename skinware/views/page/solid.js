@@ -1,0 +1,93 @@
+// The view by WebGL 2: discs in space, and the meshes of links.
+
+import {
+  Color,
+  DataTexture,
+  DirectionalLight,
+  HemisphereLight,
+  Matrix4,
+  Mesh,
+  MeshLambertMaterial,
+  Scene,
+  WebGLRenderer,
+} from "./vendor/three.min.js";
+import { Cloud, discs } from "./cloud.js";
+import { GROUND, INK, ramp } from "./palette.js";
+
+export class Solid {
+  #clouds = [];
+  #meshes = [];
+
+  /** @throws {Error} this browser has no WebGL 2. */
+  constructor(host, theme) {
+    this.canvas = document.createElement("canvas");
+    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: false, preserveDrawingBuffer: true });
+    host.prepend(this.canvas);
+    this.canvas.addEventListener("webglcontextlost", () => this.onlost?.());
+    this.scene = new Scene();
+    this.scene.add(new HemisphereLight(0xffffff, 0x445066, 2.2));
+    this.light = new DirectionalLight(0xffffff, 1.2);
+    this.scene.add(this.light);
+    this.ramp = new DataTexture(ramp(theme), 256, 1);
+    this.material = discs(this.ramp);
+    this.linkMaterial = new MeshLambertMaterial({ flatShading: true });
+    this.setTheme(theme);
+  }
+
+  setTheme(theme) {
+    this.ramp.image.data.set(ramp(theme));
+    this.ramp.needsUpdate = true;
+    const unit = (rgb) => rgb.map((x) => x / 255);
+    this.material.uniforms.ground.value = unit(GROUND[theme]);
+    this.material.uniforms.ink.value = unit(INK[theme]);
+    this.renderer.setClearColor(cssColour(GROUND[theme]));
+    this.linkMaterial.color = cssColour(GROUND[theme].map((x, c) => x + 0.22 * (INK[theme][c] - x)));
+  }
+
+  setSheets(sheets) {
+    for (const cloud of this.#clouds) {
+      this.scene.remove(cloud.points);
+      cloud.dispose();
+    }
+    this.#clouds = sheets.map((sheet) => new Cloud(sheet, this.material));
+    for (const cloud of this.#clouds) this.scene.add(cloud.points);
+  }
+
+  /** @param {{geometry: object, pose: number[]}[]} meshes `pose`: 4 x 4, row by row. */
+  setMeshes(meshes) {
+    for (const mesh of this.#meshes) this.scene.remove(mesh);
+    this.#meshes = meshes.map(({ geometry, pose }) => {
+      const mesh = new Mesh(geometry, this.linkMaterial);
+      mesh.applyMatrix4(new Matrix4().set(...pose));
+      return mesh;
+    });
+    for (const mesh of this.#meshes) this.scene.add(mesh);
+  }
+
+  update() {
+    for (const cloud of this.#clouds) cloud.update();
+  }
+
+  resize(width, height, ratio) {
+    this.renderer.setPixelRatio(ratio);
+    this.renderer.setSize(width, height, false);
+  }
+
+  render(camera) {
+    const halfAngle = (camera.fov * Math.PI) / 360;
+    this.material.uniforms.pixels.value = this.canvas.height / (2 * Math.tan(halfAngle));
+    this.light.position.copy(camera.position);
+    this.renderer.render(this.scene, camera);
+  }
+
+  dispose() {
+    this.onlost = null;
+    this.setSheets([]);
+    this.renderer.dispose();
+    this.canvas.remove();
+  }
+}
+
+function cssColour(rgb) {
+  return new Color(`rgb(${rgb.map(Math.round).join(",")})`);
+}

@@ -1,0 +1,252 @@
+"""The page against a server that says what a test wants: what it shows, what it asks for, and what it survives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page
+
+from skinware_drivers.testing.waiting import wait_until
+from tests.browser.browsing import PHONE, Troubles, look, tell, until
+from tests.browser.fake_server import FakeDriver, FakeServer
+
+OpenPage = Callable[..., Page]
+READY = "skin.connected && skin.drawn > 2 && skin.drivers.length"
+
+
+@pytest.fixture
+def driver() -> FakeDriver:
+    return FakeDriver(0, "sheet", boards=4, triangles=4, placed=False)
+
+
+@pytest.fixture
+def server(driver: FakeDriver) -> Iterator[FakeServer]:
+    server = FakeServer([driver])
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def page(server: FakeServer, open_page: OpenPage) -> Page:
+    page = open_page(f"{server.url}#theme=dark")
+    until(page, READY)
+    return page
+
+
+def asked(server: FakeServer, op: str) -> list[dict[str, Any]]:
+    return [one for one in server.ops if one["op"] == op]
+
+
+def role(name: str, more: str = "") -> str:
+    return f"[data-role={name}]{more}"
+
+
+def test_a_silent_server_is_told_and_left_for_a_new_connection(page: Page, server: FakeServer) -> None:
+    """One that accepts connections and answers nothing is no connection: what is shown stays old until turns come."""
+    server.muted = True
+    until(page, "!skin.connected")
+    banner = page.locator(role("lost"))
+    assert "Trying again" in banner.inner_text()
+    page.wait_for_timeout(700)
+    assert banner.is_visible()
+    assert tell(page, "skin.stateOf(0, 0).mark") == "stale"
+    server.muted = False
+    until(page, "skin.connected && skin.stateOf(0, 0).mark === 'fresh'")
+    assert not banner.is_visible()
+
+
+def test_a_lost_gpu_changes_nothing_but_the_way_of_drawing(page: Page, driver: FakeDriver) -> None:
+    driver.levels[:80] = 250
+    until(page, "skin.stateOf(0, 0).level === 250")
+    page.wait_for_timeout(200)
+    before = look(page)
+    lose = (
+        "document.querySelector('#stage canvas').getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()"
+    )
+    tell(page, lose)
+    until(page, "skin.flat")
+    drawn = tell(page, "skin.drawn")
+    until(page, "skin.drawn > a[0] + 5", drawn)
+    x, y = tell(page, "skin.pixelOf(0, 40)")
+    rows, columns = slice(round(y) - 20, round(y) + 20), slice(round(x) - 20, round(x) + 20)
+    after = look(page)
+    assert abs(after[rows, columns] - before[rows, columns]).mean() < 6
+    assert page.locator("#stage canvas").count() == 2
+
+
+def test_a_selected_patch_steps_forward(page: Page, server: FakeServer) -> None:
+    page.locator(role("row", "[data-patch='board 9']")).click()
+    until(page, "skin.selected === 'default/sheet/can0/board 9'")
+    assert tell(page, "[39, 40, 79, 80].map(i => skin.stateOf(0, i).dimmed)") == [True, False, False, True]
+    page.keyboard.press("Escape")
+    until(page, "skin.selected === null && !skin.stateOf(0, 0).dimmed")
+
+
+def test_the_tree_is_walked_with_keys(page: Page) -> None:
+    focused = "document.activeElement.dataset.key"
+    page.locator(role("row")).first.focus()
+    for key, row in (
+        ("ArrowDown", "default/sheet/can0"),
+        ("End", "default/sheet/can0/board 11"),
+        ("ArrowLeft", "default/sheet/can0"),
+        ("ArrowLeft", "default/sheet/can0"),
+        ("ArrowDown", "default/sheet/can0"),
+        ("ArrowRight", "default/sheet/can0"),
+        ("ArrowRight", "default/sheet/can0/board 8"),
+    ):
+        page.keyboard.press(key)
+        assert tell(page, focused) == row
+    page.keyboard.press("Enter")
+    until(page, "skin.selected === 'default/sheet/can0/board 8'")
+    assert page.locator("[role=treeitem][tabindex='0']").count() == 1
+
+
+def test_taxels_are_read_and_pinned_without_a_mouse(page: Page, server: FakeServer) -> None:
+    page.keyboard.press("j")
+    page.keyboard.press("j")
+    until(page, "'' + skin.hovered === '0,1'")
+    until(page, "document.getElementById('tip').innerText.includes('board 8, triangle 0, taxel 1')")
+    page.keyboard.press("p")
+    until(page, "skin.pins.join() === '0,1'")
+    assert asked(server, "exact")[-1]["sensors"] == [[0, 1]]
+    wait_until(lambda: {"op": "series", "driver": 0, "position": 1} in server.ops)
+    until(page, "document.querySelector('[data-role=pin] polyline').getAttribute('points')")
+    page.keyboard.press("Escape")
+    until(page, "!skin.pins.length && skin.hovered === null")
+    wait_until(lambda: asked(server, "exact")[-1]["sensors"] == [])
+
+
+def test_pins_outlive_a_restart_of_the_driver(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    for taxel in (5, 77):
+        page.mouse.click(*tell(page, "skin.pixelOf(0, a[0])", taxel))
+    until(page, "skin.pins.join() === '0,5,0,77'")
+    server.drivers.clear()
+    server.restructure()
+    until(page, "!skin.drivers.length && !skin.pins.length")
+    driver.generation = "2"
+    server.drivers.append(driver)
+    server.restructure()
+    until(page, "skin.pins.join() === '0,5,0,77'")
+
+
+def test_the_past_of_one_driver_outlives_the_start_of_another(page: Page, server: FakeServer) -> None:
+    until(page, "skin.kept_bytes > 2000")
+    kept = tell(page, "skin.kept_bytes")
+    server.drivers.append(FakeDriver(1, "other", boards=1, triangles=1, placed=False))
+    server.restructure()
+    until(page, "skin.drivers.length === 2")
+    assert tell(page, "skin.kept_bytes") >= kept
+
+
+def test_a_dead_driver_is_old_at_once_and_first_in_the_list(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    driver.state = "dead"
+    driver.problems = [{"severity": "error", "driver": 0, "text": "its process is gone"}]
+    until(page, "skin.stateOf(0, 0).mark === 'stale'")
+    assert page.locator(role("problems")).inner_text().count("sheet: its process is gone") == 1
+    row = page.locator(role("row")).first
+    assert "dead" in row.inner_text()
+    assert "✕" in row.inner_text()  # told without colour
+
+
+def test_a_replay_is_controlled(page: Page, server: FakeServer) -> None:
+    assert not page.locator(role("replay")).is_visible()
+    server.extra["replay"] = {
+        "file": "x.mcap", "time_s": 3.0, "duration_s": 60.0, "speed": 1.5, "paused": False, "loop": False
+    }  # fmt: skip
+    panel = page.locator(role("replay"))
+    panel.wait_for()
+    assert "0:03.0 of 1:00.0" in panel.inner_text()
+    for name in ("Pause", "Step", "Loop"):
+        panel.get_by_role("button", name=name).click()
+    assert panel.locator("select").input_value() == "1.5"
+    panel.locator("select").select_option("4")
+    panel.locator("input").evaluate("slider => { slider.value = 30; slider.dispatchEvent(new Event('change')) }")
+    wait_until(lambda: len(asked(server, "replay")) == 5)
+    assert [(one["action"], one["value"]) for one in asked(server, "replay")] == [
+        ("pause", None),
+        ("step", None),
+        ("loop", True),
+        ("speed", 4),
+        ("seek", 30),
+    ]
+
+
+def test_a_wipe_test_lists_what_was_not_touched(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    driver.levels[:] = 250
+    driver.levels[[3, 141]] = [249, 0]
+    server.extra["wipe"] = {"touched": 158, "of": 160}
+    page.locator(role("mode", "[data-mode=wipe]")).click()
+    until(page, "skin.untouched.join() === '0,3,0,141'")
+    with page.expect_download() as download:
+        page.keyboard.press("l")
+    lines = download.value.path().read_text().splitlines()
+    assert lines[0].startswith("# 158 of 160 touched")
+    assert lines[2:] == [
+        "sheet\t3\t0x70003\tboard 8, triangle 0, taxel 3",
+        "sheet\t141\t0x7008d\tboard 11, triangle 2, taxel 1",
+    ]
+
+
+def test_a_picture_shows_what_the_page_shows(page: Page, driver: FakeDriver) -> None:
+    with page.expect_download() as download:
+        page.locator(role("picture")).click()
+    data = download.value.path().read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    assert len(data) > 3000
+
+
+def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    driver.shear = np.zeros((driver.n, 2), np.int8)
+    before = look(page)
+    driver.shear[60:70] = 100
+    contact = {"id": 12, "kind": "hold", "load": 31.5, "unit": "counts", "speed": 0.0, "age_s": 2.0, "area_m2": 4e-4}
+    place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9, "driver": 0}
+    server.extra["contacts"] = [contact | place]
+    until(page, "skin.contacts.length === 1 && skin.contacts[0].id === 12")
+    assert "12\thold\t31.5 counts" in page.locator("#contacts").inner_text()
+    page.wait_for_timeout(200)
+    after = look(page)
+    for taxel in (20, 65):
+        x, y = (round(c) for c in tell(page, "skin.pixelOf(0, a[0])", taxel))
+        assert abs(after[y - 12 : y + 12, x - 12 : x + 12] - before[y - 12 : y + 12, x - 12 : x + 12]).max() > 60
+
+
+def test_a_fixed_scale_is_asked_for_and_forgotten(page: Page, server: FakeServer) -> None:
+    page.locator("#low").fill("10")
+    page.locator("#high").fill("90.5")
+    page.keyboard.press("Enter")
+    wait_until(lambda: server.look.get("scale") == [10, 90.5])
+    until(page, "location.hash.includes('scale=10')")
+    page.keyboard.press("Tab")
+    page.locator("#auto").click()
+    wait_until(lambda: server.look["scale"] is None)
+
+
+def test_a_malformed_turn_is_survived(page: Page, server: FakeServer, troubles: Troubles) -> None:
+    """The page says nothing of it and connects again; it does not go blank for ever."""
+    troubles.expected = ("uncaught",)
+    server.extra["skin"] = {"drivers": [{"id": 0}]}
+    page.wait_for_timeout(300)
+    del server.extra["skin"]
+    server.restructure()
+    until(page, f"{READY} && skin.stateOf(0, 0)?.mark === 'fresh'")
+
+
+def test_everything_has_a_name_and_is_reached_by_keys(server: FakeServer, open_page: OpenPage) -> None:
+    """Buttons, fields and rows: what a screen reader says of them is never empty."""
+    for size in ((1100, 700), PHONE):
+        page = open_page(server.url, size)
+        until(page, READY)
+        unnamed = """[...document.querySelectorAll('button, input, select, [role]')].filter(one =>
+            one.checkVisibility() && one.role !== 'status'
+            && !(one.ariaLabel || one.innerText?.trim() || one.labels?.length)
+        ).map(one => one.outerHTML.slice(0, 80))"""
+        assert tell(page, unnamed) == []
+        reached = set()
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            reached.add(tell(page, "document.activeElement.dataset.role ?? document.activeElement.id"))
+        assert {"mode", "record", "row", "stage", "pause", "past", "help"} <= reached

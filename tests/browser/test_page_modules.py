@@ -1,0 +1,290 @@
+"""The modules of the page that compute something, each by itself, in the browser that runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, Route
+
+from tests.browser.browsing import PATIENCE_MS
+from tests.browser.fake_server import PAGE
+
+ORIGIN = "http://127.0.0.1/"
+NONE = "\N{EN DASH}"
+"""Where a figure is not known."""
+
+
+def serve(route: Route) -> None:
+    name = route.request.url.removeprefix(ORIGIN)
+    kind, text = ("javascript", (PAGE / name).read_text()) if name else ("html", "<p>empty")
+    route.fulfill(content_type=f"text/{kind}", body=text)
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser) -> Iterator[Page]:
+    """An empty page that can import the modules; nothing serves it."""
+    context = browser.new_context()
+    context.set_default_timeout(PATIENCE_MS)
+    context.route(f"{ORIGIN}**", serve)
+    page = context.new_page()
+    page.goto(ORIGIN)
+    yield page
+    context.close()
+
+
+@pytest.fixture
+def tell(page: Page) -> Callable[..., Any]:
+    """``tell(module, expression, *arguments)``: of the names that a module exports; ``a`` are the arguments."""
+
+    def tell(module: str, expression: str, *arguments: object) -> Any:
+        script = f"async (a) => {{ const m = await import('/{module}'); return ({expression}) }}"
+        return page.evaluate(script, list(arguments))
+
+    return tell
+
+
+# -- turn.js -------------------------------------------------------------------------------------------------------
+
+
+TURN = """(() => {
+    const text = new TextEncoder().encode(a[0]);
+    const bytes = new Uint8Array(a[1] + 24);
+    new DataView(bytes.buffer).setUint32(0, a[1] - 4, true);
+    bytes.fill(32, 4, a[1]); bytes.set(text, 4);
+    new DataView(bytes.buffer).setFloat32(a[1] + 8, 2.5, true);
+    bytes[a[1] + 2] = 7;
+    const { header, blob } = m.decode(bytes.buffer);
+    const numbers = (where, Kind) => [...blob(where, Kind)];
+    return [header.turn, numbers([0, 3], Uint8Array), numbers([8, 4], Float32Array), numbers([2, 4], Uint32Array)];
+})()"""
+
+
+def test_a_turn_is_taken_apart(tell: Callable[..., Any]) -> None:
+    """Also a blob at an odd place, which no typed array can look at in its place."""
+    for size in (24, 32):
+        assert tell("turn.js", TURN, '{"turn": 3}', size) == [3, [0, 0, 7], [2.5], [7]]
+
+
+@pytest.mark.parametrize("size", [0, 3, 4, 20])
+def test_a_cut_turn_is_an_error(tell: Callable[..., Any], size: int) -> None:
+    cut = f"(() => {{ const b = new Uint8Array({size}); if (b.length) b[0] = 200; m.decode(b.buffer) }})()"
+    with pytest.raises(Exception, match="RangeError"):
+        tell("turn.js", cut)
+
+
+# -- marks.js ------------------------------------------------------------------------------------------------------
+
+
+def test_every_status_has_the_mark_that_says_most(tell: Callable[..., Any]) -> None:
+    names = tell("marks.js", "Array.from({length: 256}, (_, status) => m.MARKS[m.markOf(status)].name)")
+    assert names[0] == "fresh"
+    assert [names[1 << bit] for bit in range(8)] == [
+        "never seen",
+        "stale",
+        "out of range",
+        "no answer",
+        "not connected",
+        "switched off",
+        "suspect",
+        "unhealthy",
+    ]
+    assert names[255] == "not connected"
+    assert names[2 | 4] == "stale"
+    assert tell("marks.js", "m.statusText(6)") == "stale, out of range"
+
+
+FILL = """(() => {
+    const marks = new Uint8Array(5);
+    const how = { dimmed: a[0] && Uint8Array.from(a[0]), isOld: a[1], isWipe: a[2] };
+    const levels = Uint8Array.from([9, 255, 250, 9, 249]);
+    const fill = () => m.fillMarks(Uint8Array.from([0, 0, 0, 1, 0]), levels, marks, how);
+    const first = fill();
+    return [first, fill(), [...marks].map(mark => m.MARKS[mark & ~m.DIMMED].name + (mark & m.DIMMED ? '-' : ''))];
+})()"""
+
+
+@pytest.mark.parametrize(
+    ("dimmed", "is_old", "is_wipe", "marks"),
+    [
+        (None, False, False, ["fresh", "no value", "fresh", "never seen", "fresh"]),
+        (None, True, False, ["stale", "no value", "stale", "never seen", "stale"]),
+        (None, False, True, ["not touched", "no value", "fresh", "never seen", "not touched"]),
+        ([0, 1, 0, 1, 0], False, False, ["fresh", "no value-", "fresh", "never seen-", "fresh"]),
+    ],
+    ids=["now", "old", "wipe", "selected"],
+)
+def test_marks_of_taxels(
+    tell: Callable[..., Any], dimmed: list[int] | None, is_old: bool, is_wipe: bool, marks: list[str]
+) -> None:
+    assert tell("marks.js", FILL, dimmed, is_old, is_wipe) == [True, False, marks]
+
+
+# -- palette.js ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_each_level_is_farther_from_the_ground_in_grey(tell: Callable[..., Any], theme: str) -> None:
+    """Told apart by brightness alone, by whoever sees few colours."""
+    colours = tell("palette.js", "[...m.ramp(a[0])]", theme)
+    luma = [0.2126 * colours[4 * i] + 0.7152 * colours[4 * i + 1] + 0.0722 * colours[4 * i + 2] for i in range(251)]
+    rising = luma if theme == "dark" else luma[::-1]
+    assert all(later >= earlier - 0.5 for earlier, later in pairwise(rising))
+    assert all(later - earlier > 5 for earlier, later in pairwise(rising[::25]))
+
+
+# -- history.js ----------------------------------------------------------------------------------------------------
+
+PAST = """(() => {
+    const past = new m.Past(a[0]);
+    const sheet = { status: new Uint8Array(1000), shear: null, scale: [0, 1], mode: 'raw' };
+    for (let i = 0; i < 100; i++) {
+        sheet.levels = new Uint8Array(1000).fill(i);
+        if (i === 60) sheet.status = new Uint8Array(1000).fill(2);
+        past.push(sheet, 1000 * i);
+    }
+    const level = at_ms => past.at(sheet, at_ms)?.levels[0] ?? null;
+    const found = [past.oldest_ms, past.bytes, level(-5), level(95_400), level(1e9), past.at(sheet, 99_000).status[0]];
+    past.keepOnly([]);
+    return [...found, past.bytes, past.at(sheet, 95_000)];
+})()"""
+
+
+def test_the_past_is_kept_for_a_time_and_in_bounded_memory(tell: Callable[..., Any]) -> None:
+    long, short = {"longest_ms": 30_000, "most_bytes": 1e9}, {"longest_ms": 1e9, "most_bytes": 10_500}
+    assert tell("history.js", PAST, long) == [69_000, 31_000, 69, 95, 99, 2, 0, None]
+    oldest, kept, *rest = tell("history.js", PAST, short)
+    assert kept <= 10_500
+    assert oldest == 90_000
+    assert rest == [90, 95, 99, 2, 0, None]
+
+
+# -- address.js ----------------------------------------------------------------------------------------------------
+
+
+def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
+    view = {
+        "camera": {"position": [1, -2.5, 1e-7], "target": [0, 0, 3]},
+        "mode": "peak",
+        "type": "force",
+        "scale": [-1, 12.5],
+        "selected": "default/a b/can0/board #8&c",
+        "pins": ["default/x:pressure:7a", "default/y:force:1"],
+        "normals": True,
+        "theme": "light",
+    }
+    assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "#", "#eye=1,2", "#eye=1,2,3,4,5,x&scale=1", "#eye=,,,,,&theme=pink&scale=a,b", "#%%%=&=&eye=1e999,1,1,1,1,1"],
+)
+def test_a_bad_address_is_no_view(tell: Callable[..., Any], text: str) -> None:
+    found = tell("address.js", "m.fromHash(a[0])", text)
+    assert [found["camera"], found["scale"], found.get("theme")] == [None, None, None]
+    assert found["pins"] == []
+
+
+# -- spark.js, format.js -------------------------------------------------------------------------------------------
+
+
+def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> None:
+    """One sample among a thousand is not lost; what is older than the line is left out."""
+    line = "m.polyline(Float32Array.from(a[0]), Float32Array.from(a[1]), 100, 50, 10)"
+    times = [-12 + i * 0.01 for i in range(1201)]
+    values = [0.0] * 1201
+    values[0], values[700] = 99, 5
+    found = tell("spark.js", line, times, values)
+    assert (found["low"], found["high"]) == (0, 5)
+    points = [tuple(map(float, point.split(","))) for point in found["points"].split()]
+    assert min(y for _, y in points) == 3
+    assert all(0 <= x <= 100 for x, _ in points)
+    assert tell("spark.js", line, [], []) == {"points": "", "low": None, "high": None}
+    assert tell("spark.js", "m.polyline(Float32Array.of(-1, 0), Float32Array.of(NaN, NaN), 9, 9, 10).points") == ""
+
+
+def test_figures(tell: Callable[..., Any]) -> None:
+    ages = "[0.04, 12.4, 1234, 200000, null, NaN].map(m.age)"
+    assert tell("format.js", ages) == ["0.0 ms", "12 ms", "1.2 s", "3 min", NONE, NONE]
+    figures = "[0, 1.23456, -120345.6, 1.5e-7, 2.5e9, undefined].map(m.figure)"
+    assert tell("format.js", figures) == ["0", "1.235", "-120300", "1.50e-7", "2.50e+9", NONE]
+    assert tell("format.js", "[999, 1234, 4.2e7, 5e12, 9e15].map(m.bytes)") == [
+        "999 B",
+        "1.2 kB",
+        "42.0 MB",
+        "5.0 TB",
+        "9000 TB",
+    ]
+    assert tell("format.js", "[0, 59.96, 125.25].map(m.clock)") == ["0:00.0", "1:00.0", "2:05.3"]
+
+
+# -- tree.js -------------------------------------------------------------------------------------------------------
+
+TREE = """m.rowsOf(a[0], new Map(a[1])).map(function told(row) {
+    return [row.key, row.bad, (row.children ?? []).map(told)];
+})"""
+
+
+def test_what_has_a_problem_is_first_in_the_tree(tell: Callable[..., Any]) -> None:
+    def driver(number: int, patches: int) -> dict[str, Any]:
+        of = [{"name": f"p{i}", "bus": i % 2} for i in range(patches)]
+        return {"id": number, "key": f"d{number}", "name": f"d{number}", "buses": ["x", "y"], "patches": of}
+
+    def state(*patches: str) -> dict[str, Any]:
+        return {"state": "live", "buses": [{"state": "live"}] * 2, "patches": [{"state": one} for one in patches]}
+
+    found = tell(
+        "tree.js", TREE, [driver(0, 2), driver(1, 4)], [[0, state("live", "live")], [1, state(*["live"] * 3, "stale")]]
+    )
+    assert found == [
+        [
+            "d1",
+            2,
+            [
+                ["d1/y", 2, [["d1/y/p3", 2, []], ["d1/y/p1", 0, []]]],
+                ["d1/x", 0, [["d1/x/p0", 0, []], ["d1/x/p2", 0, []]]],
+            ],
+        ],
+        ["d0", 0, [["d0/x", 0, [["d0/x/p0", 0, []]]], ["d0/y", 0, [["d0/y/p1", 0, []]]]]],
+    ]
+    assert tell("tree.js", TREE, [driver(0, 1)], []) == [
+        ["d0", 0, [["d0/x", 0, [["d0/x/p0", 0, []]]], ["d0/y", 0, []]]]
+    ]
+    assert tell("tree.js", "['dead', 'was live', 'stale', 'paused', 'live', undefined].map(m.badness)") == [
+        3,
+        2,
+        2,
+        1,
+        0,
+        0,
+    ]
+
+
+# -- picking.js, overlay.js ----------------------------------------------------------------------------------------
+
+PICK = """m.pick({
+    project: (x, y, z) => [x, y, z], pixels: 40, far: 100, camera: { position: { x: 0, y: 0, z: -100 } },
+}, [{ n: 4, radius: [5, 5, 5, 5],
+      position: [20, 20, 10,  20, 20, 20,  90, 20, 10,  60, 60, 10],
+      normal: [0, 0, 1,  0, 0, -1,  0, 0, 0,  0, 0, 1] }], a[0], a[1])?.i ?? null"""
+
+
+def test_the_taxel_under_the_pointer(tell: Callable[..., Any]) -> None:
+    """One that is seen from inside only where there is no other."""
+    assert tell("picking.js", PICK, 21, 20) == 1
+    assert tell("picking.js", PICK, 95, 20) == 2
+    assert tell("picking.js", PICK, 62, 60) == 3
+    assert tell("picking.js", PICK, 150, 150) is None
+
+
+def test_shear_lies_in_the_skin(tell: Callable[..., Any]) -> None:
+    normals: list[list[float]] = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0.6, 0, 0.8], [0, 0, 0]]
+    for normal in normals:
+        first, second = tell("overlay.js", "m.planeOf(a[0])", normal)
+        for one in (first, second):
+            assert sum(x * x for x in one) == pytest.approx(1)
+            assert sum(x * n for x, n in zip(one, normal, strict=True)) == pytest.approx(0)
+        assert sum(x * y for x, y in zip(first, second, strict=True)) == pytest.approx(0)

@@ -37,6 +37,8 @@ ROWS: dict[int, np.dtype[Any]] = {
     for form, size in ((CLASSIC, 8), (FD, 64))
 }
 """Frames of a piece. Identifiers have the flags of linux/can.h: 29 bits, remote frame, error frame."""
+EXTENDED, REMOTE, ERROR, MASK = 0x8000_0000, 0x4000_0000, 0x2000_0000, 0x1FFF_FFFF
+"""Flags of an identifier: 29 bits, remote frame, error frame; and its own bits."""
 IS_FD = 0x04
 """Flag of a CAN FD frame (``CANFD_FDF``)."""
 IS_CUT = 0x80

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from skinware.conversion import Selection
 
 _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap")
+_WIRE_FORMATS = ("candump", "pcapng")
 
 
 @click.command(
@@ -35,11 +36,14 @@ _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap")
         "skin-convert walk.mcap torso --to csv --type pressure --start 10 --end 12",
         "skin-convert walk.mcap --to parquet --region palm -o palm",
         "skin-convert walk.npz --to mcap -o again.mcap          and back",
+        "skin-convert walk.mcap --to candump                    what went over CAN buses, for canplayer",
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @click.argument("names", metavar="[NAME]...", nargs=-1)
-@click.option("--to", "format_name", type=click.Choice(_FORMATS), required=True, help="Format to write.")
+@click.option(
+    "--to", "format_name", type=click.Choice(_FORMATS + _WIRE_FORMATS), required=True, help="Format to write."
+)
 @click.option(
     "-o",
     "--output",
@@ -77,17 +81,20 @@ def command(
 ) -> None:
     """Write a recording in another format: all drivers and services in it, or only NAME...
 
+    candump and pcapng are of what went over the buses, if that was recorded (skin-record --wire).
+
     FILE may also be what this command wrote as npz, hdf5 or parquet. It is only read; what is damaged in it is left out
     and told. The new file is there when it is complete, not before.
     """
-    from skinware.conversion import convert
+    from skinware.conversion import convert, convert_wires
 
+    write = convert_wires if format_name in _WIRE_FORMATS else convert
     selection = _selection(names, types, patches, in_regions, region_files)
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
     stop = Event()
     with signals_end(stop.set):  # not in the middle of what libraries do
-        converted = convert(file, output, format_name, selection, start_s=start_s, end_s=end_s, is_stopped=stop.is_set)
+        converted = write(file, output, format_name, selection, start_s=start_s, end_s=end_s, is_stopped=stop.is_set)
     for note in converted.notes:
         warn(note)
     if as_json:

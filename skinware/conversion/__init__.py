@@ -8,5 +8,6 @@ from __future__ import annotations
 
 from skinware.conversion.converting import FORMATS, Converted, convert
 from skinware.conversion.selection import Selection
+from skinware.conversion.wires import WIRE_FORMATS, convert_wires
 
-__all__ = ["FORMATS", "Converted", "Selection", "convert"]
+__all__ = ["FORMATS", "WIRE_FORMATS", "Converted", "Selection", "convert", "convert_wires"]

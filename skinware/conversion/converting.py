@@ -92,14 +92,12 @@ def convert(
         OSError: it cannot be read, or the new one cannot be written.
     """
     form = FORMATS[format_name]
-    target = target or path.with_name(path.stem + form.suffix)
-    if target.exists():
-        raise FileExistsError(errno.EEXIST, "exists already: give another name, or remove it", str(target))
+    target = new_target(path, target, form.suffix)
     with contextlib.closing(opened(path, start_s, end_s)) as whole:
         if not whole.tables:
             raise BadRecording(f"{path}: no frames in it that can be used")
         source = _Watched((selection or Selection()).of(whole), is_stopped)
-        with _beside(target) as begun:
+        with begun_beside(target) as begun:
             form.write(source, begun)
             if not source.frames.total():
                 raise ConfigurationError(f"{path}: nothing was recorded of what was asked for in that time")
@@ -133,8 +131,20 @@ def opened(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Sour
     return RecordedSource(path, start_s, end_s)
 
 
+def new_target(path: Path, target: Path | None, suffix: str) -> Path:
+    """Where a file is converted to: the target itself, or, if that is None, a name beside the file.
+
+    Raises:
+        FileExistsError: something is there.
+    """
+    target = target or path.with_name(path.stem + suffix)
+    if target.exists():
+        raise FileExistsError(errno.EEXIST, "exists already: give another name, or remove it", str(target))
+    return target
+
+
 @contextlib.contextmanager
-def _beside(target: Path) -> Iterator[Path]:
+def begun_beside(target: Path) -> Iterator[Path]:
     """A path to write at, which gets its name when all is written; what was begun is removed otherwise."""
     begun = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:

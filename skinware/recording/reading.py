@@ -16,7 +16,7 @@ from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, 
 from skinware.recording.timeline import GONE, LIVE, PAUSED, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
-from skinware.recording.wires import WireTrack
+from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
 
 

@@ -24,7 +24,7 @@ from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
-from skinware.recording.wires import message_of
+from skinware.recording.wire_tracks import message_of
 from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4

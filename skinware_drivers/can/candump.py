@@ -1,22 +1,13 @@
-"""CAN frames as text, one a line, as ``candump -L`` writes them and ``canplayer`` and python-can read them.
-
-::
-
-    (1700000000.123456) vcan0 473#40F0F0F0F0F0F0F0      11-bit identifier: three digits
-    (1700000000.123456) vcan0 12345678#0102             29-bit identifier: eight digits
-    (1700000000.123456) vcan0 473##1112233              CAN FD: a second # and the flags (1 bit-rate switch, 2 error)
-
-Source: can-utils lib.h and the manual of candump.
-"""
+"""The CAN frames of a batch as text (:func:`skinware.candump.candump_line`)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from skinware.candump import candump_line
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 
-_LONGEST_INTERFACE = 15  # IFNAMSIZ without its end
 _FD_BYTES = 8
 _FD_FLAG = 0x04  # CANFD_FDF of linux/can.h; newer kernels set it
 _FD_FLAGS = 0x03
@@ -44,12 +35,10 @@ class TextFrame:
         """The line of it, without an end.
 
         Args:
-            channel: name of the interface; see :func:`channel_name`.
+            channel: name of the interface; see :func:`skinware.candump.channel_name`.
         """
-        seconds, microseconds = divmod(self.time_us, 1_000_000)
-        identifier = f"{self.identifier:08X}" if self.extended else f"{self.identifier:03X}"
-        flags = "" if self.fd is None else f"#{self.fd:X}"
-        return f"({seconds}.{microseconds:06d}) {channel} {identifier}#{flags}{self.payload.hex().upper()}"
+        identifier = self.identifier | (EXTENDED_FLAG if self.extended else 0)
+        return candump_line(self.time_us, channel, identifier, self.fd, self.payload)
 
 
 def text_frames(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[TextFrame]:
@@ -73,9 +62,3 @@ def text_frames(batch: FrameBatch, epoch_offset_ns: int) -> Iterator[TextFrame]:
             fd=flags & _FD_FLAGS if is_fd else None,
             payload=payload[:length].tobytes(),
         )
-
-
-def channel_name(interface: str, channel: str) -> str:
-    """A name without blanks that can stand for an interface: ``can0``, ``ttyACM0``, ``virtual``."""
-    name = channel.rpartition("/")[2] or interface
-    return "".join(letter if letter.isalnum() or letter in "._-" else "_" for letter in name)[:_LONGEST_INTERFACE]

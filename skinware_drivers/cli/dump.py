@@ -42,9 +42,10 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
         BusNotAvailable: the bus cannot be opened, or went away.
         BusError: nothing came for ``timeout_s``.
     """
+    from skinware.candump import channel_name
     from skinware.realtime import now_ns
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.can.candump import channel_name, text_frames
+    from skinware_drivers.can.candump import text_frames
     from skinware_drivers.registry import make_bus
 
     interface, channel, _ = parse_bus_name(bus_name)

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.cli.convert import _FORMATS
+from skinware.cli.convert import _FORMATS, _WIRE_FORMATS
 from skinware.cli.convert import command as convert
-from skinware.conversion import FORMATS
+from skinware.conversion import FORMATS, WIRE_FORMATS
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 from tests.commands import BIN, PATIENCE_S
@@ -148,3 +148,4 @@ def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: st
 
 def test_it_offers_what_there_is() -> None:
     assert set(_FORMATS) == set(FORMATS)
+    assert set(_WIRE_FORMATS) == set(WIRE_FORMATS)

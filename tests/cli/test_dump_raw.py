@@ -13,10 +13,11 @@ import can
 import numpy as np
 import pytest
 
+from skinware.candump import channel_name
 from skinware.cli._command import exit_status
 from skinware.cli.dump import command as frames_command
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.can.candump import TextFrame, channel_name, text_frames
+from skinware_drivers.can.candump import TextFrame, text_frames
 from skinware_drivers.cli.dump import command
 from skinware_drivers.finding import running
 from skinware_drivers.finding.running import RunningDriver

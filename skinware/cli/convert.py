@@ -24,7 +24,7 @@ from skinware.cli._command import (
 if TYPE_CHECKING:
     from skinware.conversion import Selection
 
-_FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap")
+_FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap", "foxglove", "ros2")
 _WIRE_FORMATS = ("candump", "pcapng")
 
 
@@ -37,6 +37,8 @@ _WIRE_FORMATS = ("candump", "pcapng")
         "skin-convert walk.mcap --to parquet --region palm -o palm",
         "skin-convert walk.npz --to mcap -o again.mcap          and back",
         "skin-convert walk.mcap --to candump                    what went over CAN buses, for canplayer",
+        "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
+        "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
@@ -49,7 +51,7 @@ _WIRE_FORMATS = ("candump", "pcapng")
     "--output",
     metavar="OUT",
     type=click.Path(path_type=Path),
-    help="The new file; of csv and parquet, folder.  [default: beside FILE]",
+    help="The new file; of csv, parquet and ros2, folder.  [default: beside FILE]",
 )
 @click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; repeat it for several.")
 @click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; likewise.")

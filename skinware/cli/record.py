@@ -90,6 +90,12 @@ def past(text: str) -> float:
     type=past,
     help="Keep only the last TIME (60s, 5min), in memory; saved on SIGUSR1 and at the end.",
 )
+@click.option(
+    "--viewers",
+    "for_viewers",
+    is_flag=True,
+    help="Record also what Foxglove and Lichtblick show: points, images and states, 30 times a second.",
+)
 @click.option("--wire", "with_wires", is_flag=True, help="Record the frames and bytes on the drivers' buses, too.")
 @namespace_option
 @json_option
@@ -101,6 +107,7 @@ def command(
     split_size: int | None,
     max_size: int | None,
     last_s: float | None,
+    for_viewers: bool,
     with_wires: bool,
     namespace: str | None,
     as_json: bool,
@@ -112,6 +119,7 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
+    from skinware.conversion.viewers import Viewers
     from skinware.memory.namespace import Namespace, check_name
     from skinware.recording.recorder import Recorder
 
@@ -122,7 +130,8 @@ def command(
     place = Namespace(namespace)
     path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
-    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires)
+    beside = Viewers() if for_viewers else None
+    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, beside=beside)
     report = _Report(recorder, target, path, as_json)
     failed = True
     with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from skinware.conversion.csv_text import write_csv
+from skinware.conversion.csv_text import csv_without, write_csv
 from skinware.conversion.hdf5 import Hdf5Source, write_hdf5
 from skinware.conversion.npz import NpzSource, write_npz
 from skinware.conversion.parquet import DESCRIPTION, ParquetSource, write_parquet
@@ -20,6 +20,7 @@ from skinware.conversion.recorded import RecordedSource
 from skinware.conversion.selection import Selection
 from skinware.conversion.tables import TIME, Block, Source, Table
 from skinware.conversion.to_recording import write_recording
+from skinware.conversion.to_viewers import ros2_without, viewers_without, write_foxglove, write_ros2
 from skinware.errors import BadRecording, ConfigurationError
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -32,20 +33,22 @@ class Format(NamedTuple):
     Attributes:
         suffix: of its files, or of its folders.
         write: writes a source into a path at which nothing is.
-        leaves_out: what of a recording it cannot hold, for people; empty: nothing.
+        without: tells of a source what the format cannot hold of it; a line each.
     """
 
     suffix: str
     write: Callable[[Source, Path], None]
-    leaves_out: str = ""
+    without: Callable[[Source], list[str]] = lambda _: []
 
 
 FORMATS = {
-    "csv": Format("-csv", write_csv, "counters, histograms and events"),
+    "csv": Format("-csv", write_csv, csv_without),
     "npz": Format(".npz", write_npz),
     "parquet": Format("-parquet", write_parquet),
     "hdf5": Format(".h5", write_hdf5),
     "mcap": Format(".mcap", write_recording),
+    "foxglove": Format(".foxglove.mcap", write_foxglove, viewers_without),
+    "ros2": Format("-ros2", write_ros2, ros2_without),
 }
 
 
@@ -101,10 +104,8 @@ def convert(
             form.write(source, begun)
             if not source.frames.total():
                 raise ConfigurationError(f"{path}: nothing was recorded of what was asked for in that time")
-        left_out = [f"{target}: {form.leaves_out} are left out: {format_name} does not hold them"] * bool(
-            form.leaves_out
-        )
-        return Converted(target, source.frames, [*source.problems, *left_out])
+        notes = [f"{target}: {note}" for note in form.without(source)]
+        return Converted(target, source.frames, [*source.problems, *notes])
 
 
 def opened(path: Path, start_s: float = 0.0, end_s: float | None = None) -> Source:

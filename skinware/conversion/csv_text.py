@@ -46,6 +46,11 @@ def write_csv(source: Source, folder: Path) -> None:
             _write_frames(table, folder, open_files, source.start_ns)
 
 
+def csv_without(_: Source) -> list[str]:
+    """What a folder of texts does not have of a recording."""
+    return ["counters, histograms and events are left out: csv does not hold them"]
+
+
 def _write_frames(table: Table, folder: Path, open_files: ExitStack, start_ns: int) -> None:
     wanted = [output for output in outputs(table) if _is_wanted(table, output)]
     of_frames = [output for output in wanted if output.name.startswith(FRAMES)]

@@ -7,17 +7,13 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from mcap.records import Channel, Schema
-
-from skinware.conversion.tables import COLUMNS, TIME, Source, Table
-from skinware.memory.file_layout import SLOT
+from skinware.conversion.tables import Source
+from skinware.conversion.timed_frames import TimedFrame, timed_frames
 from skinware.realtime import NS_PER_S
 from skinware.recording.codec import Encoder
 from skinware.recording.files import Head, RecordingFile
-from skinware.recording.frames import RecordedFrame
 from skinware.recording.generation import Generation
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
@@ -25,8 +21,19 @@ from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 _CHUNK_NS = NS_PER_S // 4
 _CHUNK_BYTES = 8 << 20
 
-_Item = tuple[int, str, Any]
-"""(wall clock, service or topic, a frame after its generation or what JSON has)"""
+
+class _Told(NamedTuple):
+    """An event, or what the clocks were.
+
+    Attributes:
+        time_ns: wall clock.
+        topic: of which.
+        data: as JSON has it.
+    """
+
+    time_ns: int
+    topic: str
+    data: dict[str, Any]
 
 
 def write_recording(source: Source, path: Path) -> None:
@@ -37,40 +44,26 @@ def write_recording(source: Source, path: Path) -> None:
     """
     file = RecordingFile(path)
     writer = _Writer(file)
+    items: list[Iterator[TimedFrame | _Told]] = [
+        *(timed_frames([table]) for table in source.tables),
+        _told(EVENTS, source.events),
+        _told(CLOCK, source.clock),
+    ]
     try:
-        streams = [_frames(table) for table in source.tables]
-        streams += [_told(EVENTS, source.events), _told(CLOCK, source.clock)]
-        for time_ns, name, what in heapq.merge(*streams, key=lambda item: item[0]):
-            writer.close_chunk_before(time_ns)
-            if isinstance(what, dict):
-                writer.add_json(time_ns, name, what)
+        for item in heapq.merge(*items, key=lambda item: item.time_ns):
+            writer.close_chunk_before(item.time_ns)
+            if isinstance(item, TimedFrame):
+                writer.add_frame(item)
             else:
-                writer.add_frame(time_ns, name, *what)
+                writer.add_json(item)
         writer.close_chunk()
     finally:
         file.finish()
 
 
-def _frames(table: Table) -> Iterator[_Item]:
-    generations = {generation.generation: generation for generation in table.generations}
-    origin = table.origin
-    for block in table.blocks(table.arrays):
-        slots = np.zeros((len(block[TIME]), origin.slot_stride), np.uint8)
-        heads = slots[:, : SLOT.itemsize].view(SLOT)[:, 0]
-        for name in ("sequence", "acquired_ns", "published_ns", "flags"):
-            heads[name] = block[f"frames/{name}"]
-        for name, (_, _, offset) in origin.columns.items():
-            rows = block.get(COLUMNS + name)
-            if rows is not None:
-                data = np.frombuffer(rows.tobytes(), np.uint8).reshape(len(slots), -1)
-                slots[:, offset : offset + data.shape[1]] = data
-        for slot, number, time_ns in zip(slots, block["frames/generation"].tolist(), block[TIME].tolist(), strict=True):
-            yield time_ns, table.service, (generations[number], RecordedFrame(generations[number], slot.data))
-
-
-def _told(topic: str, told: list[dict[str, Any]]) -> Iterator[_Item]:
+def _told(topic: str, told: list[dict[str, Any]]) -> Iterator[_Told]:
     for each in told:
-        yield each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"}
+        yield _Told(each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"})
 
 
 @dataclass
@@ -95,21 +88,21 @@ class _Writer:
         self._streams: dict[str, _Stream] = {}
         self._chunk, self._heads, self._begun_ns = OpenChunk(), set[Head](), 0
 
-    def add_frame(self, time_ns: int, service: str, generation: Generation, frame: RecordedFrame) -> None:
+    def add_frame(self, timed: TimedFrame) -> None:
         """A frame of a service."""
-        stream = self._streams.get(service)
-        if stream is None or stream.generation is not generation:
-            stream = self._streams[service] = self._stream(service, generation, stream)
-        channel, schema = self._channels.of_service(service, FRAME)
+        stream = self._streams.get(timed.service)
+        if stream is None or stream.generation is not timed.generation:
+            stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
+        channel, schema = self._channels.of_service(timed.service, FRAME)
         if not self._chunk.has(channel):
             stream.encoder.next_is_key()
         self._heads.add(stream.head)
-        self._add(channel, schema, frame.sequence, time_ns, stream.encoder.encode(frame))
+        self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
 
-    def add_json(self, time_ns: int, topic: str, data: dict[str, Any]) -> None:
+    def add_json(self, told: _Told) -> None:
         """An event, or what the clocks were."""
-        channel, schema = self._channels.of_all(topic)
-        self._add(channel, schema, 0, time_ns, json.dumps(data).encode())
+        channel, schema = self._channels.of_all(told.topic)
+        self._chunk.add(channel, schema, 0, told.time_ns, json.dumps(told.data).encode())
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
@@ -127,6 +120,3 @@ class _Writer:
         number = 1 if before is None else before.head.sequence + 1
         channel, schema = self._channels.of_service(service, GENERATION)
         return _Stream(Head(channel, schema, number, generation.head), generation, Encoder(generation.coded))
-
-    def _add(self, channel: Channel, schema: Schema, sequence: int, time_ns: int, data: bytes) -> None:
-        self._chunk.add(channel, schema, sequence, time_ns, data)

@@ -59,6 +59,10 @@ class RecordedSnapshot(Snapshot):
 
 def frames_of(generation: Generation, run: Run) -> Iterator[RecordedFrame]:
     """The frames of a run; they share one piece of memory."""
-    frame_class = RecordedDriverFrame if generation.is_driver else RecordedFrame
     for slot in run.decode_slots(generation.slot_stride):
-        yield frame_class(generation, memoryview(slot))
+        yield frame_of(generation, slot)
+
+
+def frame_of(generation: Generation, slot: npt.NDArray[np.uint8]) -> RecordedFrame:
+    """The frame that stands in (stride,) bytes, as it was in the ring."""
+    return (RecordedDriverFrame if generation.is_driver else RecordedFrame)(generation, memoryview(slot.data))

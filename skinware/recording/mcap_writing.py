@@ -161,6 +161,7 @@ class McapFile:
 
     Args:
         path: of the file, which must not be there.
+        profile: what MCAP tools may expect of its channels.
 
     Attributes:
         size: bytes in it so far.
@@ -169,7 +170,7 @@ class McapFile:
         OSError: it cannot be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, profile: str = PROFILE) -> None:
         from importlib.metadata import version
 
         self.path: Path = path
@@ -180,7 +181,7 @@ class McapFile:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self.size: int = 0
         try:
-            self._append(MAGIC + _bytes(Header(PROFILE, f"skinware {version('skinware')}")))
+            self._append(MAGIC + _bytes(Header(profile, f"skinware {version('skinware')}")))
         except BaseException:
             os.close(self._fd)
             path.unlink()

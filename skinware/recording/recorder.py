@@ -6,15 +6,19 @@ cannot keep up (a slow disk), frames wait in memory; where that is full, they ar
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+from mcap.records import Schema
+
+from skinware.errors import BadRecording
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -22,6 +26,7 @@ from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.recording.codec import CodedColumn, Encoder
 from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
+from skinware.recording.generation import Generation
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
@@ -61,6 +66,22 @@ class _End:
     """That was all."""
 
 
+class Beside(Protocol):
+    """Makes messages of frames, such as viewers know."""
+
+    def messages(
+        self, service: str, generation: Generation, frame: Frame, time_ns: int
+    ) -> Iterable[tuple[str, str, Schema, bytes]]:
+        """(topic, encoding, schema, data) of each message.
+
+        Args:
+            service: whose frame.
+            generation: of it.
+            frame: it.
+            time_ns: when it was published, wall clock.
+        """
+
+
 class Recorder:
     """Records until it is stopped.
 
@@ -69,6 +90,7 @@ class Recorder:
         names: of services; None: all there are and come.
         namespace: where they are.
         with_wires: record also what goes over the wires of the drivers.
+        beside: makes messages that are recorded beside frames.
     """
 
     def __init__(
@@ -78,11 +100,12 @@ class Recorder:
         names: Collection[str] | None = None,
         namespace: Namespace | str | None = None,
         with_wires: bool = False,
+        beside: Beside | None = None,
     ) -> None:
         self._target = target
         self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
-        self._coder = _Coder(target, self._jobs)
+        self._coder = _Coder(target, self._jobs, beside)
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # what comes later is recorded from its first frame on
         self._stopping = False
@@ -171,6 +194,7 @@ class _Stream:
 
     head: Head
     encoder: Encoder
+    generation: Generation | None
 
 
 @dataclass(frozen=True)
@@ -184,12 +208,17 @@ class _WireStream:
 class _Coder(threading.Thread):
     """Codes frames, fills chunks, and hands them to the target when they are due."""
 
-    def __init__(self, target: Target, jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End]) -> None:
+    def __init__(
+        self,
+        target: Target,
+        jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End],
+        beside: Beside | None,
+    ) -> None:
         super().__init__(name="skinware recorder")
         self.channels = Channels()
         self.bytes_done = 0
         self.failure: Exception | None = None
-        self._target, self._jobs = target, jobs
+        self._target, self._jobs, self._beside = target, jobs, beside
         self._streams: dict[str, _Stream | _WireStream] = {}
         self._chunk = OpenChunk()
         self._heads: set[Head] = set()
@@ -251,7 +280,11 @@ class _Coder(threading.Thread):
         channel, schema = self.channels.of_service(service, GENERATION)
         columns = segment.layout.slot
         encoder = Encoder([CodedColumn.of(column) for column in columns])
-        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder)
+        generation = None
+        if self._beside is not None:
+            with contextlib.suppress(BadRecording):  # of no driver that anybody could show
+                generation = Generation(head, service)
+        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder, generation)
 
     def _add_frame(self, stream: _Stream, service: str, frame: Frame) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
@@ -260,6 +293,9 @@ class _Coder(threading.Thread):
         self._heads.add(stream.head)
         time_ns = frame.published_ns + self._offset_ns
         self._add(channel, schema, frame.sequence, time_ns, stream.encoder.encode(frame))
+        if self._beside is not None and stream.generation is not None:
+            for topic, encoding, known, data in self._beside.messages(service, stream.generation, frame, time_ns):
+                self._add(*self.channels.of(topic, encoding, known), frame.sequence, time_ns, data)
 
     def _add_wire(self, stream: _WireStream, frame: Frame) -> None:
         bus = int(frame.column("bus")[()])

@@ -62,23 +62,24 @@ class Channels:
 
     def of_service(self, name: str, what: str) -> tuple[Channel, Schema]:
         """The channel of a service's frames, or of its generations."""
-        return self._of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
+        return self.of(f"/skin/{name}/{what}", ENCODING, SCHEMAS[what])
 
     def of_all(self, topic: str) -> tuple[Channel, Schema]:
         """The channel of events, or of the clock."""
-        return self._of(topic, "json", SCHEMAS[topic])
+        return self.of(topic, "json", SCHEMAS[topic])
 
     def of_wire(self, driver: str, bus: str) -> tuple[Channel, Schema]:
         """The channel of what went over a bus of a driver."""
-        return self._of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
+        return self.of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
 
     def names(self) -> dict[int, str]:
         """Topics by number."""
         return {channel.id: topic for topic, channel in self._channels.items()}
 
-    def _of(
+    def of(
         self, topic: str, encoding: str, schema: Schema, metadata: dict[str, str] | None = None
     ) -> tuple[Channel, Schema]:
+        """The channel of a topic; the schema is given back."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = Channel(len(self._channels) + 1, topic, encoding, metadata or {}, schema.id)

@@ -1,6 +1,6 @@
 """Recording: what it costs, how large it is, and what a killed recorder leaves; of the recorder as people start it.
 
-tools/bench record [cost|kills] [--seconds S] [--kills N] [--sensors N ...] [--pattern analogue|quiet ...]
+tools/bench record [cost|kills|convert] [--viewers] [--seconds S] [--kills N] [--sensors N ...] [--pattern NAME ...]
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,11 +26,14 @@ from processes import Processes, answer, own_namespace
 
 import skinware.recording
 from skinware import DriverReader, DriverWriter, Structure
+from skinware.conversion import FORMATS
+from skinware.geometry import Geometry
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import Periodic, now_ns
 from skinware.recording.recovery import recover
 from skinware.sensor_types import PRESSURE
 
+BIN = Path(sys.executable).parent
 RATE_HZ = 100
 SMALL, LARGE = 768, 30_848
 PATTERNS = ("analogue", "quiet")
@@ -56,7 +60,16 @@ def structure_of(sensors: int) -> Structure:
         sensor_type=[PRESSURE.id] * sensors,
         sensor_module=np.arange(sensors) // PER_MODULE,
         dtype="u2",
+        geometry=_places(sensors),
     )
+
+
+def _places(sensors: int) -> Geometry:
+    """A plane of sensors."""
+    places = Geometry.unknown([PRESSURE.name] * sensors, np.arange(sensors, dtype=np.uint64))
+    places.position_m[:] = np.stack((*np.divmod(np.arange(sensors), 176), np.zeros(sensors)), axis=1) * 0.0065
+    places.frame[:] = "chest"
+    return places
 
 
 def drive(pipe: Connection, namespace: str, sensors: int, pattern: str) -> None:
@@ -118,8 +131,8 @@ def driving(namespace: str, sensors: int, pattern: str) -> Iterator[Connection]:
 
 
 @contextmanager
-def recording(namespace: str, file: Path) -> Iterator[subprocess.Popen[str]]:
-    command = [str(Path(sys.executable).parent / "skin-record"), "-o", str(file), "--namespace", namespace, "--json"]
+def recording(namespace: str, file: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    command = [str(BIN / "skin-record"), "-o", str(file), "--namespace", namespace, "--json", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -139,14 +152,14 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
+def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path, *options: str) -> None:
     """Processor time, bytes a frame and losses, by skin and pattern."""
     print(f"{RATE_HZ} Hz, {seconds:g} s each; load {os.getloadavg()[0]:.1f}")
     for sensors in skins:
         for pattern in patterns:
             with own_namespace() as namespace:
                 file = folder / f"{sensors}-{pattern}.mcap"
-                with driving(namespace.name, sensors, pattern), recording(namespace.name, file) as process:
+                with driving(namespace.name, sensors, pattern), recording(namespace.name, file, *options) as process:
                     begin_s, used_s, size = time.monotonic(), cpu_s(process.pid), file.stat().st_size
                     time.sleep(seconds)
                     share = (cpu_s(process.pid) - used_s) / (time.monotonic() - begin_s)
@@ -209,19 +222,56 @@ def kills(count: int, skins: list[int], folder: Path) -> None:
         print(f"  {sensors:6} sensors, {count} kills: missing p50 {p50:.3f} s, most {most:.3f} s", flush=True)
 
 
+def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
+    """How long a conversion takes, how large its result is, and how much memory it had."""
+    for sensors in skins:
+        for pattern in patterns:
+            file = folder / f"{sensors}-{pattern}.mcap"
+            with own_namespace() as namespace, driving(namespace.name, sensors, pattern):
+                options = ["-o", str(file), "--namespace", namespace.name, "-T", str(seconds)]
+                subprocess.run([BIN / "skin-record", *options], check=True, stdout=subprocess.DEVNULL)
+            with skinware.recording.open(file) as opened:
+                frames = len(opened["large"].read(["latency_ns"]))
+            print(f"  {sensors:6} sensors, {pattern}: {frames} frames", flush=True)
+            for name in FORMATS:
+                target = folder / f"converted-{name}"
+                begin_s = time.monotonic()
+                process = subprocess.Popen(
+                    [BIN / "skin-convert", file, "--to", name, "-o", target],
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )
+                _, status, usage = os.wait4(process.pid, 0)
+                process.returncode = os.waitstatus_to_exitcode(status)
+                passed_s = time.monotonic() - begin_s
+                assert not process.returncode
+                files = [target] if target.is_file() else list(target.iterdir())
+                size = sum(each.stat().st_size for each in files)
+                print(
+                    f"    {name:<8} {1e3 * passed_s / frames:7.2f} ms a frame, {size / frames / 1e3:7.1f} kB a frame,"
+                    f" at most {usage.ru_maxrss / 1024:.0f} MiB",
+                    flush=True,
+                )
+                shutil.rmtree(target) if target.is_dir() else target.unlink()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["cost", "kills"])
+    parser.add_argument("what", nargs="?", choices=["cost", "kills", "convert"])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--sensors", type=int, nargs="+", default=[LARGE, SMALL], metavar="N")
     parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
+    parser.add_argument("--viewers", action="store_true", help="cost of a recorder with --viewers")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if options.what in (None, "cost"):
-            cost(options.seconds, options.sensors, options.pattern, Path(folder))
+            more = ["--viewers"] * options.viewers
+            cost(options.seconds, options.sensors, options.pattern, Path(folder), *more)
         if options.what in (None, "kills"):
             kills(options.kills, options.sensors, Path(folder))
+        if options.what in (None, "convert"):
+            convert(options.seconds, options.sensors, options.pattern, Path(folder))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,221 @@
+"""What viewers are shown of a driver: point clouds, images and a state, a few times a second."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mcap.records import Schema
+
+from skinware._names import distinct
+from skinware.conversion import definitions
+from skinware.conversion.cdr import Cdr
+from skinware.driver_frame import DriverFrame
+from skinware.sensor_types import SensorType
+from skinware.status import BusState, PatchState
+from skinware.structure import Index, Structure
+from skinware.views.shapes import shape_of
+
+_FLOAT32, _UINT8 = 7, 2
+"""Types of fields of a PointCloud2."""
+_FIELDS = (("x", _FLOAT32), ("y", _FLOAT32), ("z", _FLOAT32), ("intensity", _FLOAT32), ("status", _UINT8))
+_POINT = np.dtype([(name, "<f4" if kind == _FLOAT32 else "u1") for name, kind in _FIELDS])
+_GRID = re.compile(r"[1-9]\d*x[1-9]\d*")
+_NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
+
+
+class Message(NamedTuple):
+    """A message for viewers.
+
+    Attributes:
+        topic: its channel's.
+        encoding: likewise.
+        schema: likewise.
+        data: of it.
+    """
+
+    topic: str
+    encoding: str
+    schema: Schema
+    data: bytes
+
+
+class Showing:
+    """What is shown of one generation of a driver.
+
+    Args:
+        name: of the driver.
+        structure: of the generation.
+        json_state: the state is JSON as it is; else it is in a ``std_msgs/String``, for ROS 2.
+
+    Attributes:
+        has_points: whether the place of any sensor is known.
+    """
+
+    def __init__(self, name: str, structure: Structure, *, json_state: bool = True) -> None:
+        self._name, self._structure, self._json_state = name, structure, json_state
+        self._clouds = list(_clouds(name, structure))
+        self.has_points: bool = bool(self._clouds)
+        self._images = list(_images(name, structure, only_grids=self.has_points))
+
+    def messages(self, frame: DriverFrame, time_ns: int) -> Iterator[Message]:
+        """What is shown of a frame.
+
+        Args:
+            frame: it.
+            time_ns: when it was published, wall clock.
+        """
+        acquired_ns = time_ns - frame.published_ns + frame.acquired_ns if frame.acquired_ns else time_ns
+        values = {each.name: self._structure.physical(frame.values, each.name) for each in self._structure.types}
+        for cloud in self._clouds:
+            yield cloud.message(values[cloud.type_name], frame.status, acquired_ns)
+        for image in self._images:
+            yield image.message(values[image.sensor_type.name], frame.status, acquired_ns)
+        yield self._state(frame)
+
+    def _state(self, frame: DriverFrame) -> Message:
+        structure = self._structure
+        fresh = np.bincount(structure.sensor_patch[frame.status == 0], minlength=structure.n_patches)
+        state = {
+            "driver": self._name,
+            "sequence": frame.sequence,
+            "age_ms": (frame.published_ns - frame.acquired_ns) / 1e6,
+            "patches": [
+                {"name": name, "state": _name(PatchState, state), "fresh": count}
+                for name, state, count in zip(
+                    structure.patch_names, frame.patch_state.tolist(), fresh.tolist(), strict=True
+                )
+            ],
+            "buses": [
+                {"name": name, "state": _name(BusState, state), "load": load / 1000}
+                for name, state, load in zip(
+                    structure.buses, frame.bus_state.tolist(), frame.bus_load.tolist(), strict=True
+                )
+            ],
+        }
+        topic, text = f"/skin/{in_topic(self._name)}/state", json.dumps(state)
+        if self._json_state:
+            return Message(topic, "json", definitions.STATE, text.encode())
+        return Message(topic, "cdr", definitions.TEXT, Cdr().text(text).done())
+
+
+def in_topic(text: str) -> str:
+    """A text as a part of a ROS topic: letters, digits and underscores, no digit first."""
+    plain = _NOT_IN_TOPICS.sub("_", text)
+    return f"_{plain}" if not plain or plain[0].isdigit() else plain
+
+
+def _name(kind: Any, number: int) -> str:
+    try:
+        return str(kind(number).name.lower())
+    except ValueError:
+        return str(number)
+
+
+class _Cloud:
+    """Sensors of one type whose places are known in one coordinate frame."""
+
+    def __init__(
+        self, topic: str, type_name: str, frame: str, index: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]
+    ) -> None:
+        self.type_name = type_name
+        self._topic, self._frame, self._index, self._rows = topic, frame, index, rows
+        self.points = np.zeros(len(rows), _POINT)
+
+    def message(self, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int) -> Message:
+        self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
+        cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
+        for number, (name, kind) in enumerate(_FIELDS):
+            cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
+        cdr.numbers("?", False).numbers("I", _POINT.itemsize, self.points.nbytes).array(self.points)
+        is_dense = bool(np.isfinite(self.points["intensity"]).all())
+        return Message(self._topic, "cdr", definitions.POINTS, cdr.numbers("?", is_dense).done())
+
+
+def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:
+    geometry = structure.geometry
+    if geometry is None:
+        return
+    for sensor_type in structure.types:
+        positions = np.arange(structure.n_sensors)[structure.index(sensor_type.name)]
+        frames = geometry.frame[positions]
+        known = geometry.known[positions]
+        found = sorted(set(frames[known].tolist()))
+        for frame in found:
+            rows = np.flatnonzero(known & (frames == frame))
+            parts = ["points", in_topic(sensor_type.name), *([in_topic(frame)] * (len(found) > 1))]
+            cloud = _Cloud("/".join(["/skin", in_topic(name), *parts]), sensor_type.name, frame, positions[rows], rows)
+            for axis, letter in enumerate("xyz"):
+                cloud.points[letter] = geometry.position_m[positions[rows], axis]
+            yield cloud
+
+
+class _Image:
+    """Sensors of one type of a patch, side by side; the brighter, the more. Black: no sensor, or no good value."""
+
+    def __init__(
+        self, topic: str, frame: str, sensor_type: SensorType, index: Index, pixels: npt.NDArray[np.int64]
+    ) -> None:
+        self.sensor_type = sensor_type
+        self._topic, self._frame, self._index, self._pixels = topic, frame, index, pixels
+        self._is_bounded = math.isfinite(sensor_type.minimum) and math.isfinite(sensor_type.maximum)
+
+    def message(self, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int) -> Message:
+        good = (status[self._index] == 0) & np.isfinite(values)
+        if self._is_bounded:
+            span = max(self.sensor_type.maximum - self.sensor_type.minimum, 1e-30)
+            scaled = np.clip((values - self.sensor_type.minimum) / span, 0, 1) * 65534 + 1
+            shown = np.where(good, scaled, 0).astype("<u2")
+        else:
+            shown = np.where(good, values, 0).astype("<f4")
+        image = np.append(shown, shown.dtype.type(0))[self._pixels]
+        height, width = image.shape
+        cdr = Cdr().header(time_ns, self._frame).numbers("I", height, width)
+        cdr.text("mono16" if self._is_bounded else "32FC1").numbers("B", 0).numbers("I", width * image.itemsize)
+        return Message(self._topic, "cdr", definitions.IMAGE, cdr.array(image.reshape(-1).view(np.uint8)).done())
+
+
+def _images(name: str, structure: Structure, *, only_grids: bool) -> Iterator[_Image]:
+    plain = [in_topic(each) for each in structure.patch_names]
+    patches = [in_topic(each) for each in distinct(plain, list(map(str, range(len(plain)))), "")]
+    kinds = [kind.decode(errors="replace") for kind in structure.module_kind.tolist()]
+    for sensor_type in structure.types:
+        index = structure.index(sensor_type.name)
+        modules = structure.module_of(sensor_type.name)
+        for patch, patch_name in enumerate(patches):
+            of_patch = np.flatnonzero(structure.module_patch[modules] == patch)
+            numbers = list(dict.fromkeys(modules[of_patch].tolist()))
+            is_grid = all(_GRID.fullmatch(kinds[module]) for module in numbers)
+            if numbers and (is_grid or not only_grids):
+                rows = [of_patch[modules[of_patch] == module] for module in numbers]
+                pixels = _side_by_side([_pixels(kinds[m], each) for m, each in zip(numbers, rows, strict=True)])
+                parts = ["image", in_topic(patch_name), in_topic(sensor_type.name)]
+                topic = "/".join(["/skin", in_topic(name), *parts])
+                yield _Image(topic, patch_name, sensor_type, index, pixels)
+
+
+def _pixels(kind: str, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(height, width) which of its sensors each pixel of a module is; -1: none. A sensor is a pixel, or two by two."""
+    shape = shape_of(kind, len(rows))
+    pixels = np.full((2 * shape.rows, shape.halves), -1)
+    for row, (line, half) in zip(rows.tolist(), shape.cells, strict=True):
+        pixels[2 * line : 2 * line + 2, half : half + 2] = row
+    return pixels if any(half % 2 for _, half in shape.cells) else pixels[::2, ::2]
+
+
+def _side_by_side(parts: Sequence[npt.NDArray[np.int64]]) -> npt.NDArray[np.int64]:
+    """Modules in rows, with a pixel between them; -1 where there is none."""
+    height, width = (max(part.shape[axis] for part in parts) for axis in (0, 1))
+    columns = max(1, round(math.sqrt(len(parts) * height / width)))
+    lines = -(-len(parts) // columns)
+    pixels = np.full((lines * (height + 1) - 1, min(columns, len(parts)) * (width + 1) - 1), -1)
+    for number, part in enumerate(parts):
+        line, column = divmod(number, columns)
+        top, left = line * (height + 1), column * (width + 1)
+        pixels[top : top + part.shape[0], left : left + part.shape[1]] = part
+    return pixels

@@ -20,7 +20,7 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
 from skinware.samples import SAMPLE, SAMPLES
-from skinware.service import DEFAULT_SLOTS, Columns, RequestServer, ServiceReader, ServiceWriter
+from skinware.service import Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
 __all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter"]
@@ -51,7 +51,7 @@ class DriverWriter:
         bus_counters: Sequence[str] = (),
         patch_counters: Sequence[str] = (),
         namespace: Namespace | str | None = None,
-        slots: int = DEFAULT_SLOTS,
+        slots: int | None = None,
         rate_hz: float | None = None,
         group: str | None = None,
         operations: Mapping[str, Callable[..., object]] | None = None,
@@ -79,6 +79,11 @@ class DriverWriter:
     def namespace(self) -> Namespace:
         """Where it publishes."""
         return self._service.namespace
+
+    @property
+    def slots(self) -> int:
+        """Frames that the ring holds."""
+        return self._service.slots
 
     @property
     def sequence(self) -> int:

@@ -35,6 +35,8 @@ MAGIC = b"SKINRING"
 VERSION = (1, 0)
 ALIGNMENT = 64
 MIN_SLOTS, MAX_SLOTS, DEFAULT_SLOTS = 2, 64, 8
+_KEPT_NS = 1_000_000_000
+_KEPT_BYTES = 16 << 20
 MAX_COLUMNS = 256
 MAX_FILE_SIZE = 1 << 32
 KIND_BYTES = 16
@@ -180,19 +182,22 @@ def aligned(offset: int, to: int = ALIGNMENT) -> int:
 def plan(
     static: Mapping[str, npt.NDArray[Any]],
     slot: Mapping[str, tuple[npt.DTypeLike, int]],
-    slot_count: int = DEFAULT_SLOTS,
+    slot_count: int | None = None,
+    period_ns: int = 0,
 ) -> Layout:
     """Lay out a new file.
 
     Args:
         static: contents of the static columns.
         slot: (dtype, count) of the columns of a slot.
-        slot_count: 2 to 64.
+        slot_count: 2 to 64; None: as many as the period asks for.
+        period_ns: the writer's nominal period. Slots then hold a second, but take at most 16 MiB; there are at least 8.
+            0: it has none, and there are 8.
 
     Raises:
         ConfigurationError: a slot count or a column that the format cannot hold.
     """
-    if not MIN_SLOTS <= slot_count <= MAX_SLOTS:
+    if slot_count is not None and not MIN_SLOTS <= slot_count <= MAX_SLOTS:
         raise ConfigurationError(f"slots={slot_count}: give {MIN_SLOTS} to {MAX_SLOTS}")
     if len(static) + len(slot) > MAX_COLUMNS:
         raise ConfigurationError(f"{len(static) + len(slot)} columns: at most {MAX_COLUMNS}")
@@ -211,6 +216,9 @@ def plan(
         slot_columns.append(column)
         slot_end = column.offset + column.dtype.itemsize * count
     slot_offset, slot_stride = aligned(end, 4096), aligned(slot_end)
+    if slot_count is None:
+        of_period = -(-_KEPT_NS // period_ns) if period_ns > 0 else DEFAULT_SLOTS
+        slot_count = max(DEFAULT_SLOTS, min(MAX_SLOTS, of_period, _KEPT_BYTES // slot_stride))
     file_size = aligned(slot_offset + slot_stride * slot_count, 4096)
     if file_size > MAX_FILE_SIZE:
         raise ConfigurationError(f"the service would need {file_size} bytes of shared memory; the limit is 4 GiB")

@@ -162,7 +162,7 @@ def create(
     schema: Schema,
     static: Mapping[str, npt.NDArray[Any]],
     *,
-    slots: int,
+    slots: int | None,
     kind: str,
     period_ns: int,
     published_before: int,
@@ -178,7 +178,7 @@ def create(
     if len(kind.encode()) > file_layout.KIND_BYTES:
         raise ConfigurationError(f"kind {kind!r}: at most {file_layout.KIND_BYTES} bytes")
     static = {**static, **schema.for_file(static)}
-    layout = file_layout.plan(static, schema.for_layout(), slots)
+    layout = file_layout.plan(static, schema.for_layout(), slots, period_ns)
     temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
     header = _header(name, layout, layout.digest(static), kind, period_ns, published_before)
     try:

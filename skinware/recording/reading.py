@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -157,11 +158,12 @@ class Recording:
         while (moment := timeline.next()) is not None and (end_s is None or moment.time_s < end_s):
             yield moment
 
-    def timeline(self, services: Collection[str] | None = None) -> Timeline:
+    def timeline(self, services: Collection[str] | None = None, *, ahead: Executor | None = None) -> Timeline:
         """The moments of several services, to go to and fro in.
 
         Args:
             services: names; None: all.
+            ahead: see :class:`Timeline`.
 
         Raises:
             ConfigurationError: nothing was recorded of one of them.
@@ -169,7 +171,7 @@ class Recording:
         names = self.services if services is None else tuple(services)
         for name in names:
             self[name]
-        return Timeline(self, names)
+        return Timeline(self, names, ahead)
 
     def close(self) -> None:
         """Close the file; what was read stays. Idempotent."""

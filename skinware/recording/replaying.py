@@ -6,10 +6,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from skinware.memory.namespace import Namespace
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.recording.reading import Recording
 from skinware.recording.republishing import Republisher
 from skinware.recording.timeline import GONE, Moment
@@ -61,7 +62,8 @@ class Replayer:
         keeps_times: bool = False,
     ) -> None:
         self._recording = recording
-        self._timeline = recording.timeline(names)
+        self._ahead = ThreadPoolExecutor(1, "skinware replay")
+        self._timeline = recording.timeline(names, ahead=self._ahead)
         self._first_s = self._timeline.first_s()
         self._start_s, self._end_s = start_s, math.inf if end_s is None else end_s
         self._loops, self._paused, self._stays = loop, paused, stays
@@ -108,6 +110,10 @@ class Replayer:
         """
         if self._start_s > self._recording.duration_s:
             return
+        with short_turns():
+            self._run(tell, every_s)
+
+    def _run(self, tell: Callable[[], object], every_s: float) -> None:
         self._go_to(self._start_s)
         if self._paused and not self.frames:  # who is to resume it has to find it
             self.step()
@@ -135,6 +141,7 @@ class Replayer:
 
     def close(self) -> None:
         """Withdraw what is published. Idempotent."""
+        self._ahead.shutdown()
         self._republisher.close()
 
     def watch(self, fd: int, call: Callable[[], object]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping
+from concurrent.futures import Executor, Future
 from itertools import accumulate
 from typing import NamedTuple, Protocol
 
@@ -54,12 +55,15 @@ class Timeline:
     Args:
         recording: whose.
         services: their names.
+        ahead: decodes the chunk after the one at hand meanwhile, for who must not wait for it.
     """
 
-    def __init__(self, recording: MomentSource, services: Iterable[str]) -> None:
+    def __init__(self, recording: MomentSource, services: Iterable[str], ahead: Executor | None = None) -> None:
         self._recording, self.services = recording, tuple(services)
         self._places = [place for place in recording.places if recording.may_have(place, self.services)]
         self._ends_s = list(accumulate((recording.time_s(place.end_ns) for place in self._places), max))
+        self._ahead = ahead
+        self._coming: tuple[int, Future[list[Moment]] | None] = -1, None
         self._kept: dict[int, list[Moment]] = {}
         self._chunk = self._at = 0
 
@@ -127,8 +131,17 @@ class Timeline:
             return []
         moments = self._kept.pop(chunk, None)
         if moments is None:
-            moments = self._recording.moments_in(self._places[chunk], self.services)
+            number, coming = self._coming
+            moments = coming.result() if coming is not None and number == chunk else self._decoded(chunk)
+            self._prepare(chunk + 1)
         self._kept[chunk] = moments
         if len(self._kept) > _KEPT_CHUNKS:
             del self._kept[next(iter(self._kept))]
         return moments
+
+    def _decoded(self, chunk: int) -> list[Moment]:
+        return self._recording.moments_in(self._places[chunk], self.services)
+
+    def _prepare(self, chunk: int) -> None:
+        if self._ahead is not None and chunk < len(self._places) and chunk not in self._kept:
+            self._coming = chunk, self._ahead.submit(self._decoded, chunk)

@@ -5,10 +5,9 @@ from skinware.service._client import PendingRequest
 from skinware.service._ownership import Columns
 from skinware.service._reader import Position, ServiceReader
 from skinware.service._server import Request, RequestServer
-from skinware.service._writer import DEFAULT_SLOTS, ServiceWriter
+from skinware.service._writer import ServiceWriter
 
 __all__ = [
-    "DEFAULT_SLOTS",
     "Column",
     "Columns",
     "PendingRequest",

@@ -55,7 +55,7 @@ class Ownership:
         schema: Schema,
         static: Mapping[str, npt.NDArray[Any]],
         kind: str,
-        slots: int,
+        slots: int | None,
         period_ns: int,
         group: str | None,
         operations: Mapping[str, Callable[..., object]],
@@ -89,6 +89,11 @@ class Ownership:
     def sequence(self) -> int:
         """Sequence of the newest frame, 0 before the first."""
         return self._ring.sequence
+
+    @property
+    def slots(self) -> int:
+        """Frames that the ring holds."""
+        return self._ring.segment.layout.slot_count
 
     @property
     def position(self) -> tuple[int, int]:

@@ -9,7 +9,6 @@ from typing import Any, Self
 import numpy.typing as npt
 
 from skinware.errors import Closed, Paused
-from skinware.memory import file_layout
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns
@@ -17,7 +16,6 @@ from skinware.service._ownership import Columns, Ownership
 from skinware.service._server import Request
 from skinware.service.messages import ACQUIRE
 
-DEFAULT_SLOTS = file_layout.DEFAULT_SLOTS
 _LONGEST_WAIT_S = 1.0
 
 
@@ -31,7 +29,8 @@ class ServiceWriter(Ownership):
         static: arrays that are written once, for readers, besides the frames.
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         kind: of the service (``data``, ``driver``).
-        slots: frames that the ring holds, 2 to 64.
+        slots: frames that the ring holds, 2 to 64; default: those of a second at ``rate_hz``, but at least 8, at most
+            64, and not more than 16 MiB; 8 where there is no rate.
         rate_hz: nominal rate, told to readers; None for no fixed rate.
         group: group whose members may read; an existing namespace must have the same.
         description: of the service, for people.
@@ -52,7 +51,7 @@ class ServiceWriter(Ownership):
         *,
         namespace: Namespace | str | None = None,
         kind: str = "data",
-        slots: int = DEFAULT_SLOTS,
+        slots: int | None = None,
         rate_hz: float | None = None,
         group: str | None = None,
         description: str = "",

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from skinware._columns import texts
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.service import DEFAULT_SLOTS, Column, ServiceWriter
+from skinware.service import Column, ServiceWriter
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.source_reader import SourceReader
@@ -155,7 +155,7 @@ class ContactsWriter:
         neighbours: npt.NDArray[Any] | None = None,
         name: str = NAME,
         namespace: Namespace | str | None = None,
-        slots: int = DEFAULT_SLOTS,
+        slots: int | None = None,
         rate_hz: float | None = None,
         group: str | None = None,
     ) -> None:

@@ -125,9 +125,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option(
     "--slots",
     type=click.IntRange(2, 64),
-    default=8,
-    show_default=True,
-    help="Ring size: how many frames slow programs may fall behind, 2-64.",
+    help="Ring size: how many frames slow programs may fall behind, 2-64.  [default: a second, at least 8, 16 MiB]",
 )
 @click.option(
     "--latency",
@@ -166,7 +164,7 @@ def command(
     listen_only: bool,
     wait: bool,
     publish: PublishMode | None,
-    slots: int,
+    slots: int | None,
     latency_ms: float | None,
     geometry_file: Path | None,
     group: str | None,

@@ -12,7 +12,6 @@ from skinware.driver_service import DriverWriter
 from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import SAMPLE, SAMPLES
-from skinware.service import DEFAULT_SLOTS
 from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, Status
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
@@ -59,7 +58,6 @@ class Publisher:
         by_cycle: see above.
         desk: who asks for frames.
         on_request: publish only what somebody waits for (beside the very first frame).
-        most_at_once: frames that are published of one take, at the most: more than the ring holds are seen by nobody.
     """
 
     def __init__(
@@ -71,7 +69,6 @@ class Publisher:
         by_cycle: bool,
         desk: Desk | None = None,
         on_request: bool = False,
-        most_at_once: int = DEFAULT_SLOTS,
     ) -> None:
         self._writer = writer
         self._state = decoder.state
@@ -79,7 +76,7 @@ class Publisher:
         self.period_ns = round(period_s * NS_PER_S)
         self.by_cycle = by_cycle
         self._desk, self.on_request = desk, on_request and desk is not None
-        self.most_at_once = most_at_once
+        self.most_at_once: int = writer.slots  # of one take; more than the ring holds are seen by nobody
         # longer than a period: what comes late must not be cut off from its burst, or bursts mix from then on
         self.patience_ns = self.period_ns * 3 // 2
         self.pause_ns = self.period_ns // 2

@@ -15,7 +15,6 @@ from skinware.errors import DriverError, StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, short_turns
-from skinware.service import DEFAULT_SLOTS
 from skinware.status import BusReason
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
@@ -84,7 +83,7 @@ class Runner:
         publish: PublishMode | None = None,
         latency_s: float | None = None,
         namespace: Namespace | None = None,
-        slots: int = DEFAULT_SLOTS,
+        slots: int | None = None,
         group: str | None = None,
         geometry: Geometry | None = None,
         on_ready: Callable[[], None] = lambda: None,
@@ -308,7 +307,7 @@ class Runner:
             log.info("new generation: %r", tables.structure)
         by_cycle = self.lines[0].adapter.by_cycle if self._publish is None else self._publish != "rate"
         on_request = self._publish == "request"
-        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request, self._slots)
+        publisher = Publisher(writer, decoder, watch, self._period_s, by_cycle, self._desk, on_request)
         self._intake.latency_s = self._longest_rest_s
         publisher.latency_ns[:] = round(self._longest_rest_s * NS_PER_S)
         self.generation = Generation(self.lines, decoder, watch, publisher, self._period_s)

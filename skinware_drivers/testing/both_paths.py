@@ -154,7 +154,6 @@ class Way:
             publishing.by_cycle,
             self.desk,
             publishing.on_request,
-            publishing.slots,
         )
         self.publisher.bus_counters = [BusCounters() for _ in layouts]
         longest = max((layout.payload_size for layout in layouts if layout is not None), default=8)

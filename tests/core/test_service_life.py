@@ -14,6 +14,7 @@ import pytest
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.memory import file_layout
 from skinware.memory.announcement import living_readers
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
@@ -122,6 +123,23 @@ def test_impossible_slots_are_refused_and_the_name_is_free_again(slots: int, nam
     assert namespace.services() == []
     with ServiceWriter("x", SMALL) as writer:
         assert writer.sequence == 0
+
+
+@pytest.mark.parametrize(("rate_hz", "slots"), [(None, 8), (0.1, 8), (20, 20), (100, 64), (1000, 64)])
+def test_a_ring_holds_a_second_where_nobody_says_otherwise(rate_hz: float | None, slots: int) -> None:
+    with ServiceWriter("x", SMALL, rate_hz=rate_hz) as writer:
+        assert writer.slots == slots
+        writer.restructure(SMALL, rate_hz=12.5)
+        assert writer.slots == 13
+    with ServiceWriter("x", SMALL, rate_hz=rate_hz, slots=5) as writer:
+        writer.restructure(SMALL, rate_hz=12.5)
+        assert writer.slots == 5
+
+
+@pytest.mark.parametrize(("megabytes", "slots"), [(0.1, 64), (0.5, 32), (1, 16), (3, 8), (30, 8)])
+def test_a_ring_of_large_frames_holds_less_than_a_second(megabytes: float, slots: int) -> None:
+    frame = round(megabytes * 2**20) - 64  # the slot's header
+    assert file_layout.plan({}, {"values": ("u1", frame)}, None, 10_000_000).slot_count == slots
 
 
 def test_a_removed_file_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, PatchState, Status
-from skinware.service import DEFAULT_SLOTS
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.running import publisher as publisher_module
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
@@ -14,6 +13,7 @@ from skinware_drivers.watch import Watch
 from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
 
 PERIOD_S = 0.05
+SLOTS = 8
 
 
 class Clock:
@@ -29,7 +29,7 @@ class Desk:
         boards: tuple[int, ...] = (7,),
         *,
         watched: bool = False,
-        slots: int = DEFAULT_SLOTS,
+        slots: int = SLOTS,
     ) -> None:
         self.clock = clock = Clock()
         monkeypatch.setattr(publisher_module, "now_ns", lambda: clock.now_ns)
@@ -39,7 +39,7 @@ class Desk:
             "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS, slots=slots
         )
         self.watch = self.rig.driver.watch(tables) if watched else Watch(tables)
-        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True, most_at_once=slots)
+        self.publisher = Publisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)
         self.reader = DriverReader("desk")
 
     def feed(self, frames: list[Wire]) -> None:
@@ -131,7 +131,7 @@ def test_a_take_publishes_no_more_than_the_ring_holds_and_counts_what_it_skips(
         frames += desk.burst(value, triangles)
     desk.feed(frames)
     published = desk.writer.sequence - before
-    assert 2 <= published <= DEFAULT_SLOTS
+    assert 2 <= published <= SLOTS
     if desk.publisher._state.updated.any():  # the last one waits for the others of its board
         desk.clock.now_ns += 100 * MS
         desk.publisher.publish_if_due(desk.clock.now_ns)

@@ -1,21 +1,24 @@
-"""Recording: what it costs, how large it is, and what a killed recorder leaves; of the recorder as people start it.
+"""Recording: what it costs, how large it is, what it loses, and what a killed recorder leaves; as people start it.
 
-tools/bench record [cost|kills|convert] [--viewers] [--seconds S] [--kills N] [--sensors N ...] [--pattern NAME ...]
+tools/bench record [cost|kills|convert|losses] [--viewers] [--seconds S] [--kills N] [--minutes M] [--busy N] [--slots N]
+                    [--sensors N ...] [--pattern NAME ...]
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,7 +28,7 @@ import numpy.typing as npt
 from processes import Processes, answer, own_namespace
 
 import skinware.recording
-from skinware import DriverReader, DriverWriter, Structure
+from skinware import DriverReader, DriverWriter, Frame, Structure
 from skinware.conversion import FORMATS
 from skinware.geometry import Geometry
 from skinware.memory.statistics import BUCKETS
@@ -72,7 +75,7 @@ def _places(sensors: int) -> Geometry:
     return places
 
 
-def drive(pipe: Connection, namespace: str, sensors: int, pattern: str) -> None:
+def drive(pipe: Connection, namespace: str, sensors: int, pattern: str, slots: int | None) -> None:
     """Publish a skin at 100 Hz until the other end says enough; then how many frames."""
     structure = structure_of(sensors)
     generator = np.random.default_rng(1)
@@ -85,6 +88,7 @@ def drive(pipe: Connection, namespace: str, sensors: int, pattern: str) -> None:
         structure,
         namespace=namespace,
         rate_hz=RATE_HZ,
+        slots=slots,
         bus_counters=names[:BUS_COUNTERS],
         patch_counters=names[:PATCH_COUNTERS],
     ) as writer:
@@ -119,15 +123,58 @@ def drive(pipe: Connection, namespace: str, sensors: int, pattern: str) -> None:
 
 
 @contextmanager
-def driving(namespace: str, sensors: int, pattern: str) -> Iterator[Connection]:
+def driving(namespace: str, sensors: int, pattern: str, slots: int | None = None) -> Iterator[list[int]]:
+    """A driver; at the end how many frames it published, and how many periods it missed."""
+    told: list[int] = []
     with Processes() as processes:
-        pipe = processes.start(drive, namespace, sensors, pattern)
+        pipe = processes.start(drive, namespace, sensors, pattern, slots)
         answer(pipe, 30)
         try:
-            yield pipe
+            yield told
         finally:
             pipe.send("enough")
+            told += answer(pipe, 30)
+
+
+def count(pipe: Connection) -> None:
+    """Be busy until the other end says enough."""
+    number = 0
+    pipe.send("ready")
+    while number % 4096 or not pipe.poll():
+        number += 1
+
+
+@contextmanager
+def busy(number: int) -> Iterator[None]:
+    """Programs that do nothing but count."""
+    with Processes() as processes:
+        pipes = [processes.start(count) for _ in range(number)]
+        for pipe in pipes:
             answer(pipe, 30)
+        try:
+            yield
+        finally:
+            for pipe in pipes:
+                pipe.send("enough")
+
+
+def witness(pipe: Connection, namespace: str) -> None:
+    """Take every frame until the other end says enough; then a digest of each, by sequence."""
+    seen: dict[int, bytes] = {}
+    with DriverReader("large", namespace=namespace) as reader:
+        pipe.send("ready")
+        for frame in reader.in_order():
+            seen[frame.sequence] = digest(frame, reader.schema.columns)
+            if pipe.poll():
+                break
+    pipe.send(seen)
+
+
+def digest(frame: Frame, columns: Iterable[str]) -> bytes:
+    state = hashlib.blake2b(struct.pack("<qQ", frame.acquired_ns, frame.flags), digest_size=16)
+    for name in columns:
+        state.update(frame.column(name).tobytes())
+    return state.digest()
 
 
 @contextmanager
@@ -195,16 +242,20 @@ def read(file: Path) -> None:
     )
 
 
-def kills(count: int, skins: list[int], folder: Path) -> None:
-    """What is missing at the end of a recording whose recorder was killed at a random moment."""
+def kills(number_of_kills: int, skins: list[int], folder: Path) -> None:
+    """What is missing at the end of a recording whose recorder was killed at any moment, and what is wrong in it."""
     for sensors in skins:
         missing: list[float] = []
+        recorded: list[dict[int, bytes]] = []
         with (
             own_namespace() as namespace,
             driving(namespace.name, sensors, "analogue"),
             DriverReader("large", namespace=namespace) as reader,
+            Processes() as processes,
         ):
-            for number in range(count):
+            pipe = processes.start(witness, namespace.name)
+            answer(pipe, 30)
+            for number in range(number_of_kills):
                 file = folder / f"killed-{sensors}-{number}.mcap"
                 with recording(namespace.name, file) as process:
                     time.sleep(random.uniform(0, 1.0))
@@ -213,13 +264,50 @@ def kills(count: int, skins: list[int], folder: Path) -> None:
                     process.wait()
                 whole = file.with_suffix(".whole.mcap")
                 recover(file, whole)
+                columns = reader.schema.columns
                 with skinware.recording.open(whole) as opened:
-                    last_ns = int(opened["large"].read(["status"]).published_ns[-1])
-                missing.append((newest_ns - last_ns) / 1e9)
+                    frames = list(opened["large"].frames())
+                missing.append((newest_ns - frames[-1].published_ns) / 1e9)
+                recorded.append({frame.sequence: digest(frame, columns) for frame in frames})
                 file.unlink()
                 whole.unlink()
+            pipe.send("enough")
+            seen = answer(pipe, 30)
         p50, most = np.median(missing), max(missing)
-        print(f"  {sensors:6} sensors, {count} kills: missing p50 {p50:.3f} s, most {most:.3f} s", flush=True)
+        both = sum(len(frames.keys() & seen.keys()) for frames in recorded)
+        others = sum(seen.get(sequence, value) != value for frames in recorded for sequence, value in frames.items())
+        gaps = sum(max(frames) - min(frames) + 1 - len(frames) for frames in recorded)
+        print(
+            f"  {sensors:6} sensors, {number_of_kills} kills: missing p50 {p50:.3f} s, most {most:.3f} s;"
+            f" of {both} frames that a second reader took {others} differ, {gaps} missing within",
+            flush=True,
+        )
+
+
+def losses(minutes: float, n_busy: int, slots: int | None, skins: list[int], patterns: list[str], folder: Path) -> None:
+    """Frames that are lost in a long time, beside programs that keep the processors busy."""
+    for sensors in skins:
+        for pattern in patterns:
+            file = folder / f"{sensors}-{pattern}-long.mcap"
+            with own_namespace() as namespace:
+                with (
+                    driving(namespace.name, sensors, pattern, slots) as told,
+                    busy(n_busy),
+                    recording(namespace.name, file) as process,
+                ):
+                    time.sleep(60 * minutes)
+                    process.send_signal(signal.SIGINT)
+                    assert process.stdout is not None
+                    stopped = json.loads(process.stdout.read().splitlines()[-1])
+            lost = stopped["lost"]
+            frames = stopped["messages"]["/skin/large/frame"] + lost
+            print(
+                f"  {sensors:6} sensors, {pattern:<8}  {minutes:g} min beside {n_busy} busy programs, load"
+                f" {os.getloadavg()[0]:.1f}, {slots or 'default'} slots: lost {lost} of {frames}"
+                f"  (the driver missed {told[1]} periods)",
+                flush=True,
+            )
+            file.unlink()
 
 
 def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
@@ -257,9 +345,12 @@ def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", choices=["cost", "kills", "convert"])
+    parser.add_argument("what", nargs="?", choices=["cost", "kills", "convert", "losses"])
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of losses, for each skin and pattern")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="of losses: busy programs beside it")
+    parser.add_argument("--slots", type=int, metavar="N", help="of losses: of the driver's ring")
     parser.add_argument("--sensors", type=int, nargs="+", default=[LARGE, SMALL], metavar="N")
     parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
     parser.add_argument("--viewers", action="store_true", help="cost of a recorder with --viewers")
@@ -272,6 +363,9 @@ def main() -> None:
             kills(options.kills, options.sensors, Path(folder))
         if options.what in (None, "convert"):
             convert(options.seconds, options.sensors, options.pattern, Path(folder))
+        if options.what == "losses":
+            skins, patterns = options.sensors, options.pattern
+            losses(options.minutes, options.busy, options.slots, skins, patterns, Path(folder))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import Columns, RequestServer, ServiceReader, ServiceWriter
 from skinware.structure import Structure
 
-__all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter"]
+__all__ = ["KIND", "DriverFrame", "DriverReader", "DriverWriter", "counters_of"]
 
 KIND = "driver"
 _REQUIRED = ("values", "status", "module_time_ns", "patch_state", "bus_state")
@@ -211,16 +211,31 @@ class DriverReader(ServiceReader[DriverFrame]):
         return self._counters(frame, "patch", self.structure.n_patches)
 
     def _counters(self, frame: DriverFrame, what: str, count: int) -> list[dict[str, int]]:
-        names = _names(self.static(), f"{what}_counter_name")
-        if not names or f"{what}_counters" not in self.schema.columns:
-            return [{} for _ in range(count)]
-        rows = frame.column(f"{what}_counters").reshape(count, len(names)).tolist()
-        return [dict(zip(names, row, strict=True)) for row in rows]
+        names, counts = counters_of(frame, self.static(), what, count)
+        return [dict(zip(names, row, strict=True)) for row in counts.tolist()]
 
     def _describe(self, attached: segments.Segment) -> Structure:
         if bytes(attached.header["kind"]) != KIND.encode():
             raise BadServiceFile(f"service {self.name!r} is not a driver: it has no sensors")
         return structure_of(attached)
+
+
+def counters_of(
+    frame: DriverFrame, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
+) -> tuple[list[str], npt.NDArray[np.uint64]]:
+    """Counters in a frame: their names, and (count, names) numbers; no names where the driver tells none.
+
+    Args:
+        frame: of the driver.
+        tables: its static columns.
+        what: ``bus`` or ``patch``.
+        count: how many of those the driver has.
+    """
+    names = _names(tables, f"{what}_counter_name")
+    try:
+        return names, frame.column(f"{what}_counters").reshape(count, len(names))
+    except KeyError:
+        return [], np.zeros((count, 0), np.uint64)
 
 
 def structure_of(segment: segments.Segment) -> Structure:

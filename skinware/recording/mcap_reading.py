@@ -20,7 +20,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Schema
+from mcap.records import Channel, ChunkIndex, Header, Schema
 
 from skinware.errors import BadRecording
 from skinware.recording.mcap_writing import COMPRESSION, MAGIC
@@ -138,6 +138,15 @@ class McapSource:
     def size(self) -> int:
         """Bytes of the file."""
         return len(self._map)
+
+    @property
+    def library(self) -> str:
+        """What wrote the file, as its header says; empty where that is damaged."""
+        try:
+            opcode, record = next(_records(self._data[len(MAGIC) :]), (0, memoryview(b"")))
+            return str(_read(Header, record).library) if opcode == Opcode.HEADER else ""
+        except Damaged:
+            return ""
 
     def contents(self, place: ChunkPlace) -> ChunkContents:
         """What is in a chunk.

@@ -80,6 +80,11 @@ class Recording:
         return tuple(self._wires[key] for key in sorted(self._wires))
 
     @property
+    def recorded_by(self) -> str:
+        """Program and version that wrote the file, as it says: ``skinware 0.1.0``; empty where that is damaged."""
+        return self._source.library
+
+    @property
     def duration_s(self) -> float:
         """From the first message to the last."""
         return (self.end_ns - self.start_ns) / NS_PER_S

@@ -7,13 +7,12 @@ import logging
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError, NameInUse
+from skinware.errors import NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.tactile.baseline import SIGNED_TYPES
-from skinware.tactile.chain import BaselineStage, Chain
-from skinware.tactile.health import Health
+from skinware.tactile.chain import Chain
+from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.health_service import RATE_HZ, HealthWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -38,8 +37,7 @@ class CalmHealth:
         self.faulty = 0
         self._name = name
         self._driver, self._into, self._group = driver, into, group
-        self._chain: Chain | None = None
-        self._watched: dict[str, tuple[BaselineStage, Health]] = {}
+        self._health: ChainHealth | None = None
         self._writer: HealthWriter | None = None
         self._status: npt.NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._due_ns = 0
@@ -55,14 +53,10 @@ class CalmHealth:
         Args:
             chain: whose values come from now on.
         """
-        self._chain, self._watched, self.faulty = chain, {}, 0
+        self._health, self.faulty = ChainHealth(chain, self._driver), 0
         self._status = np.zeros(chain.structure.n_sensors, np.uint8)
-        for name, stages in chain.stages.items():
-            stage = next((stage for stage in stages if isinstance(stage, BaselineStage)), None)
-            if stage is not None and not name.startswith(SIGNED_TYPES):
-                self._watched[name] = stage, self._health(chain, name, stage)
         try:
-            if not self._watched:
+            if not self._health:
                 self.close()
             elif self._writer is not None:
                 self._writer.restructure(chain.structure)
@@ -80,14 +74,12 @@ class CalmHealth:
             status: (n_sensors,) what came out of the chain, changed in place.
             acquired_ns: of the frame.
         """
-        if self._chain is None:
+        if self._health is None:
             return
-        for stage, health in self._watched.values():
-            if stage.calm is not None:
-                health.update(acquired_ns, stage.given, stage.calm)
+        self._health.update(acquired_ns)
         if acquired_ns >= self._due_ns:
             self._due_ns = acquired_ns + _PERIOD_NS
-            self._tell(self._chain, acquired_ns)
+            self._tell(self._health, acquired_ns)
         status |= self._status
 
     def close(self) -> None:
@@ -96,21 +88,9 @@ class CalmHealth:
             self._writer.close()
         self._writer = None
 
-    def _health(self, chain: Chain, type_name: str, stage: BaselineStage) -> Health:
-        """For the values that a baseline gets."""
-        structure, taxels = chain.structure, stage.before
-        geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
-        limits = taxels.type.minimum, taxels.type.maximum
-        try:
-            return Health(taxels.module, geometry, resolution=taxels.resolution, limits=limits)
-        except ConfigurationError as error:  # places without neighbours
-            log.warning("%s of %r: dead and weak sensors are not found: %s", type_name, self._driver, error)
-            return Health(taxels.module, resolution=taxels.resolution, limits=limits)
-
-    def _tell(self, chain: Chain, acquired_ns: int) -> None:
-        reports = {name: health.report() for name, (_, health) in self._watched.items()}
-        for name, report in reports.items():
-            self._status[chain.structure.index(name)] = np.uint8(Status.UNHEALTHY) * report.faulty
+    def _tell(self, health: ChainHealth, acquired_ns: int) -> None:
+        reports = health.reports()
+        self._status = np.uint8(Status.UNHEALTHY) * health.faulty(reports)
         self.faulty = int(np.count_nonzero(self._status))
         if self._writer is not None:
             try:

@@ -136,8 +136,12 @@ class MachineLimits:
             )
 
     def _read(self) -> int:
-        try:
-            rows = self._source.read_text().splitlines()
-            return sum(int(row.split()[1], 16) for row in rows)
-        except (OSError, ValueError, IndexError):  # no such file, or of another form: nothing is known
-            return 0
+        return softnet_dropped(self._source) or 0
+
+
+def softnet_dropped(source: Path = SOFTNET) -> int | None:
+    """Packets that this machine has dropped before any socket saw them; None where the kernel does not tell."""
+    try:
+        return sum(int(row.split()[1], 16) for row in source.read_text().splitlines())
+    except (OSError, ValueError, IndexError):  # no such file, or of another form
+        return None

@@ -26,6 +26,7 @@ from skinware.cli.top import command as top
 from skinware.geometry import geometry_to_toml
 from skinware.realtime import now_ns
 from skinware_drivers.cli.config import command as config
+from skinware_drivers.cli.doctor import command as doctor
 from skinware_drivers.cli.dump import command as dump
 from skinware_drivers.cli.emulation import Emulation, JsonReport
 from skinware_drivers.cli.find import command as find
@@ -231,6 +232,18 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
         probe |= {"asked": ["roboskin"], "answers": {"roboskin": "yes"}, "problems": {"xela": "no"}}
     check("`skin-find`", *machine, *heard, *no_interface)
     check("`skin-find --udev`", *printing(find, "--udev"))
+
+
+def test_what_a_doctor_finds(printing: Print, tmp_path: Path) -> None:
+    skin = FakeSkin("torso")
+    skin.break_some()
+    file = tmp_path / "skin.mcap"
+    with publishing(skin):
+        with running("skin-record", "torso", "-o", str(file)) as record:
+            record.wait_for("status", lambda status: bool(status["messages"]))
+            record.stop()
+        live = printing(doctor, "--seconds", "0.2", status=1)
+    check("`skin-doctor`", *live, *printing(doctor, str(file), status=1))
 
 
 def test_robots_files(printing: Print, tmp_path: Path) -> None:

@@ -1,0 +1,88 @@
+"""Which taxels are noisy, stuck, dead ..., by the frames that were looked at, or by ``skin-calm`` where it runs."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.driver_frame import DriverFrame
+from skinware.errors import ConfigurationError
+from skinware.structure import Structure
+from skinware.tactile.chain import ChainSettings
+from skinware.tactile.chain_health import ChainHealth
+from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware_drivers.doctor.evidence import HealthSeen, TaxelFault
+
+_PERIOD_NS = 45_000_000
+"""Frames that come faster than that say nothing more of a taxel's health."""
+_STUCK_S = 600.0
+
+
+class TaxelJudge:
+    """Judges the taxels of one structure by its frames.
+
+    Args:
+        structure: of the driver.
+        driver: name of the driver.
+    """
+
+    def __init__(self, structure: Structure, driver: str) -> None:
+        self._structure = structure
+        self._first_ns = self._due_ns = self._last_ns = 0
+        self._why_not = ""
+        self._values: npt.NDArray[np.float32] = np.zeros(structure.n_sensors, np.float32)
+        self._status: npt.NDArray[np.uint8] = np.zeros(structure.n_sensors, np.uint8)
+        try:
+            self._chain = ChainSettings.calm().chain(structure)
+        except ConfigurationError:
+            self._why_not = "no sensor of it has a rest to go back to"
+            return
+        self._health = ChainHealth(self._chain, driver)
+
+    def take(self, frame: DriverFrame) -> None:
+        """Take in the next frame; those that come too soon after another are left out."""
+        if self._why_not or frame.acquired_ns < self._due_ns:
+            return
+        self._first_ns = self._first_ns or frame.acquired_ns
+        self._last_ns, self._due_ns = frame.acquired_ns, frame.acquired_ns + _PERIOD_NS
+        self._chain.step(frame, self._values, self._status)
+        self._health.update(frame.acquired_ns)
+
+    def seen(self) -> HealthSeen:
+        """What is known now."""
+        if self._why_not or not self._health:
+            return HealthSeen("", 0, (), {"health": self._why_not or "it has no such sensors"})
+        faults: list[TaxelFault] = []
+        reports = self._health.reports()
+        known_noise = untouched = judged = 0
+        for name, report in reports.items():
+            positions = np.arange(self._structure.n_sensors)[self._structure.index(name)]
+            faults += _faults(self._structure, positions, report, self._structure.type(name).unit)
+            judged += len(positions)
+            known_noise += int(np.isfinite(report.noise).sum())
+            untouched += int((report.kind == HealthKind.NEVER_TOUCHED).sum())
+        missing = {}
+        seconds = (self._last_ns - self._first_ns) / 1e9
+        if not known_noise:
+            missing["noisy and clipped taxels"] = f"that takes 10 s without a touch, and these were {seconds:.0f} s"
+        if seconds < _STUCK_S:
+            missing["stuck taxels"] = f"that takes {_STUCK_S / 60:.0f} min of use, and these were {seconds:.0f} s"
+        if untouched or not faults:
+            missing["dead and weak taxels"] = f"nothing has touched {untouched:,} of {judged:,} meanwhile"
+        return HealthSeen("these frames", judged, tuple(faults), missing)
+
+
+def _faults(
+    structure: Structure, positions: npt.NDArray[np.int64], report: HealthReport, unit: str
+) -> list[TaxelFault]:
+    return [
+        TaxelFault(
+            structure.sensor_name(int(positions[row])),
+            HealthKind(int(report.kind[row])).name.lower(),
+            report.evidence(row, unit),
+        )
+        for row in np.flatnonzero(report.faulty).tolist()
+    ]
+
+
+__all__ = ["TaxelJudge"]

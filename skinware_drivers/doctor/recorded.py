@@ -1,0 +1,247 @@
+"""Gathers the evidence of a recording, from the file alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import reduce
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
+
+import skinware.recording
+from skinware.memory.statistics import Histogram
+from skinware.realtime import NS_PER_S
+from skinware.recording import RecordedDriverFrame, Recording
+from skinware.status import Status
+from skinware_drivers.doctor.driver_log import DriverLog
+from skinware_drivers.doctor.evidence import (
+    BusSeen,
+    ClockSet,
+    Counted,
+    Counts,
+    DriverSeen,
+    Evidence,
+    PatchSeen,
+    RecordingSeen,
+    Timing,
+)
+from skinware_drivers.doctor.judging import TaxelJudge
+from skinware_drivers.doctor.surroundings import MachineWatch
+
+_LOOK_EVERY_NS = 45_000_000
+"""Frames between two looks are only counted and timed."""
+_TELL_EVERY = 200
+_SET_S = 0.1
+_CLOSED, _DEAD = "closed", "dead"
+
+_PartT = TypeVar("_PartT", BusSeen, PatchSeen)
+
+
+def look_at(file: Path, tell: Callable[[float], object] = lambda _seconds: None) -> Evidence:
+    """Look at all of a recording.
+
+    Args:
+        file: it.
+        tell: called now and then with how much of it was looked at, s.
+
+    Raises:
+        BadRecording: it is not a recording, or one of a newer version.
+        OSError: it cannot be read.
+    """
+    with skinware.recording.open(file) as recording:
+        events = recording.events
+        drivers = {name: _DriverTrack(name) for name in recording.drivers}
+        for number, (time_s, name, frame, _) in enumerate(recording.moments(tuple(drivers))):
+            if isinstance(frame, RecordedDriverFrame):
+                drivers[name].take(frame, recording[name].generation(frame.generation).static(), time_s)
+            if number % _TELL_EVERY == 0:
+                tell(time_s)
+        seen = tuple(one for track in drivers.values() if (one := track.seen(events)) is not None)
+        return Evidence(
+            seconds=recording.duration_s,
+            namespace="",
+            drivers=seen,
+            machine=MachineWatch().seen(),
+            recording=_recording_seen(recording, events),
+        )
+
+
+def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> RecordingSeen:
+    clock = recording.clock
+    return RecordingSeen(
+        name=recording.path.name,
+        size=recording.path.stat().st_size,
+        duration_s=recording.duration_s,
+        is_whole=recording.is_whole,
+        problems=tuple(recording.problems),
+        services=tuple(name for name in recording.services if name not in recording.drivers),
+        lost=sum(_lost_in(event) for event in events),
+        events=Counter(str(event.get("event")) for event in events),
+        clock_sets=tuple(_clock_sets(clock)),
+        boots=len({str(moment.get("boot")) for moment in clock}),
+        recorded_by=recording.recorded_by,
+    )
+
+
+def _clock_sets(clock: Iterable[dict[str, Any]]) -> Iterable[ClockSet]:
+    """When the wall clock moved against the one that nobody sets."""
+    offsets = [
+        (moment["time_s"], (moment["realtime_ns"] - moment["monotonic_ns"]) / NS_PER_S, moment.get("boot"))
+        for moment in clock
+        if isinstance(moment.get("realtime_ns"), int) and isinstance(moment.get("monotonic_ns"), int)
+    ]
+    for (_, before, boot), (time_s, now, boot_now) in pairwise(offsets):
+        if boot == boot_now and abs(now - before) > _SET_S:
+            yield ClockSet(time_s, now - before)
+
+
+def _lost_in(event: dict[str, Any]) -> int:
+    """Frames that an event says were lost."""
+    count = event.get("count")
+    return count if event.get("event") == "lost" and isinstance(count, int) else 0
+
+
+class _DriverTrack:
+    """Follows one driver of a recording over its restarts.
+
+    Args:
+        name: of it.
+
+    Attributes:
+        log: of its present structure; None before the first frame.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self.log: DriverLog | None = None
+        self._judge: TaxelJudge | None = None
+        self._earlier: list[DriverLog] = []
+        self._newest: RecordedDriverFrame | None = None
+        self._driver_type = ""
+        self._looked_ns = 0
+        self._frames = self._restarts = 0
+        self._live_ns = self._intervals = 0
+        self._late, self._age = Histogram(), Histogram()
+        self._longest_gap_ns = 0
+
+    def take(self, frame: RecordedDriverFrame, tables: Any, time_s: float) -> None:
+        """The next frame.
+
+        Args:
+            frame: it.
+            tables: static columns of its generation.
+            time_s: when it was published, since the recording began.
+        """
+        before, self._newest = self._newest, frame
+        self._frames += 1
+        self._age.add(max(0, frame.published_ns - frame.acquired_ns))
+        is_new = before is None or before.generation != frame.generation
+        if is_new:
+            self._begin(frame, tables, is_restart=before is not None)
+        elif before is not None:
+            self._time(before, frame)
+        if is_new or abs(frame.published_ns - self._looked_ns) >= _LOOK_EVERY_NS:
+            self._looked_ns = frame.published_ns
+            if self.log is not None and self._judge is not None:
+                self.log.take(frame, tables, time_s)
+                self._judge.take(frame)
+
+    def _begin(self, frame: RecordedDriverFrame, tables: Any, *, is_restart: bool) -> None:
+        """Another generation; where its sensors are the same, what was seen goes on."""
+        self._restarts += is_restart
+        self._driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1]).decode(errors="replace")
+        if self.log is not None and self.log.structure == frame.structure:
+            return
+        if self.log is not None:
+            self._earlier.append(self.log)
+        self.log = DriverLog(frame.structure, by_hour=True)
+        self._judge = TaxelJudge(frame.structure, self._name)
+
+    def _time(self, before: RecordedDriverFrame, frame: RecordedDriverFrame) -> None:
+        """How regular frames are that follow each other; those after a loss say nothing."""
+        if frame.sequence != before.sequence + 1:
+            return
+        interval_ns, period_ns = frame.published_ns - before.published_ns, frame.period_ns
+        self._live_ns += interval_ns
+        self._intervals += 1
+        self._longest_gap_ns = max(self._longest_gap_ns, interval_ns)
+        if period_ns:
+            self._late.add(max(0, interval_ns - period_ns))
+
+    def seen(self, events: Sequence[dict[str, Any]]) -> DriverSeen | None:
+        """What came of it; None: there is no frame.
+
+        Args:
+            events: of the recording.
+        """
+        log, newest, judge = self.log, self._newest, self._judge
+        if log is None or newest is None or judge is None:
+            return None
+        own = [event for event in events if event.get("service") == self._name]
+        last = str(own[-1].get("event")) if own else ""
+        status = newest.status
+        statuses, affected = log.affected(status)
+        return DriverSeen(
+            name=self._name,
+            namespace="",
+            driver_type=self._driver_type,
+            life=last if last in (_CLOSED, _DEAD, "paused") else "live",
+            pid=0,
+            scheduling="",
+            data_path=newest.data_path.name.lower(),
+            restarts=self._restarts,
+            frames=self._frames,
+            frames_lost=sum(_lost_in(event) for event in own),
+            structure=log.structure,
+            statuses=statuses,
+            affected=affected,
+            buses=_joined(log.buses(), [one.buses() for one in self._earlier]),
+            patches=_joined(
+                log.patches(status, newest.published_ns),
+                [one.patches(_unknown(one), newest.published_ns) for one in self._earlier],
+            ),
+            timing=Timing(
+                rate_hz=self._intervals * NS_PER_S / self._live_ns if self._live_ns > 0 else None,
+                period_ns=newest.period_ns,
+                missed=0,
+                missed_before=0,
+                late=self._late,
+                age=self._age,
+                future_ns=log.future_ns,
+                backwards=log.backwards,
+                longest_gap_s=self._longest_gap_ns / NS_PER_S,
+            ),
+            health=judge.seen(),
+        )
+
+
+def _unknown(log: DriverLog) -> Any:
+    """The status of sensors of which nothing is to be said."""
+    import numpy as np
+
+    return np.full(log.structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
+
+
+def _joined(now: tuple[_PartT, ...], before: list[tuple[_PartT, ...]]) -> tuple[_PartT, ...]:
+    """Buses or patches with what was counted of them, under the same name, before the structure changed."""
+    return tuple(
+        reduce(_after, [one for parts in reversed(before) for one in parts if one.name == part.name], part)
+        for part in now
+    )
+
+
+def _after(part: _PartT, earlier: _PartT) -> _PartT:
+    """A bus or patch, with what was counted and seen of it before."""
+    now: Counted = part.counted
+    before: Counted = earlier.counted
+    counted = Counted(now.total, _sum(before.grown, now.grown), (*before.hours, *now.hours))
+    return replace(part, counted=counted, changes=(*earlier.changes, *part.changes))
+
+
+def _sum(one: Counts, other: Counts) -> Counts:
+    return {name: one.get(name, 0) + other.get(name, 0) for name in {*one, *other}}
+
+
+__all__ = ["look_at"]

@@ -33,7 +33,7 @@ def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int) ->
 
 def test_its_address_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(view_module.webbrowser, "open", opened.append)
+    monkeypatch.setattr("webbrowser.open", opened.append)
     monkeypatch.setattr(view_module, "_serve", ready_at_once)
     monkeypatch.setenv("DISPLAY", ":0")
     assert exit_status(view, ["torso", "arm"]) == 0

@@ -1,7 +1,7 @@
 """Recording: what it costs, how large it is, what it loses, and what a killed recorder leaves; as people start it.
 
-tools/bench record [cost|kills|convert|losses] [--viewers] [--seconds S] [--kills N] [--minutes M] [--busy N] [--slots N]
-                    [--sensors N ...] [--pattern NAME ...]
+tools/bench record [cost|kills|convert|losses] [--viewers] [--seconds S] [--kills N] [--minutes M] [--busy N]
+                    [--slots N] [--sensors N ...] [--pattern NAME ...]
 """
 
 from __future__ import annotations

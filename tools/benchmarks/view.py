@@ -100,7 +100,8 @@ def cost(sensors: int, viewers: int, mode: str, seconds: float, profile: Path | 
     print(
         f"  {sensors:6} taxels  {viewers} viewers  {mode:<6}  {pictures / viewers / passed_s:5.1f} pictures/s each"
         f"  {1e3 * turn_s:6.2f} ms a turn  {100 * used_s / passed_s:5.1f} % of a core"
-        f"  {turn_s / copy_s(size // max(pictures, 1)):6.0f} times a copy of its {size / max(pictures, 1) / 1e3:.1f} kB",
+        f"  {turn_s / copy_s(size // max(pictures, 1)):6.0f} times a copy"
+        f" of its {size / max(pictures, 1) / 1e3:.1f} kB",
         flush=True,
     )
 

@@ -24,6 +24,7 @@ from skinware.tactile.chain import ChainSettings
 from skinware.tactile.curves import read_curves
 from skinware.tactile.region_files import read_regions
 from skinware.tactile.testing import read_stage
+from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from tests.commands import PATIENCE_S, running
@@ -131,7 +132,7 @@ def fenced(page: Path, language: str) -> list[str]:
 
 @pytest.mark.parametrize("page", [page for page in PAGES if fenced(page, "toml")], ids=lambda page: page.stem)
 def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
-    """Geometry, stages, chains, curves, regions and packages are TOML too; their tables tell."""
+    """Geometry, stages, chains, curves, regions, links and packages are TOML too; their tables tell."""
     file = tmp_path / "page.toml"
     for text in fenced(page, "toml"):
         found = tomllib.loads(text)
@@ -147,6 +148,11 @@ def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
         elif found.get("format") == "skinware-regions":
             file.write_text(text)
             read_regions(file)
+        elif found.get("format") == "skinware-links":
+            file.write_text(text)
+            for link in found["link"]:
+                (tmp_path / link["mesh"]).touch()
+            read_robot(file)
         elif not {"project", "group"} & found.keys():
             file.write_text(re.sub(r"^cpus = .*", "", text, flags=re.MULTILINE))  # that this machine may not have
             read = ConfigFile(file)

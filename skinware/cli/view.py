@@ -30,6 +30,7 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
+from skinware.errors import MissingExtra
 
 if TYPE_CHECKING:
     from skinware.views.access import Access
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
 DEFAULT_PORT = 8736
 _CALM = "calm"
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
-_NEEDED = "websockets>=15"
-"""What the extra ``view`` brings."""
 
 
 def token_text(text: str) -> str:
@@ -103,7 +102,7 @@ def command(
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
     if find_spec("websockets") is None:
-        raise click.ClickException(f"skin-view needs: {sys.executable} -m pip install '{_NEEDED}'")
+        raise MissingExtra("skin-view needs a package that is not installed: pip install 'skinware[view]'")
     from skinware.memory.namespace import Namespace, check_name
     from skinware.views.access import Access, is_loopback
     from skinware.views.following import Follower

@@ -42,7 +42,7 @@ class Followed:
     Attributes:
         structure: of what is shown.
         quantities: the pictures that there are of it.
-        edition: another one whenever the structure is.
+        generation: in which the driver came with this structure.
         frame: its newest; None before the first.
         life: what it is doing; see :func:`skinware.views.health.life_of`.
         status: (n_sensors,) uint8, status of its sensors now, with what the calmed driver knows of their health.
@@ -58,7 +58,6 @@ class Followed:
         self.frame: DriverFrame | None = None
         self.life = STARTING
         self.changes = 0
-        self.edition = 0
         self.taken_ns = 0
         self._judged_ns = 0
         self.contacts: ContactsFrame | None = None
@@ -67,7 +66,7 @@ class Followed:
         self._calm_structure: Structure | None = None
         self._calm_fits = False
         self._shared: dict[object, Any] = {}
-        self._take_structure(live.structure)
+        self._take_structure(live.structure, live.reader.generation)
 
     @property
     def name(self) -> str:
@@ -86,7 +85,7 @@ class Followed:
             beside: what services tell beside it.
         """
         if frame.structure is not self.structure and frame.structure != self.structure:
-            self._take_structure(frame.structure)
+            self._take_structure(frame.structure, frame.generation)
         self.frame, self.taken_ns, self.life = frame, now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         self._judge(frame, beside)
@@ -158,12 +157,11 @@ class Followed:
             physical[self.structure.index(sensor_type.name)] = self.frame.physical(sensor_type.name)
         return physical
 
-    def _take_structure(self, structure: Structure) -> None:
-        self.structure = structure
+    def _take_structure(self, structure: Structure, generation: int) -> None:
+        self.structure, self.generation = structure, generation
         self.quantities = quantities_of(structure)
         self.status: npt.NDArray[np.uint8] = np.full(structure.n_sensors, int(Status.NEVER_SEEN), np.uint8)
         self.past, self.rest = Past(structure.n_sensors, structure.dtype), Rest(structure)
-        self.edition += 1
         self._calm_structure = None
 
     def _judge(self, frame: DriverFrame, beside: Beside) -> None:
@@ -222,18 +220,26 @@ class Follower:
             period_ns: no driver's frames are taken more often.
 
         Returns:
-            The drivers with a newer frame; ``changes`` and ``edition`` tell what else there is to be seen.
+            The drivers with a newer frame; their ``changes`` and ``edition`` tell what else there is to be seen.
         """
         try:
-            found = self._live.look()
-            self._beside.look()
-            self.problem = None
+            newer, self.problem = self._take(period_ns), None
         except NamespaceError as error:
-            self.problem = str(error)
-            return []
+            newer, self.problem = [], str(error)
+        return newer
+
+    def close(self) -> None:
+        """Detach from everything. Idempotent."""
+        self._beside.close()
+        self._live.close()
+        self.drivers = []
+
+    def _take(self, period_ns: int) -> list[Followed]:
+        found = self._live.look()
+        self._beside.look()
         self._keep(found)
         newer = []
-        editions = [driver.edition for driver in self.drivers]
+        generations = [driver.generation for driver in self.drivers]
         for driver in self.drivers:
             if now_ns() - driver.taken_ns < period_ns - _SLACK_NS:
                 continue
@@ -245,15 +251,9 @@ class Follower:
             elif self._beside.is_due(live):
                 driver.take(live.frame, self._beside)
                 newer.append(driver)
-        if editions != [driver.edition for driver in self.drivers]:
+        if generations != [driver.generation for driver in self.drivers]:
             self._arrange()
         return newer
-
-    def close(self) -> None:
-        """Detach from everything. Idempotent."""
-        self._beside.close()
-        self._live.close()
-        self.drivers = []
 
     def _keep(self, found: list[LiveDriver]) -> None:
         """Drivers that came and went."""

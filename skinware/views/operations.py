@@ -28,7 +28,7 @@ class Choose(msgspec.Struct, tag_field="op", tag="look"):
     mode: Mode = "raw"
     type: str | None = None
     scale: tuple[float, float] | None = None
-    fps: Annotated[float, msgspec.Meta(ge=0.1, le=60)] = DEFAULT_FPS
+    fps: Annotated[float, msgspec.Meta(ge=1, le=60)] = DEFAULT_FPS
 
     def __post_init__(self) -> None:
         if self.scale is not None and not (all(map(math.isfinite, self.scale)) and self.scale[0] < self.scale[1]):

@@ -95,8 +95,7 @@ class ViewServer:
                     for viewer in self._viewers:
                         viewer.look.follow(driver)
                 self._replay.follow(self._follower.drivers)
-                self._news.set()
-                self._news.clear()
+                self._wake()
             await asyncio.sleep(_TICK_S)
 
     async def close(self) -> None:
@@ -150,32 +149,47 @@ class ViewServer:
             self._viewers.discard(viewer)
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
+        """Hear what a viewer asks for, and tell it a turn for each time that it wants one."""
+        wanted = asyncio.Semaphore(0)
+        telling = asyncio.create_task(self._tell(viewer, connection, wanted))
+        try:
+            async for text in connection:
+                try:
+                    operation = operations.operation_of(text)
+                    if isinstance(operation, operations.Next):
+                        wanted.release()
+                    self._do(viewer, operation)
+                except ConfigurationError as error:
+                    viewer.refuse(str(error))
+                self._wake()
+        finally:
+            telling.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await telling
+
+    async def _tell(self, viewer: Viewer, connection: ServerConnection, wanted: asyncio.Semaphore) -> None:
         loop = asyncio.get_running_loop()
         last_s = 0.0
-        async for text in connection:
-            try:
-                operation = operations.operation_of(text)
-                if not isinstance(operation, operations.Next):
-                    self._do(viewer, operation)
-                    continue
-            except ConfigurationError as error:
-                viewer.refuse(str(error))
-                continue
-            if operation.protocol not in (None, PROTOCOL):
-                viewer.refuse(f"this server speaks {PROTOCOL}: reload the page")
+        while True:
+            await wanted.acquire()
             await asyncio.sleep(last_s + 1 / viewer.look.fps - loop.time())
-            await self._wait_for_news(viewer)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_LONGEST_TURN_S):
+                    while not viewer.has_news:
+                        await self._news.wait()
             last_s = loop.time()
             await connection.send(viewer.turn(self._besides()))
 
-    async def _wait_for_news(self, viewer: Viewer) -> None:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_LONGEST_TURN_S):
-                while not viewer.has_news:
-                    await self._news.wait()
+    def _wake(self) -> None:
+        """Have those who wait look whether there is news for them."""
+        self._news.set()
+        self._news.clear()
 
     def _do(self, viewer: Viewer, operation: operations.Operation) -> None:
         match operation:
+            case operations.Next():
+                if operation.protocol not in (None, PROTOCOL):
+                    raise ConfigurationError(f"this server speaks {PROTOCOL}: reload the page")
             case operations.Choose():
                 viewer.choose(operation)
             case operations.Exact():

@@ -84,10 +84,12 @@ class Viewer:
     def tare(self) -> None:
         """Take what comes next for rest."""
         self.look.tare()
+        self._see_all_again()
 
     def wipe(self, on: bool) -> None:
         """Begin a wipe test, or leave it."""
         self.look.wipe(on)
+        self._see_all_again()
 
     def pin(self, sensors: list[tuple[int, int]]) -> None:
         """Tell the values of these sensors, of drivers by number, as they are, in every turn."""
@@ -190,7 +192,7 @@ class Viewer:
         told: dict[str, Any] = {
             "driver": driver.number,
             "type": quantity.name,
-            "generation": str(driver.edition),
+            "generation": str(driver.generation),
             "sequence": str(frame.sequence),
             "acquired_ns": str(frame.acquired_ns),
             "scale": picture.scale,
@@ -304,7 +306,7 @@ def _regions(driver: Followed) -> list[dict[str, Any]]:
 
 
 def _seen(driver: Followed) -> tuple[int, int]:
-    return driver.edition, driver.changes
+    return driver.generation, driver.changes
 
 
 def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
@@ -339,7 +341,7 @@ def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
         "id": driver.number,
         "name": driver.name,
         "namespace": driver.namespace,
-        "generation": str(driver.edition),
+        "generation": str(driver.generation),
         "type": driver.live.reader.driver_type,
         "dtype": structure.dtype.name,
         "types": types,

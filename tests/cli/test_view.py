@@ -103,4 +103,4 @@ def test_bad_input_is_said_in_a_line(arguments: tuple[str, ...], status: int, wh
 def test_without_its_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(view_module, "find_spec", lambda _: None)
     assert exit_status(view, ["--no-browser"]) == 1
-    assert "pip install 'websockets" in capsys.readouterr().err
+    assert "pip install 'skinware[view]'" in capsys.readouterr().err

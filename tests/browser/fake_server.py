@@ -191,7 +191,10 @@ class FakeServer:
 
     Attributes:
         ops: what the pages asked for besides turns, oldest first.
-        extra: added to every turn; once to each viewer if its key begins with "once:".
+        extra: added to every turn.
+        muted: it answers nothing.
+        links: meshes of the structure.
+        files: more that it serves, by path.
         before_turn: called before each turn is made, for tests that move things.
     """
 
@@ -205,7 +208,11 @@ class FakeServer:
         self.version = 0
         self.turns = 0
         self.muted = False
-        self._server = serve(self._talk, "127.0.0.1", port, process_request=self._file, compression=None)
+        self.links: list[Header] = []
+        self.files: dict[str, bytes] = {}
+        self._server = serve(
+            self._talk, "127.0.0.1", port, process_request=self._file, compression=None, ping_interval=None
+        )
         self.port = self._server.socket.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}/"
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
@@ -223,6 +230,8 @@ class FakeServer:
         path = request.path.split("?")[0]
         if path == "/live":
             return None
+        if path in self.files:
+            return Response(200, "OK", Headers({"Content-Length": str(len(self.files[path]))}), self.files[path])
         file = (PAGE / (path.lstrip("/") or "index.html")).resolve()
         if not file.is_relative_to(PAGE) or not file.is_file():
             return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
@@ -251,7 +260,8 @@ class FakeServer:
                 header: Header = {"turn": number, "now_ns": str(MONOTONIC_NS + time.monotonic_ns())}
                 if told != self.version:
                     told = self.version
-                    header["skin"] = {"namespaces": ["default"], "drivers": [d.told() for d in self.drivers]}
+                    drivers = [d.told() for d in self.drivers]
+                    header["skin"] = {"namespaces": ["default"], "drivers": drivers, "links": self.links}
                 header["scale"] = {"low": 0, "high": 250, "unit": "counts", "mode": self.look["mode"]}
                 header["pictures"] = [d.picture() for d in self.drivers if d.state == "live"]
                 if last - state_at > 0.5:

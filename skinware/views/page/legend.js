@@ -34,7 +34,8 @@ export class Legend {
 
   /** @param {object} scale `low`, `high`, `unit` of what is shown; @param {?number[]} fixed what a person chose. */
   update(scale, fixed, sheets) {
-    for (const [input, end] of [[this.low, scale.low], [this.high, scale.high]]) {
+    const ends = fixed ?? [scale.low, scale.high];
+    for (const [input, end] of [[this.low, ends[0]], [this.high, ends[1]]]) {
       if (document.activeElement !== input) input.value = figure(end);
     }
     byId("gradient").setAttribute("aria-label", `colours from ${figure(scale.low)} to ${figure(scale.high)} ${scale.unit}`);

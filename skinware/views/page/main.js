@@ -4,7 +4,7 @@ import * as address from "./address.js";
 import { Bar } from "./bar.js";
 import { Cards } from "./cards.js";
 import { byId, h, save, setHidden, setPressed, setText, stamp } from "./dom.js";
-import { bytes, clock } from "./format.js";
+import { bytes, clock, measure } from "./format.js";
 import { Past } from "./history.js";
 import { fillHelp, listen } from "./keys.js";
 import { Legend } from "./legend.js";
@@ -30,6 +30,7 @@ const TURN = 0.12; // rad, of a key
 const CLICK_PX = 4; // a mouse that moved less has clicked
 const HIDDEN_MS = 1000; // between turns of a page that nobody sees
 const NOTICE_MS = 6000;
+const TELL_EVERY_MS = 90; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
@@ -47,13 +48,12 @@ const view = {
   isThemeChosen: Boolean(wanted.theme ?? stored()),
 };
 let isAlive = false; // turns come
-let isFramed = false;
 let contacts = [];
 let problems = [];
 let recording = null;
 let wipeTold = null;
-let pointer = null;
 let turnNumber = 0;
+let told_ms = 0; // when figures were brought up to date
 
 const stage = new Stage(byId("stage"), {
   flat: query.has("flat") || wanted.flat,
@@ -132,9 +132,9 @@ function turn(message) {
   wipe.update(header.wipe);
   if (!rewind.isPaused) {
     remember(header.pictures);
-    show();
+    if (header.pictures || header.state || header.skin) show();
   }
-  tell();
+  if (performance.now() - told_ms > TELL_EVERY_MS) tell();
   afterFrame(() => link.next());
 }
 
@@ -175,7 +175,6 @@ function takeState(state) {
   const lost = recording?.lost ? `, ${recording.lost} lost` : "";
   setText(byId("record").lastElementChild, recording ? `${clock(recording.s)} · ${bytes(recording.bytes)}${lost}` : "Record");
   byId("record").title = recording?.file ?? "Record (r)";
-  for (const sheet of stage.sheets) sheet.fill();
 }
 
 function remember(pictures) {
@@ -197,6 +196,7 @@ function show() {
 
 /** Bring everything beside the picture up to date. */
 function tell() {
+  told_ms = performance.now();
   const isPast = rewind.isPaused;
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
   bar.update(skin, states, stage, recording);
@@ -208,10 +208,11 @@ function tell() {
 
 function sheetsChanged() {
   stage.setSheets(skin.shown(view.type));
-  if (isFramed || !stage.sheets.length) return;
-  isFramed = true;
-  if (wanted.camera) stage.look(...[wanted.camera.position, wanted.camera.target].map(([x, y, z]) => ({ x, y, z })));
-  else frameAll(true);
+  if (stage.isTurned || !stage.sheets.length) return;
+  if (wanted.camera) {
+    stage.look(...[wanted.camera.position, wanted.camera.target].map(([x, y, z]) => ({ x, y, z })));
+    stage.isTurned = true;
+  } else frameAll(true);
 }
 
 /** Bring all taxels, or those selected, into view. */
@@ -299,7 +300,6 @@ function setMode(mode) {
 function setType(type) {
   view.type = type;
   view.scale = null;
-  isFramed = stage.sheets.length > 0;
   sheetsChanged();
   probes.hover(null);
   dim();
@@ -321,7 +321,7 @@ function setTheme(theme, isChosen) {
   setText(byId("theme"), theme === "dark" ? "Light" : "Dark");
   stage.setTheme(theme);
   legend.setTheme(theme);
-  if (isChosen) localStorage.setItem("theme", theme);
+  if (isChosen) store(theme);
   tell();
 }
 
@@ -346,11 +346,14 @@ function step(by) {
   const at = all.findIndex(({ sheet, i }) => sheet === probes.hovered?.sheet && i === probes.hovered?.i);
   const found = all[at < 0 ? 0 : (at + by + all.length) % all.length];
   hover(found);
+  const { name } = probes.hovered;
+  setText(byId("spoken"), `${name}: ${measure(found.sheet.valueOf(found.i), found.sheet.unit)}`);
   const [x, y] = stage.project(...found.sheet.place(found.i));
   cards.place(x, y, stage.width, stage.height);
 }
 
 function takePicture() {
+  stage.draw(); // the browser keeps no picture by WebGL after it was shown
   const both = h("canvas", { width: stage.view.canvas.width, height: stage.view.canvas.height });
   const context = both.getContext("2d");
   for (const canvas of [stage.view.canvas, overlay.canvas]) context.drawImage(canvas, 0, 0, both.width, both.height);
@@ -379,7 +382,7 @@ let keepTimer = 0;
 function keep() {
   clearTimeout(keepTimer);
   keepTimer = setTimeout(() => {
-    if (!isFramed) return;
+    if (!stage.sheets.length) return;
     const hash = address.toHash({
       ...view,
       camera: { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() },
@@ -409,8 +412,21 @@ function afterFrame(go) {
   setTimeout(once, HIDDEN_MS);
 }
 
+/** The theme that was chosen in this browser before; some let no page keep anything. */
 function stored() {
-  return localStorage.getItem("theme") ?? undefined;
+  try {
+    return localStorage.getItem("theme") ?? undefined;
+  } catch {
+    return undefined;
+  }
+}
+
+function store(theme) {
+  try {
+    localStorage.setItem("theme", theme);
+  } catch {
+    // it is chosen for this page alone
+  }
 }
 
 // -- mouse, keys, buttons -----------------------------------------------------------------------------------------
@@ -418,7 +434,7 @@ function stored() {
 const host = byId("stage");
 let pressed = null;
 host.addEventListener("pointermove", (event) => {
-  pointer = [event.offsetX, event.offsetY];
+  const pointer = [event.offsetX, event.offsetY];
   if (event.pointerType === "touch" || event.buttons) return;
   hover(pick(stage, stage.sheets, ...pointer));
   cards.place(...pointer, stage.width, stage.height);
@@ -534,6 +550,7 @@ window.skin = {
   get untouched() { return untouched(stage.sheets).map(pairOf); },
   get recording() { return recording; },
   get contacts() { return contacts; },
+  get meshes() { return stage.meshes.length; },
   get kept_bytes() { return past.bytes; },
   /** The colour of a level, [r, g, b]. */
   colourOf: (level) => [...ramp(view.theme).slice(4 * level, 4 * level + 3)],

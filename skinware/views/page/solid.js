@@ -21,7 +21,7 @@ export class Solid {
   /** @throws {Error} this browser has no WebGL 2. */
   constructor(host, theme) {
     this.canvas = document.createElement("canvas");
-    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: false, preserveDrawingBuffer: true });
+    this.renderer = new WebGLRenderer({ canvas: this.canvas, antialias: false, alpha: false, stencil: false });
     host.prepend(this.canvas);
     this.canvas.addEventListener("webglcontextlost", () => this.onlost?.());
     this.scene = new Scene();

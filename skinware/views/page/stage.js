@@ -7,7 +7,7 @@ import { Solid } from "./solid.js";
 const VIEW_ANGLE = 35; // degrees, from the bottom of the picture to its top
 const SLOW_MS = 55;
 const QUICK_MS = 24;
-const RATIOS = [0.5, 0.75, 1, 1.5, 2];
+const RATIOS = [0.75, 1, 1.5, 2];
 
 export class Stage {
   #asked = false;
@@ -35,6 +35,8 @@ export class Stage {
     this.controls.enableDamping = !matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.controls.dampingFactor = 0.2;
     this.controls.zoomToCursor = true;
+    this.isTurned = false; // by a person: the view is theirs
+    this.controls.addEventListener("start", () => (this.isTurned = true));
     this.controls.addEventListener("change", () => {
       options.moved?.();
       this.ask();
@@ -112,11 +114,16 @@ export class Stage {
   #frame(now) {
     this.#asked = false;
     this.controls.update();
-    this.#see();
     this.#pace(now);
+    this.draw();
+    this.drawn++;
+  }
+
+  /** Draw now. */
+  draw() {
+    this.#see();
     this.view.render(this.camera);
     this.options.drawOver?.(this);
-    this.drawn++;
   }
 
   /** Fewer pixels while frames come slowly, more when there is time again. */
@@ -186,6 +193,7 @@ export class Stage {
 
   /** Go around what is looked at, rad, and nearer to it (below 1) or away. */
   orbit(around, up, zoom = 1) {
+    this.isTurned = true;
     const eye = new Spherical().setFromVector3(yUp(this.camera.position.clone().sub(this.controls.target)));
     eye.theta += around;
     eye.phi += up;

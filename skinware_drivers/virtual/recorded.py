@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -49,15 +49,19 @@ class RecordedWire:
 
     Args:
         items: what went over it, by time.
+        first_ns: time of the recording, CLOCK_MONOTONIC of then, at which it begins.
         speed: 2.0: twice as fast.
         waits: for the questions that were asked when it was recorded.
         name: for messages.
     """
 
-    def __init__(self, items: Iterator[WireItem], *, speed: float = 1.0, waits: bool = True, name: str = "") -> None:
+    def __init__(
+        self, items: Iterator[WireItem], first_ns: int, *, speed: float = 1.0, waits: bool = True, name: str = ""
+    ) -> None:
         self._items, self._speed, self._waits, self._name = items, speed, waits, name
         self._next: WireItem | None = None
-        self._first_ns = self._begun_ns = self._given_ns = 0
+        self._first_ns = first_ns
+        self._begun_ns = self._given_ns = 0
         self._has_begun = self._is_over = False
         self._asked: dict[int, deque[int]] = {}
         self._unasked: set[int] = set()
@@ -98,7 +102,6 @@ class RecordedWire:
             return len(self.emit(now_ns))
         self._has_begun, self._begun_ns = True, now_ns
         self._take_next()
-        self._first_ns = self._next.time_ns if self._next is not None else 0
         return 0
 
     def totals(self) -> dict[str, int]:
@@ -239,9 +242,22 @@ def replayed_bus(
     wire = wire_of(recording, wanted.bus, wanted.driver)
     name = f"replay:{channel} ({wire.bus})"
     items = _items(recording, wire, wanted)
-    recorded = RecordedWire(items, speed=wanted.speed, waits=not listen_only, name=name)
+    of_driver = [one for one in recording.wires if one.driver == wire.driver]
+    first_ns = first_of(of_driver, wanted.start)
+    recorded = RecordedWire(items, first_ns, speed=wanted.speed, waits=not listen_only, name=name)
     kind = ReplayedSerialBus if wire.is_serial else ReplayedCanBus
     return kind(recorded, name, payload_size=payload_size, listen_only=listen_only)
+
+
+def first_of(wires: Sequence[WireTrack], start_s: float = 0.0) -> int:
+    """When something first went over one of these, CLOCK_MONOTONIC ns of then; 0: nothing did.
+
+    Args:
+        wires: of one recording.
+        start_s: from when on, s since the recording began.
+    """
+    firsts = (next(wire.items(start_s=start_s), None) for wire in wires)
+    return min((first.time_ns for first in firsts if first is not None), default=0)
 
 
 def _items(recording: Recording, wire: WireTrack, wanted: ReplayOptions) -> Iterator[WireItem]:
@@ -273,4 +289,4 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")
 
 
-__all__ = ["RecordedWire", "ReplayOptions", "replayed_bus", "wire_of"]
+__all__ = ["RecordedWire", "ReplayOptions", "first_of", "replayed_bus", "wire_of"]

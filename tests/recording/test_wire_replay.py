@@ -151,7 +151,7 @@ def emitted(wire: RecordedWire, until_ms: float, step_ms: float = 1.0) -> list[t
 
 
 def test_frames_come_with_their_own_times() -> None:
-    wire = RecordedWire(iter([item(5, 1), item(6.5, 2), item(20, 3)]))
+    wire = RecordedWire(iter([item(5, 1), item(6.5, 2), item(20, 3)]), 7_005 * MS)
     assert wire.next_due_ns() is None
     assert wire.skip(0) == 0
     assert wire.next_due_ns() == 0
@@ -161,15 +161,14 @@ def test_frames_come_with_their_own_times() -> None:
 
 
 def test_speed() -> None:
-    wire = RecordedWire(iter([item(0, 1), item(10, 2), item(30, 3)]), speed=2.0)
+    wire = RecordedWire(iter([item(0, 1), item(10, 2), item(30, 3)]), 7_000 * MS, speed=2.0)
     wire.skip(0)
     assert emitted(wire, 30) == [(0, 1), (5, 2), (15, 3)]
 
 
 def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
-    wire = RecordedWire(
-        iter([item(0, 0x10, is_sent=True), item(2, 0x20), item(50, 0x10, is_sent=True), item(52, 0x20)])
-    )
+    items = [item(0, 0x10, is_sent=True), item(2, 0x20), item(50, 0x10, is_sent=True), item(52, 0x20)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
     wire.skip(0)
     assert emitted(wire, 30) == []
     wire.receive(0x11, b"", 30 * MS)  # another question
@@ -184,26 +183,26 @@ def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
 
 def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
     items = [item(0, 0x10, is_sent=True), item(1, 1), item(10, 0x10, is_sent=True), item(11, 2)]
-    wire = RecordedWire(iter(items))
+    wire = RecordedWire(iter(items), 7_000 * MS)
     wire.skip(0)
     assert wire.next_due_ns() == 500 * MS
     assert emitted(wire, 600) == [(501, 1), (511, 2)]
 
 
 def test_who_only_listens_is_not_waited_for() -> None:
-    wire = RecordedWire(iter([item(0, 0x10, is_sent=True), item(1, 1)]), waits=False)
+    wire = RecordedWire(iter([item(0, 0x10, is_sent=True), item(1, 1)]), 7_000 * MS, waits=False)
     wire.skip(0)
     assert emitted(wire, 2) == [(1, 1)]
 
 
 def test_error_and_remote_frames_are_not_sent_again() -> None:
-    wire = RecordedWire(iter([item(0, ERROR_FLAG | 4, bytes(8)), item(0, REMOTE_FLAG | 5), item(0, 6)]))
+    wire = RecordedWire(iter([item(0, ERROR_FLAG | 4, bytes(8)), item(0, REMOTE_FLAG | 5), item(0, 6)]), 7_000 * MS)
     wire.skip(0)
     assert emitted(wire, 1) == [(0, 6)]
 
 
 def test_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    wire = RecordedWire(iter([item(0, 1)]), name="replay:walk.mcap (can0)")
+    wire = RecordedWire(iter([item(0, 1)]), 7_000 * MS, name="replay:walk.mcap (can0)")
     wire.skip(0)
     emitted(wire, 1)
     emitted(wire, 1)

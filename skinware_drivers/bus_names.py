@@ -9,6 +9,7 @@ from urllib.parse import parse_qsl
 from skinware.errors import ConfigurationError
 
 _PLACING: dict[str, dict[str, str]] = {
+    "replay": {"bus": "", "driver": ""},
     "serial": {"serial_number": "", "vid_pid": ""},
     "udp_multicast": {"port": "43113"},
     "socketcand": {"host": "", "port": ""},

@@ -25,7 +25,7 @@ from skinware.recording.frames import RecordedDriverFrame, RecordedFrame, Record
 from skinware.recording.reading import Recording
 from skinware.recording.series import Series
 from skinware.recording.tracks import Track
-from skinware.recording.wire_tracks import WirePiece, WireTrack
+from skinware.recording.wire_tracks import WireItem, WirePiece, WireTrack
 
 __all__ = [
     "RecordedDriverFrame",
@@ -34,6 +34,7 @@ __all__ = [
     "Recording",
     "Series",
     "Track",
+    "WireItem",
     "WirePiece",
     "WireTrack",
     "open",

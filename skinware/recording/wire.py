@@ -13,15 +13,12 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
-
-import numpy as np
-import numpy.typing as npt
+from typing import BinaryIO
 
 from skinware.candump import candump_line, channel_name
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording.reading import Recording
-from skinware.recording.wire_tracks import WirePiece, WireTrack
+from skinware.recording.wire_tracks import WireItem, WireTrack
 from skinware.wire import IS_CUT, IS_FD
 
 SOCKETCAN, SERIAL = 227, 147
@@ -32,8 +29,6 @@ SERIAL_HEADER = struct.Struct("<BBH")
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _NAME, _DESCRIPTION, _RESOLUTION, _FLAGS = 2, 3, 9, 2
 _INBOUND, _OUTBOUND = 1, 2
-_WINDOW_S = 5.0
-"""So much is put in order at once."""
 _ASKED_EACH = 1000
 
 _Wires = list[tuple[WireTrack, str]]
@@ -70,18 +65,6 @@ class Exported:
     notes: list[str] = field(default_factory=list)
 
 
-class _Item(NamedTuple):
-    """A frame, or bytes, of a wire; they sort by time."""
-
-    epoch_ns: int
-    number: int
-    order: int
-    is_sent: bool
-    identifier: int
-    flags: int
-    data: bytes
-
-
 def export_candump(recording: Recording, path: Path, chosen: Chosen | None = None) -> Exported:
     """Write the frames of all CAN buses as ``candump -L`` does; each line ends with ``R`` (received) or ``T`` (sent).
 
@@ -97,12 +80,11 @@ def export_candump(recording: Recording, path: Path, chosen: Chosen | None = Non
     """
 
     def write(file: BinaryIO, wires: _Wires, what: Chosen, told: Exported) -> None:
-        for item in _in_order(wires, what, told):
-            channel = wires[item.number][1]
+        for number, item in _in_order(wires, what, told):
+            channel = wires[number][1]
             fd_flags = item.flags if item.flags & IS_FD else None
-            line = candump_line(
-                item.epoch_ns // 1000, channel, item.identifier, fd_flags, item.data, "T" if item.is_sent else "R"
-            )
+            direction = "T" if item.is_sent else "R"
+            line = candump_line(item.epoch_ns // 1000, channel, item.identifier or 0, fd_flags, item.data, direction)
             file.write(line.encode() + b"\n")
             told.counts[channel] += 1
 
@@ -127,17 +109,14 @@ def export_pcapng(recording: Recording, path: Path, chosen: Chosen | None = None
 
     def write(file: BinaryIO, wires: _Wires, what: Chosen, told: Exported) -> None:
         file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)))
-        are_serial = []
         for wire, name in wires:
-            is_serial = _is_serial(wire)
-            are_serial.append(is_serial)
             options = _option(_NAME, name.encode()) + _option(_RESOLUTION, b"\x09")
             options += _option(_DESCRIPTION, f"bus {wire.bus} of {wire.driver}".encode()) + struct.pack("<HH", 0, 0)
-            link_type = SERIAL if is_serial else SOCKETCAN
+            link_type = SERIAL if wire.is_serial else SOCKETCAN
             file.write(_block(_INTERFACE, struct.pack("<HHI", link_type, 0, 0) + options))
-        for item in _in_order(wires, what, told):
-            file.write(_packet(item, are_serial[item.number]))
-            told.counts[wires[item.number][1]] += 1
+        for number, item in _in_order(wires, what, told):
+            file.write(_packet(number, item))
+            told.counts[wires[number][1]] += 1
 
     return _export(recording, path, chosen or Chosen(), write, with_serial=True)
 
@@ -160,7 +139,7 @@ def _export(
     for wire, name in _named(recording):
         if chosen.drivers and wire.driver not in chosen.drivers:
             continue
-        if with_serial or not _is_serial(wire):
+        if with_serial or not wire.is_serial:
             wires.append((wire, name))
         else:
             told.notes.append(f"{wire.bus} of {wire.driver} left out: the format has no serial lines")
@@ -197,49 +176,22 @@ def _named(recording: Recording) -> _Wires:
     return named
 
 
-def _is_serial(wire: WireTrack) -> bool:
-    first = next(wire.pieces(), None)
-    return first is not None and first.frames is None
-
-
-def _in_order(wires: _Wires, chosen: Chosen, told: Exported) -> Iterator[_Item]:
-    """Everything by time; what is cut is counted in the notes."""
+def _in_order(wires: _Wires, chosen: Chosen, told: Exported) -> Iterator[tuple[int, WireItem]]:
+    """Everything by time, each with the number of its wire; what is cut is counted in the notes."""
     cut = 0
-    streams = [_by_time(wire, number, chosen) for number, (wire, _) in enumerate(wires)]
-    for count, item in enumerate(heapq.merge(*streams)):
+    streams = [_numbered(number, wire, chosen) for number, (wire, _) in enumerate(wires)]
+    for count, (number, item) in enumerate(heapq.merge(*streams, key=lambda one: one[1].epoch_ns)):
         if not count % _ASKED_EACH and chosen.is_stopped():
             raise KeyboardInterrupt
         cut += bool(item.flags & IS_CUT)
-        yield item
+        yield number, item
     if cut:
         told.notes.append(f"{cut} CAN FD frames without their end: their driver knows none that are so long")
 
 
-def _by_time(wire: WireTrack, number: int, chosen: Chosen) -> Iterator[_Item]:
-    """What went over one wire by time: what was received and sent is put in order within some seconds."""
-    waiting: list[_Item] = []
-    order = 0
-    for piece in wire.pieces(start_s=chosen.start_s, end_s=chosen.end_s):
-        for item in _items(piece, number, order):
-            heapq.heappush(waiting, item)
-            order += 1
-        until_ns = int(piece.epoch_ns[-1]) - round(_WINDOW_S * 1e9) if len(piece.epoch_ns) else 0
-        while waiting and waiting[0].epoch_ns < until_ns:
-            yield heapq.heappop(waiting)
-    while waiting:
-        yield heapq.heappop(waiting)
-
-
-def _items(piece: WirePiece, number: int, order: int) -> Iterator[_Item]:
-    times: npt.NDArray[np.int64] = piece.epoch_ns
-    if piece.frames is None:
-        yield _Item(int(times[0]), number, order, piece.is_sent, 0, 0, piece.data)
-        return
-    names = ("identifier", "length", "flags")
-    columns = (piece.frames[name].tolist() for name in names)
-    for place, (time_ns, identifier, length, flags) in enumerate(zip(times.tolist(), *columns, strict=True)):
-        data = piece.frames["payload"][place, :length].tobytes()
-        yield _Item(time_ns, number, order + place, piece.is_sent, identifier, flags, data)
+def _numbered(number: int, wire: WireTrack, chosen: Chosen) -> Iterator[tuple[int, WireItem]]:
+    for item in wire.items(start_s=chosen.start_s, end_s=chosen.end_s):
+        yield number, item
 
 
 def _block(kind: int, body: bytes) -> bytes:
@@ -255,12 +207,12 @@ def _filled_up(data: bytes) -> bytes:
     return data + bytes(-len(data) % 4)
 
 
-def _packet(item: _Item, is_serial: bool) -> bytes:
-    if is_serial:
+def _packet(number: int, item: WireItem) -> bytes:
+    if item.identifier is None:
         data = SERIAL_HEADER.pack(1, item.is_sent, 0) + item.data
     else:
         data = struct.pack(">IBBH", item.identifier, len(item.data), item.flags & ~IS_CUT & 0xFF, 0) + item.data
-    head = struct.pack("<IIIII", item.number, item.epoch_ns >> 32, item.epoch_ns & 0xFFFF_FFFF, len(data), len(data))
+    head = struct.pack("<IIIII", number, item.epoch_ns >> 32, item.epoch_ns & 0xFFFF_FFFF, len(data), len(data))
     options = _option(_FLAGS, struct.pack("<I", _OUTBOUND if item.is_sent else _INBOUND)) + struct.pack("<HH", 0, 0)
     return _block(_PACKET, head + _filled_up(data) + options)
 

@@ -8,6 +8,7 @@ A message is that of a frame of the driver's service (:mod:`skinware.wire`)::
 
 from __future__ import annotations
 
+import heapq
 import struct
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -24,6 +25,8 @@ _HEADER = struct.Struct("<QQqQ")
 """Generation and sequence of the frame, when it was published, how much of the bus was lost so far."""
 _LATEST_S = 1.0
 """What goes over a wire is published so soon."""
+_WINDOW_NS = 2 * NS_PER_S
+"""Within which what was received and sent is put in order."""
 
 FRAME = np.dtype(
     [
@@ -61,6 +64,26 @@ class WirePiece(NamedTuple):
     time_ns: npt.NDArray[np.int64]
     epoch_ns: npt.NDArray[np.int64]
     frames: npt.NDArray[np.void] | None
+    data: bytes
+
+
+class WireItem(NamedTuple):
+    """A frame of a CAN bus, or bytes of a serial line that were read or written together.
+
+    Attributes:
+        time_ns: CLOCK_MONOTONIC.
+        epoch_ns: the same, ns since 1970.
+        is_sent: by the driver, not received.
+        identifier: with the flags of linux/can.h; None of bytes.
+        flags: of ``skinware.wire.ROWS``.
+        data: payload, or bytes.
+    """
+
+    time_ns: int
+    epoch_ns: int
+    is_sent: bool
+    identifier: int | None
+    flags: int
     data: bytes
 
 
@@ -120,6 +143,31 @@ class WireTrack:
                     frames = piece.frames[wanted]
                     yield WirePiece(piece.is_sent, piece.time_ns[wanted], epoch_ns[wanted], frames, b"")
 
+    @property
+    def is_serial(self) -> bool:
+        """Whether it is a serial line; False if nothing was recorded."""
+        first = next(self.pieces(), None)
+        return first is not None and first.frames is None
+
+    def items(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WireItem]:
+        """Every frame, or every read and write, by time.
+
+        Args:
+            start_s: as for :meth:`pieces`.
+            end_s: likewise.
+        """
+        waiting: list[tuple[int, int, WireItem]] = []
+        order = 0
+        for piece in self.pieces(start_s=start_s, end_s=end_s):
+            for item in _items(piece):
+                heapq.heappush(waiting, (item.time_ns, order, item))
+                order += 1
+            until_ns = int(piece.time_ns[-1]) - _WINDOW_NS if len(piece.time_ns) else 0
+            while waiting and waiting[0][0] < until_ns:
+                yield heapq.heappop(waiting)[2]
+        while waiting:
+            yield heapq.heappop(waiting)[2]
+
     def frames(self, *, start_s: float = 0.0, end_s: float | None = None) -> npt.NDArray[np.void]:
         """(n,) of :data:`FRAME`: all frames of a CAN bus by time; none of a serial line.
 
@@ -158,4 +206,16 @@ class WireTrack:
         return f"<WireTrack of {self.bus!r} of {self.driver!r}>"
 
 
-__all__ = ["FRAME", "WirePiece", "WireTrack", "message_of"]
+def _items(piece: WirePiece) -> Iterator[WireItem]:
+    times, epochs = piece.time_ns.tolist(), piece.epoch_ns.tolist()
+    if piece.frames is None:
+        yield WireItem(times[0], epochs[0], piece.is_sent, None, 0, piece.data)
+        return
+    columns = (piece.frames[name].tolist() for name in ("identifier", "length", "flags"))
+    payloads = piece.frames["payload"]
+    for place, (time_ns, epoch_ns, identifier, length, flags) in enumerate(zip(times, epochs, *columns, strict=True)):
+        data = payloads[place, :length].tobytes()
+        yield WireItem(time_ns, epoch_ns, piece.is_sent, identifier, flags, data)
+
+
+__all__ = ["FRAME", "WireItem", "WirePiece", "WireTrack", "message_of"]

@@ -54,15 +54,18 @@ class Wires:
         await asyncio.gather(self._task, return_exceptions=True)
         self._task = None
         try:
-            if self._writer is not None or is_wished(self._namespace, wire.WISH):
+            if self._writer is not None:
                 self._publish()
         except (SkinwareError, OSError) as error:
             self._tell_trouble(error)
         self._withdraw()
 
     async def _serve(self) -> None:
-        await asyncio.sleep(_BEGINNING_S)
         try:
+            for _ in range(round(_BEGINNING_S / _TURN_S)):
+                if is_wished(self._namespace, wire.WISH):
+                    break
+                await asyncio.sleep(_TURN_S)
             while True:
                 if is_wished(self._namespace, wire.WISH):
                     await self._publish_for_a_while()

@@ -21,7 +21,6 @@ from skinware.cli.info import command as info
 from skinware.cli.press import command as press
 from skinware.cli.recover import command as recover
 from skinware.cli.regions import command as regions
-from skinware.cli.replay import command as replay
 from skinware.cli.top import command as top
 from skinware.geometry import geometry_to_toml
 from skinware.realtime import now_ns
@@ -31,6 +30,7 @@ from skinware_drivers.cli.dump import command as dump
 from skinware_drivers.cli.emulation import Emulation, JsonReport
 from skinware_drivers.cli.find import command as find
 from skinware_drivers.cli.import_ import command as import_
+from skinware_drivers.cli.replay import command as replay
 from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
@@ -47,6 +47,7 @@ from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device
 from tests.icub.test_positions import TRIANGLE, positions
+from tests.recording.test_wire_export import ON_VCAN1, keep, write_recording
 from tests.virtual.test_emulate import HostBus
 
 PAGE = Path(__file__).parents[2] / "docs/reference/json.md"
@@ -290,6 +291,9 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
     check("`skin-recover`", *printing(recover, str(file)))
     check("`skin-convert`", *printing(convert, str(file), "--to", "csv"))
     check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
+    wire = tmp_path / "wire.mcap"
+    write_recording(wire, lambda taps: keep(taps, "torso", "can0", ON_VCAN1))
+    check("`skin-replay --wire`", *printing(replay, str(wire), "--wire", "--bus", "can+virtual:json"))
 
 
 def test_view() -> None:

@@ -1,0 +1,235 @@
+"""``skin-replay``: publish a recording again (``skinware.cli.replay``), or with ``--wire`` send its frames on buses."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, print_json, run, signals_end, warn
+from skinware.cli.replay import command as frames_command
+
+if TYPE_CHECKING:
+    from skinware.recording import Recording, WireTrack
+    from skinware_drivers.bus import Bus
+    from skinware_drivers.virtual.recorded import RecordedWire
+
+_OF_SERVICES = {"paused": "--paused", "stay": "--stay", "namespace": "--namespace"}
+_LONGEST_SLEEP_S = 0.05
+_FULL_S = 0.1
+"""How long a bus that takes nothing is waited for, before a frame is given up."""
+_PAYLOAD = 64
+
+
+def replay(wire: bool, buses: tuple[str, ...], **options: Any) -> None:
+    """Services, or wires."""
+    if not wire:
+        if buses:
+            raise click.UsageError("--bus is for --wire")
+        click.get_current_context().invoke(frames_command, **options)
+        return
+    for option, flag in _OF_SERVICES.items():
+        if options[option]:
+            raise click.UsageError(f"{flag} is about drivers and services, --wire about what went over buses")
+    if options["times"] != "now":
+        raise click.UsageError("--times is about the frames of drivers, --wire about what went over buses")
+    if not buses:
+        file = options["file"]
+        raise click.UsageError(
+            f"--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:{file}"
+        )
+    _replay_wires(
+        options["file"],
+        options["names"],
+        buses,
+        options["factor"],
+        options["start_s"],
+        options["end_s"],
+        options["loop"],
+        options["as_json"],
+    )
+
+
+def _replay_wires(
+    file: Path,
+    drivers: Sequence[str],
+    buses: Sequence[str],
+    speed: float,
+    start_s: float,
+    end_s: float | None,
+    loop: bool,
+    as_json: bool,
+) -> None:
+    import skinware.recording
+
+    with skinware.recording.open(file) as recording:
+        pairs = _pairs(recording, drivers, buses)
+        sender = WireSender(pairs, speed, start_s, end_s)
+        with contextlib.closing(sender), signals_end(sender.stop):
+            sender.open()
+            told = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
+            if as_json:
+                print_json({"event": "ready", "file": str(file), "buses": told, "duration_s": recording.duration_s})
+            else:
+                click.echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in told.items())} (Ctrl-C ends)")
+            sender.send_all(loop=loop)
+        for problem in recording.problems:
+            warn(problem)
+    if as_json:
+        print_json({"event": "stopped", "frames": dict(sender.sent), "failed": sender.failed})
+    else:
+        failed = f", {sender.failed} not taken by their bus" if sender.failed else ""
+        click.echo(f"{sender.sent.total()} frames sent{failed}")
+
+
+def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireTrack, Bus]]:
+    """What is sent where.
+
+    Raises:
+        ConfigurationError: a recorded bus is not there, or it is not clear which is meant, or named twice.
+    """
+    from skinware.errors import ConfigurationError
+    from skinware.wire import MOST_BYTES
+    from skinware_drivers.registry import make_bus
+    from skinware_drivers.virtual.recorded import wire_of
+
+    driver = drivers[0] if len(drivers) == 1 else ""
+    pairs: list[tuple[WireTrack, Bus]] = []
+    for text in buses:
+        recorded, _, name = text.partition("=") if _names_recorded(recording, text) else ("", "", text)
+        wire = wire_of(recording, recorded, driver)
+        if any(wire is other for other, _ in pairs):
+            raise ConfigurationError(f"--bus {text}: {wire.bus} is sent already")
+        pairs.append((wire, make_bus(name, payload_size=MOST_BYTES if wire.is_serial else _PAYLOAD)))
+    return pairs
+
+
+def _names_recorded(recording: Recording, text: str) -> bool:
+    return any(text.startswith(f"{wire.bus}=") for wire in recording.wires)
+
+
+class WireSender:
+    """Sends what was received on wires onto buses, with the times that it had.
+
+    Args:
+        pairs: recorded wires, and unopened buses to send them on.
+        speed: 2.0: twice as fast.
+        start_s: where to begin, s since the recording began.
+        end_s: where to end, likewise; None: with the last.
+
+    Attributes:
+        sent: frames, or reads of a serial line, of each recorded bus.
+        failed: those that a bus did not take.
+    """
+
+    def __init__(
+        self,
+        pairs: Sequence[tuple[WireTrack, Bus]],
+        speed: float = 1.0,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+    ) -> None:
+        self._pairs, self._speed, self._start_s, self._end_s = pairs, speed, start_s, end_s
+        self._stopping = False
+        self.sent: Counter[str] = Counter()
+        self.failed: int = 0
+
+    def open(self) -> None:
+        """Open the buses.
+
+        Raises:
+            BusNotAvailable: one is not there.
+        """
+        for _, bus in self._pairs:
+            bus.open()
+
+    def close(self) -> None:
+        """Close them. Idempotent."""
+        for _, bus in self._pairs:
+            bus.close()
+
+    def stop(self) -> None:
+        """End ``send_all``; from any thread, and from a signal handler."""
+        self._stopping = True
+
+    def send_all(self, *, loop: bool = False) -> None:
+        """Send everything, once or again and again, until it is over or ``stop`` is called."""
+        before = -1
+        while not self._stopping and before < self.sent.total():  # what has no frames is not looped
+            before = self.sent.total()
+            self._send_once()
+            if not loop:
+                break
+
+    def _send_once(self) -> None:
+        from skinware_drivers.virtual.recorded import RecordedWire, first_of
+
+        first_ns = first_of([wire for wire, _ in self._pairs], self._start_s)
+        wires: list[tuple[str, Bus, RecordedWire]] = []
+        for wire, bus in self._pairs:
+            items = wire.items(start_s=self._start_s, end_s=self._end_s)
+            wires.append((wire.bus, bus, RecordedWire(items, first_ns, speed=self._speed, waits=False)))
+        begin_ns = time.monotonic_ns()
+        for _, _, recorded in wires:
+            recorded.skip(begin_ns)
+        while not self._stopping:
+            for name, bus, recorded in wires:
+                for frame in recorded.emit(time.monotonic_ns()):
+                    self._send(name, bus, frame.identifier, frame.payload)
+            dues = [due for _, _, recorded in wires if (due := recorded.next_due_ns()) is not None]
+            if not dues:
+                return
+            time.sleep(min(max(0.0, (min(dues) - time.monotonic_ns()) / 1e9), _LONGEST_SLEEP_S))
+
+    def _send(self, name: str, bus: Bus, identifier: int, payload: bytes) -> None:
+        from skinware.errors import BusSendError
+
+        give_up_s = time.monotonic() + _FULL_S
+        while not self._stopping:
+            try:
+                bus.send(identifier, payload)
+            except BusSendError:
+                if time.monotonic() >= give_up_s:
+                    self.failed += 1
+                    return
+                time.sleep(0.001)
+            else:
+                self.sent[name] += 1
+                return
+
+
+command: click.Command = click.Command(
+    "skin-replay",
+    context_settings=CONTEXT_SETTINGS,
+    callback=replay,
+    params=[
+        *frames_command.params,
+        click.Option(
+            ["--wire"], is_flag=True, help="Send what went over buses, if it was recorded, on a --bus instead."
+        ),
+        click.Option(
+            ["--bus", "buses"],
+            metavar="[RECORDED=]BUS",
+            multiple=True,
+            help="With --wire: where to send; if several buses were recorded, one of them: can0=vcan0. Repeat it.",
+        ),
+    ],
+    help=frames_command.help,
+    epilog=examples(
+        "skin-replay walk.mcap                         skin-top --namespace replay shows it",
+        "skin-replay walk.mcap torso --speed 0.5       one driver, half as fast",
+        "skin-replay walk.mcap --start 10 --end 12 --loop",
+        "skin-replay walk.mcap --paused                step through it with . and ,",
+        "skin-replay walk.mcap --wire --bus vcan0      the frames on the recorded bus, for any program",
+    ),
+)
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

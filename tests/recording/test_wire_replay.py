@@ -1,0 +1,290 @@
+"""Recorded wires as buses of drivers: the same values come of them, and a decoder's mistake is found again."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import skinware.recording
+from skinware import DriverReader
+from skinware.errors import BadRecording, BusNotAvailable, ConfigurationError
+from skinware.recording import Series, WireItem
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.bus_names import place_of_bus
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.options import NoOptions
+from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.testing.driving import driving_lines
+from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual.recorded import RecordedWire
+from skinware_drivers.wire_tap import WireTap
+from tests.can.rig import TIP_IDENTIFIER, Tip
+from tests.commands import run, running
+from tests.recording.rig import recording
+from tests.recording.test_wire_export import Sent, keep, write_recording
+from tests.sdk.cable import Cable
+from tests.sdk.test_flow import EndOfCable
+
+MS = 1_000_000
+UNASKED = ("agni", "cyskin_cpm", "skintalk", "tactile_glove", "xela")
+"""Devices that send by themselves: between their frames, nothing moves the time."""
+DRIVERS = (*UNASKED, "anyskin", "barrett", "canopen", "openpatch", "roboskin", "weiss_wts", "wuji_glove")
+
+
+@pytest.fixture
+def cable() -> Iterator[Cable]:
+    cable = Cable()
+    yield cable
+    cable.close()
+
+
+def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, **options: Any) -> Series:
+    """So many frames of a driver, with what goes over its wire; what was recorded of it."""
+    with recording(path, with_wires=True) as recorder, driving_lines([(adapter, bus)], "skin", **options):
+        wait_until(lambda: recorder.messages.get("/skin/skin/frame", 0) >= frames)
+    with skinware.recording.open(path) as opened:
+        assert (opened.problems, opened.lost) == ([], 0)
+        return opened["skin"].read()
+
+
+def updates_of(series: Series) -> list[list[tuple[int, bytes]]]:
+    """Of each module: time and values, whenever they were new."""
+    structure, values = series.structure, series.column("values")
+    times = series.column("module_time_ns")
+    found: list[list[tuple[int, bytes]]] = []
+    for module in range(structure.n_modules):
+        mine = values[:, np.asarray(structure.sensor_module) == module]
+        is_new = (times[:, module] != 0) & np.r_[True, np.diff(times[:, module]) != 0]
+        rows = np.flatnonzero(is_new)
+        found.append([(int(times[row, module]), mine[row].tobytes()) for row in rows])
+    return found
+
+
+def equal_updates(then: Series, now: Series, *, with_times: bool) -> int:
+    """How many updates of modules have the same values in both, in order; with the same distances in time.
+
+    Raises:
+        AssertionError: too many do not, or one that is of the same time has other values.
+    """
+    pairs = list(zip(updates_of(then), updates_of(now), strict=True))
+    distances = Counter(new_ns - old_ns for old, new in pairs for new_ns, _ in new for old_ns, _ in old)
+    (shift_ns, _), *_ = distances.most_common(1)
+    total = 0
+    for old, new in pairs:
+        known = dict(old)
+        both = [(known[at_ns - shift_ns], values) for at_ns, values in new if at_ns - shift_ns in known]
+        assert all(one == other for one, other in both)
+        matcher = difflib.SequenceMatcher(None, [one for _, one in old], [one for _, one in new], autojunk=False)
+        equal = len(both) if with_times else sum(block.size for block in matcher.get_matching_blocks())
+        assert equal >= 0.8 * min(len(old), len(new)), f"{equal} of {len(old)} and {len(new)}"
+        total += equal
+    return total
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_every_driver_decodes_its_wire_to_the_same_values(tmp_path: Path, driver: str) -> None:
+    kind = load_driver(driver)
+    first, again = tmp_path / "first.mcap", tmp_path / "again.mcap"
+    adapter = kind(kind.Options())
+    emulated = make_bus("virtual", payload_size=adapter.payload_size, driver=driver)
+    before = record(first, adapter, emulated, 25)
+    adapter = kind(kind.Options())
+    after = record(again, adapter, make_bus(f"replay:{first}", payload_size=adapter.payload_size), 15)
+    assert after.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
+    assert equal_updates(before, after, with_times=driver in UNASKED) >= 10
+
+
+class Mistaken(CanAdapter[NoOptions]):
+    """Tip, but for its last two taxels, which somebody has exchanged."""
+
+    types, dtype, patches, period_s = Tip.types, Tip.dtype, Tip.patches, Tip.period_s
+    _values = Values(0, "u1", 8, to=(0, 1, 2, 3, 4, 5, 7, 6))
+    layout = Layout([Frame("all", [Identifier(TIP_IDENTIFIER)], length=(8,), values=_values)])
+
+
+def test_a_mistake_of_a_decoder_is_found_again(tmp_path: Path, cable: Cable) -> None:
+    """Recorded with the mistake, and decoded without it from what was recorded: values differ there, and only there."""
+    first, again = tmp_path / "first.mcap", tmp_path / "again.mcap"
+    numbers = np.random.default_rng(5)
+    with (
+        recording(first, with_wires=True) as recorder,
+        driving_lines([(Mistaken(NoOptions()), EndOfCable(cable.end))], "skin", wait=False) as driver,
+    ):
+        for _ in range(40):
+            cable.put(TIP_IDENTIFIER, numbers.bytes(8))
+            time.sleep(0.02)
+        driver.wait()
+        wait_until(lambda: recorder.messages.get("/skin/skin/frame", 0) > 15)
+    with skinware.recording.open(first) as opened:
+        wrong = opened["skin"].read()
+        n_frames = len(opened.wires[0].frames())
+    assert n_frames == 40
+    mended = record(again, Tip(NoOptions()), make_bus(f"replay:{first}"), 15)
+    known = {values: at_ns for at_ns, values in updates_of(wrong)[0]}
+    found = [values for _, values in updates_of(mended)[0]]
+    exchanged = [values[:6] + values[:5:-1] for values in found]
+    assert sum(values in known for values in exchanged) >= 10
+    assert not any(values in known for values in found if values[6] != values[7])
+
+
+def item(at_ms: float, identifier: int | None, data: bytes = b"", *, is_sent: bool = False) -> WireItem:
+    return WireItem(7_000 * MS + round(at_ms * MS), 0, is_sent, identifier, 0, data)
+
+
+def emitted(wire: RecordedWire, until_ms: float, step_ms: float = 1.0) -> list[tuple[float, int]]:
+    """(ms, identifier) of what is given by then, if somebody looks each ms."""
+    found = []
+    for number in range(round(until_ms / step_ms) + 1):
+        now_ns = round(number * step_ms * MS)
+        found += [(frame.time_ns / MS, frame.identifier) for frame in wire.emit(now_ns)]
+    return found
+
+
+def test_frames_come_with_their_own_times() -> None:
+    wire = RecordedWire(iter([item(5, 1), item(6.5, 2), item(20, 3)]), 7_005 * MS)
+    assert wire.next_due_ns() is None
+    assert wire.skip(0) == 0
+    assert wire.next_due_ns() == 0
+    assert emitted(wire, 30, 4) == [(0, 1), (1.5, 2), (15, 3)]
+    assert wire.next_due_ns() is None
+    assert wire.totals()["frames"] == 3
+
+
+def test_speed() -> None:
+    wire = RecordedWire(iter([item(0, 1), item(10, 2), item(30, 3)]), 7_000 * MS, speed=2.0)
+    wire.skip(0)
+    assert emitted(wire, 30) == [(0, 1), (5, 2), (15, 3)]
+
+
+def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
+    items = [item(0, 0x10, is_sent=True), item(2, 0x20), item(50, 0x10, is_sent=True), item(52, 0x20)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
+    wire.skip(0)
+    assert emitted(wire, 30) == []
+    wire.receive(0x11, b"", 30 * MS)  # another question
+    assert wire.emit(31 * MS) == []
+    wire.receive(0x10, b"", 40 * MS)
+    assert wire.next_due_ns() == 40 * MS
+    assert [frame.time_ns for frame in wire.emit(41 * MS)] == []
+    assert [frame.time_ns for frame in wire.emit(45 * MS)] == [42 * MS]
+    wire.receive(0x10, b"", 80 * MS)  # earlier than it was: the answer comes when it came
+    assert [frame.time_ns for frame in wire.emit(100 * MS)] == [92 * MS]
+
+
+def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
+    items = [item(0, 0x10, is_sent=True), item(1, 1), item(10, 0x10, is_sent=True), item(11, 2)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
+    wire.skip(0)
+    assert wire.next_due_ns() == 500 * MS
+    assert emitted(wire, 600) == [(501, 1), (511, 2)]
+
+
+def test_who_only_listens_is_not_waited_for() -> None:
+    wire = RecordedWire(iter([item(0, 0x10, is_sent=True), item(1, 1)]), 7_000 * MS, waits=False)
+    wire.skip(0)
+    assert emitted(wire, 2) == [(1, 1)]
+
+
+def test_error_and_remote_frames_are_not_sent_again() -> None:
+    wire = RecordedWire(iter([item(0, ERROR_FLAG | 4, bytes(8)), item(0, REMOTE_FLAG | 5), item(0, 6)]), 7_000 * MS)
+    wire.skip(0)
+    assert emitted(wire, 1) == [(0, 6)]
+
+
+def test_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    wire = RecordedWire(iter([item(0, 1)]), 7_000 * MS, name="replay:walk.mcap (can0)")
+    wire.skip(0)
+    emitted(wire, 1)
+    emitted(wire, 1)
+    assert [record.message for record in caplog.records] == ["replay:walk.mcap (can0): the recording is over"]
+
+
+def two_wires(path: Path) -> None:
+    def fill(taps: dict[tuple[str, str], WireTap]) -> None:
+        keep(taps, "torso", "can0", [Sent(number * MS, 0x100 + number, b"a") for number in range(10)])
+        keep(taps, "torso", "can1", [Sent(0, 0x7FF, b"b")])
+        keep(taps, "other", "can0", [Sent(0, 0x7FE, b"c")])
+
+    write_recording(path, fill)
+
+
+@pytest.mark.parametrize(
+    ("options", "identifiers"),
+    [
+        ("?bus=can1", [0x7FF]),
+        ("?bus=can0&driver=other", [0x7FE]),
+        ("?bus=can0&driver=torso&start=0.0025&end=0.0045", [0x103, 0x104]),
+        ("?bus=can0&driver=torso&speed=4", list(range(0x100, 0x10A))),
+    ],
+)
+def test_one_bus_of_several_and_part_of_the_time(tmp_path: Path, options: str, identifiers: list[int]) -> None:
+    path = tmp_path / "walk.mcap"
+    two_wires(path)
+    bus, batch = make_bus(f"replay:{path}{options}"), FrameBatch(100)
+    bus.open()
+    try:
+        wait_until(lambda: bus.receive(batch, 3) >= 0 and len(batch) >= len(identifiers))
+        rows = batch.wire[batch.start : batch.stop]
+        assert rows["identifier"].tolist() == identifiers
+        if "speed=4" in options:
+            assert set(np.diff(batch.time_ns[batch.start : batch.stop]).tolist()) == {MS // 4}
+    finally:
+        bus.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("", "which bus? there are: bus=can0&driver=other, bus=can0&driver=torso, bus=can1&driver=torso"),
+        ("?bus=can0", "which bus? there are"),
+        ("?bus=can7", "no bus can7; there are"),
+        ("?speed=0", "speed"),
+        ("?sped=2", "sped"),
+    ],
+)
+def test_what_is_not_clear_is_refused(tmp_path: Path, options: str, words: str) -> None:
+    path = tmp_path / "walk.mcap"
+    two_wires(path)
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        make_bus(f"replay:{path}{options}")
+
+
+def test_files_that_cannot_be_replayed(tmp_path: Path) -> None:
+    with pytest.raises(BusNotAvailable, match="No such file"):
+        make_bus(f"replay:{tmp_path}/nothing.mcap")
+    (tmp_path / "text").write_text("text")
+    with pytest.raises(BadRecording, match="not a recording"):
+        make_bus(f"replay:{tmp_path}/text")
+    write_recording(tmp_path / "without.mcap", lambda taps: None)
+    with pytest.raises(ConfigurationError, match="no wire was recorded: skin-record --wire records them"):
+        make_bus(f"replay:{tmp_path}/without.mcap")
+
+
+def test_two_recorded_buses_are_two_places() -> None:
+    places = [place_of_bus(f"replay:walk.mcap?bus={bus}&speed={speed}") for bus in ("can0", "can1") for speed in (1, 2)]
+    assert places[0] == places[1] != places[2] == places[3]
+
+
+def test_skin_driver_runs_on_a_recording(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    kind = load_driver("roboskin")
+    before = record(path, kind(kind.Options()), make_bus("virtual", driver="roboskin"), 40)
+    with running("skin-driver", "--bus", f"replay:{path}?speed=0.5") as driver:
+        driver.wait_for("ready")
+        with DriverReader("roboskin") as reader:
+            assert reader.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
+        driver.stop()
+        assert driver.process.returncode == 0
+    refused = run("skin-driver", "--bus", f"replay:{path}?bus=can9")
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == f"skin-driver: {path}: no bus can9; there are: bus=bus0&driver=skin\n"

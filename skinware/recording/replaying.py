@@ -37,7 +37,7 @@ class Replayer:
         namespace: where to publish them.
         speed: 2.0: twice as fast.
         start_s: where it begins, s since the recording began.
-        end_s: where it ends, likewise; default: with the last frame.
+        end_s: where it ends, likewise; default: where the recording does.
         loop: it begins again at its end.
         paused: it waits for ``resume`` or ``step`` first.
         stays: at its end it is paused, and does not end.
@@ -89,8 +89,12 @@ class Replayer:
         if self._paused:
             return self._from_s
         passed_s = self._from_s + (now_ns() - self._from_ns) / NS_PER_S * self._republisher.speed
-        most_s = min(self._end_s, self._recording.duration_s) if self._next is None else self._next.time_s
-        return max(self._reached_s, min(passed_s, most_s))
+        return max(self._reached_s, min(passed_s, self._last_s if self._next is None else self._next.time_s))
+
+    @property
+    def _last_s(self) -> float:
+        """Where it ends."""
+        return min(self._end_s, self._recording.duration_s)
 
     @property
     def frames(self) -> Counter[str]:
@@ -120,11 +124,13 @@ class Replayer:
         while not self._stopping:
             if not self._paused and self._next is None:
                 self._next = self._take_next()
-                if self._next is None and not self._end():
+            time_s = self._last_s if self._next is None else self._next.time_s
+            due_ns = now_ns() + WAIT_SLICE_NS if self._paused else self._due_ns(time_s)
+            if not self._wait(due_ns, tell, every_s) or self._paused:
+                continue
+            if self._next is None:
+                if not self._end():
                     return
-            due_ns = now_ns() + WAIT_SLICE_NS if self._next is None or self._paused else self._due_ns(self._next)
-            turned = self._turned
-            if not self._wait(due_ns, tell, every_s) or self._next is None or self._paused or turned != self._turned:
                 continue
             behind_ns = now_ns() - due_ns
             if behind_ns > _MOST_BEHIND_NS:
@@ -191,7 +197,7 @@ class Replayer:
     def seek(self, time_s: float) -> dict[str, Any]:
         """Go to a time, s since the recording began, and publish what was newest then; then as replay."""
         time_s = _number(time_s, "time_s")
-        self._go_to(min(max(time_s, self._start_s), self._end_s, self._recording.duration_s))
+        self._go_to(min(max(time_s, self._start_s), self._last_s))
         return self.replay()
 
     def speed(self, factor: float) -> dict[str, Any]:
@@ -215,8 +221,8 @@ class Replayer:
         self._from_ns, self._from_s = now_ns(), time_s
         self._turned += 1
 
-    def _due_ns(self, moment: Moment) -> int:
-        return self._from_ns + round((moment.time_s - self._from_s) / self._republisher.speed * NS_PER_S)
+    def _due_ns(self, time_s: float) -> int:
+        return self._from_ns + round((time_s - self._from_s) / self._republisher.speed * NS_PER_S)
 
     def _wait(self, due_ns: int, tell: Callable[[], object], every_s: float) -> bool:
         """Until a time; False: something was asked for meanwhile, or it is to end."""
@@ -254,7 +260,7 @@ class Replayer:
             self._goes_on = False
             self._go_to(self._start_s)
         elif self._stays:
-            self._set_paused(True, self._reached_s)
+            self._set_paused(True, self._last_s)
         else:
             return False
         return True

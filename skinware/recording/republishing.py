@@ -100,10 +100,12 @@ class Republisher:
         service.was_paused = False
         if writer.paused:
             writer.resume()
-        shift_ns = now_ns() - frame.published_ns
-        for column, into in writer.begin().items():
+        columns = writer.begin()
+        for column, into in columns.items():
             into[...] = frame.column(column)
-            if not self._keeps_times and generation.is_driver and column in _TIMES_OF_DRIVERS:
+        shift_ns = now_ns() - frame.published_ns  # last, so that filling the columns makes no frame older
+        if generation.is_driver and not self._keeps_times:
+            for into in (columns[column] for column in _TIMES_OF_DRIVERS if column in columns):
                 into[into != 0] += shift_ns
         acquired_ns = frame.acquired_ns + shift_ns if frame.acquired_ns else 0
         writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)

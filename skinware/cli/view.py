@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from skinware.views.following import Follower
 
 DEFAULT_PORT = 8736
-_CALM = "calm"
 _TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
 
 
@@ -76,6 +75,14 @@ def token_text(text: str) -> str:
     help="That the address needs.  [default: a random one, if other machines can connect]",
 )
 @click.option(
+    "--calm",
+    "calm_name",
+    metavar="NAMESPACE",
+    default="calm",
+    show_default=True,
+    help="Where calmed drivers and their contacts are, if anywhere.",
+)
+@click.option(
     "--links",
     metavar="FILE",
     type=click.Path(path_type=Path),
@@ -90,6 +97,7 @@ def command(
     port: int | None,
     host: str,
     token: str | None,
+    calm_name: str,
     links: Path | None,
     no_browser: bool,
     namespace: str | None,
@@ -111,7 +119,7 @@ def command(
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
-    calm = None if place.name == _CALM else Namespace(_CALM)
+    calm = None if place.name == calm_name else Namespace(calm_name)
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(16)
     robot = None if links is None else read_robot(links)

@@ -89,7 +89,9 @@ def test_another_port_where_the_usual_one_is_in_use(monkeypatch: pytest.MonkeyPa
         (("--port", "0", "--host", "192.0.2.1"), 1, "192.0.2.1"),
         (("--port", "0", "no driver"), 2, "driver name 'no driver'"),
         (("--port", "0", "--namespace", "a/b"), 2, "namespace name 'a/b'"),
+        (("--port", "0", "--calm", "a/b"), 2, "namespace name 'a/b'"),
         (("--port", "0", "--token", "with space"), 2, "--token"),
+        (("--port", "0", "--links", "none.urdf"), 2, "none.urdf: No such file"),
     ],
 )
 def test_bad_input_is_said_in_a_line(arguments: tuple[str, ...], status: int, why: str) -> None:

@@ -1,18 +1,22 @@
-"""Who may see a skin in a browser: which requests are answered, judged by their address, token and origin.
+"""Who may see a skin in a browser: which requests are answered, judged by their account, address, token and origin.
 
 A page of another site that somebody has open in the same browser must not see the skin: neither through a web socket
 (which browsers let any page open, but with its ``Origin``), nor by giving its own name this machine's address (DNS
-rebinding: the request then has that name as its ``Host``).
+rebinding: the request then has that name as its ``Host``). Nor must other accounts of this machine see it: only the
+group of a namespace may read that.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import os
 from collections.abc import Mapping
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
+
+from skinware.views.peers import account_of
 
 _COOKIE = "skin-view"
 
@@ -34,7 +38,7 @@ class Access:
 
     Args:
         host: that the server listens at.
-        token: that is needed; None: who can connect may look. Where others than this machine can, give one.
+        token: that is needed; None: this account may look, and root. Where other machines can connect, give one.
     """
 
     def __init__(self, host: str, token: str | None = None) -> None:
@@ -62,6 +66,19 @@ class Access:
             self.has_token(target) or hmac.compare_digest(_cookie(headers).encode(), self.token.encode())
         ):
             raise Refused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
+
+    def check_account(self, peer: tuple[str, int], here: tuple[str, int]) -> None:
+        """Make sure that the account at the other end of a connection may look.
+
+        Args:
+            peer: address and port of that end.
+            here: those of this end.
+
+        Raises:
+            Refused: it may not.
+        """
+        if self.token is None and account_of(peer, here) not in (os.geteuid(), 0):
+            raise Refused(HTTPStatus.FORBIDDEN, "for other accounts of this machine, skin-view needs a --token")
 
     def has_token(self, target: str) -> bool:
         """Whether the token is in an address."""

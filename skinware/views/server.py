@@ -109,9 +109,10 @@ class ViewServer:
 
     # -- files --------------------------------------------------------------------------------------------------
 
-    def _answer(self, _connection: ServerConnection, request: Request) -> Response | None:
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request; None: go on to a web socket."""
         try:
+            self._access.check_account(connection.remote_address[:2], connection.local_address[:2])
             self._access.check(request.path, request.headers)
             path = unquote(urlsplit(request.path).path)
             if path == "/live":

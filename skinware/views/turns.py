@@ -69,6 +69,7 @@ class Viewer:
         self._changes: dict[int, tuple[int, int]] = {}
         self._status: dict[tuple[int, str], npt.NDArray[np.uint8]] = {}
         self._state_due_ns = 0
+        self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
         self._asked = False
         self._questions: list[operations.Names | operations.Series] = []
@@ -140,8 +141,9 @@ class Viewer:
             header |= self._answer(question, blobs)
         if self._error is not None:
             header["error"], self._error = self._error, None
-        if now_ns() >= self._state_due_ns:
-            self._state_due_ns = now_ns() + _STATE_EVERY_NS
+        lives = [driver.life for driver in self._follower.drivers]
+        if now_ns() >= self._state_due_ns or lives != self._lives:
+            self._state_due_ns, self._lives = now_ns() + _STATE_EVERY_NS, lives
             header["state"] = besides | self._state(besides.get("problems", []))
         return blobs.under(header)
 

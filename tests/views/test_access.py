@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import http.client
+import os
+import shutil
+import socket
+import subprocess
 from urllib.parse import urlsplit
 
 import pytest
@@ -11,11 +15,14 @@ from hypothesis import strategies as st
 from websockets.exceptions import InvalidStatus
 
 from skinware.views.access import Access, Refused, is_loopback
+from skinware.views.peers import account_of
 from skinware_drivers.testing.waiting import PATIENCE_S
 from tests.views.client import page_of
 from tests.views.conftest import INDEX, Serve
 
 TOKEN = "a-token"
+OTHERS_PYTHON = shutil.which("python3", path="/usr/bin:/bin")
+"""One that all accounts may run."""
 
 
 def get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
@@ -67,6 +74,26 @@ def test_pages_of_other_sites_are_refused(serving: Serve, origin: str) -> None:
         assert get(url, Origin=origin).status == 403
         with page_of(url, origin=url.rstrip("/")) as page:
             assert page.pull()["skin"]["drivers"] == []
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or OTHERS_PYTHON is None, reason="only root can be somebody else")
+def test_other_accounts_need_a_token(serving: Serve) -> None:
+    ask = "import sys, urllib.request as r; print(r.urlopen(sys.argv[1]).status)"
+    for token, told in ((None, "HTTP Error 403"), (TOKEN, "200")):
+        with serving(token=token) as url:
+            command = [str(OTHERS_PYTHON), "-c", ask, url.replace("/?", "/index.html?")]
+            asked = subprocess.run(command, user=12345, capture_output=True, text=True, cwd="/")
+            assert told in asked.stdout + asked.stderr
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_the_kernel_tells_the_account(host: str) -> None:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.create_server((host, 0), family=family) as server:
+        with socket.create_connection(server.getsockname()[:2]) as one, socket.create_connection(one.getpeername()[:2]):
+            here, peer = one.getpeername()[:2], one.getsockname()[:2]
+            assert account_of(peer, here) == account_of(here, peer) == os.geteuid()
+        assert account_of((host, 1), here) is None
 
 
 def test_a_token_is_needed_once(serving: Serve) -> None:

@@ -14,10 +14,17 @@ from PIL import Image
 from playwright.sync_api import BrowserContext, ConsoleMessage, Error, Page, Request
 
 from skinware_drivers.testing.waiting import SLOWER
+from tests.cli.fake_skin import FakeSkin
 from tests.commands import Running, running
 
-PATIENCE_MS = 20_000 * SLOWER
+PATIENCE_MS = 8_000 * SLOWER
 DESKTOP, PHONE = (1100, 700), (390, 844)
+DRIVER = "skin.drivers[0]?.id"
+READY = "window.skin?.connected && skin.drawn > 2 && skin.drivers.length"
+"""JavaScript: of the first driver that the page has; it has drawn one."""
+RAW_SCALE = "mode=raw&scale=0,255&sharp=1"
+"""Part of an address: physical values from 0 to 255, which the sleeve has for 255 to 0 raw; all pixels, however slow
+the machine is."""
 OURS = ("127.0.0.1", "localhost")
 Grey = npt.NDArray[np.float64]
 
@@ -79,8 +86,40 @@ def until(page: Page, expression: str, *arguments: object, within_ms: float = PA
         raise AssertionError(f"never true: {expression} with {arguments}; the page has {known}; {error}") from None
 
 
-def look(page: Page, place: tuple[float, float] | None = None, half: int = 6) -> Grey:
-    """What is on the screen, in grey, 0 to 255: (height, width), or (2 half, 2 half) about a place in CSS pixels."""
-    clip = place and {"x": round(place[0]) - half, "y": round(place[1]) - half, "width": 2 * half, "height": 2 * half}
-    with Image.open(io.BytesIO(page.screenshot(clip=clip))) as image:  # type: ignore[arg-type]
+def let_settle(page: Page, skin: FakeSkin) -> None:
+    """Wait until what is felt at rest is known: for frames of 1.2 s."""
+    end = skin.writer.sequence + 60
+    while skin.writer.sequence < end:
+        page.wait_for_timeout(20)
+
+
+def look(page: Page, left: int = 0, top: int = 0, right: int | None = None, bottom: int | None = None) -> Grey:
+    """What is on the screen between these edges, CSS pixels, in grey, 0 to 255: (height, width)."""
+    size = page.viewport_size or {"width": 0, "height": 0}
+    width = (size["width"] if right is None else right) - left
+    height = (size["height"] if bottom is None else bottom) - top
+    with Image.open(io.BytesIO(page.screenshot(clip={"x": left, "y": top, "width": width, "height": height}))) as image:
         return np.asarray(image.convert("L"), np.float64)
+
+
+def places(page: Page, positions: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """(n, 2): where taxels of the first driver are on the screen, CSS pixels."""
+    found = tell(page, f"a[0].map(position => skin.pixelOf({DRIVER}, position))", np.asarray(positions).tolist())
+    return np.array(found, np.float64).reshape(-1, 2)
+
+
+def states(page: Page, positions: npt.ArrayLike, what: str) -> list[Any]:
+    """What the page has of taxels of the first driver: their ``level``, ``mark`` ..."""
+    of_each = f"a[0].map(position => skin.stateOf({DRIVER}, position)[a[1]])"
+    found: list[Any] = tell(page, of_each, np.asarray(positions).tolist(), what)
+    return found
+
+
+def level(position: int) -> str:
+    """JavaScript: the level of a taxel of the first driver, as it is shown; undefined where there is none."""
+    return f"skin.stateOf({DRIVER}, {position})?.level"
+
+
+def role(name: str, more: str = "") -> str:
+    """The selector of what has a role on the page."""
+    return f"[data-role={name}]{more}"

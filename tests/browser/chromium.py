@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,21 +41,22 @@ def program() -> str | None:
 
 
 @contextmanager
-def chromium(folder: Path) -> Iterator[Browser]:
-    """A browser with its temporary files in an empty folder; no process and no file of it outlives the block."""
-    with mock.patch.dict(os.environ, {"TMPDIR": str(folder)}):
-        playwright = sync_playwright().start()
-    try:
-        browser = playwright.chromium.launch(executable_path=program(), args=FLAGS)
-        session = os.getsid(process_of(browser))
+def chromium() -> Iterator[Browser]:
+    """A browser; no process and no temporary file of it outlives the block."""
+    with tempfile.TemporaryDirectory(prefix="chromium-") as folder:  # short: there will be a socket in it
+        with mock.patch.dict(os.environ, {"TMPDIR": folder}):
+            playwright = sync_playwright().start()
         try:
-            yield browser
+            browser = playwright.chromium.launch(executable_path=program(), args=FLAGS)
+            session = os.getsid(process_of(browser))
+            try:
+                yield browser
+            finally:
+                browser.close()
         finally:
-            browser.close()
-    finally:
-        playwright.stop()
-    wait_until(lambda: not processes_of(session))
-    wait_until(lambda: not any(folder.iterdir()))
+            playwright.stop()
+        wait_until(lambda: not processes_of(session))
+        wait_until(lambda: not os.listdir(folder))
 
 
 def process_of(browser: Browser) -> int:

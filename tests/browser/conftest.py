@@ -11,8 +11,10 @@ import pytest
 from playwright.sync_api import Browser, Page
 
 from skinware.memory.namespace import Namespace
-from tests.browser.browsing import DESKTOP, PATIENCE_MS, Troubles
+from tests.browser.browsing import DESKTOP, PATIENCE_MS, Troubles, viewing
 from tests.browser.chromium import PACKAGE, chromium, program
+from tests.browser.sleeve import Sleeve
+from tests.cli.fake_skin import publishing
 
 HERE = Path(__file__).parent
 
@@ -25,10 +27,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="package")  # while it runs, asyncio.run cannot be used: no longer than needed
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser() -> Iterator[Browser]:
     if program() is None:
         pytest.skip(f"there is no Chromium (Debian: apt install {PACKAGE})")
-    with chromium(tmp_path_factory.mktemp("browser")) as browser:
+    with chromium() as browser:
         yield browser
 
 
@@ -54,3 +56,20 @@ def open_page(browser: Browser, namespace: Namespace, troubles: Troubles) -> Ite
 
         yield open_page
     assert troubles.found == []
+
+
+@pytest.fixture
+def sleeve(namespace: Namespace) -> Iterator[Sleeve]:
+    """A driver that publishes what the test sets."""
+    skin = Sleeve()
+    with publishing(skin, 50):
+        yield skin
+    del skin.writer  # and its memory: pytest keeps the skin a little longer
+
+
+@pytest.fixture
+def address(namespace: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """Of the page of a skin-view that runs in the test's folder, and outlives all pages."""
+    monkeypatch.chdir(tmp_path)
+    with viewing() as (_, url):
+        yield url

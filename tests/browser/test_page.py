@@ -31,7 +31,7 @@ def server(driver: FakeDriver) -> Iterator[FakeServer]:
 
 @pytest.fixture
 def page(server: FakeServer, open_page: OpenPage) -> Page:
-    page = open_page(f"{server.url}#theme=dark")
+    page = open_page(f"{server.url}#theme=dark&sharp=1")
     until(page, READY)
     return page
 

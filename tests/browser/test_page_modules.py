@@ -175,7 +175,7 @@ def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
         "normals": True,
         "theme": "light",
     }
-    assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False}
+    assert tell("address.js", "m.fromHash(m.toHash(a[0]))", view) == view | {"flat": False, "sharp": False}
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ export function fromHash(hash) {
     normals: parts.get("normals") === "1",
     theme: theme === "dark" || theme === "light" ? theme : undefined,
     flat: parts.get("flat") === "1",
+    sharp: parts.get("sharp") === "1",
   };
 }
 

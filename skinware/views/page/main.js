@@ -57,6 +57,7 @@ let told_ms = 0; // when figures were brought up to date
 
 const stage = new Stage(byId("stage"), {
   flat: query.has("flat") || wanted.flat,
+  sharp: wanted.sharp,
   theme: view.theme,
   drawOver: (its) =>
     overlay.draw(its, { theme: view.theme, normals: view.normals, contacts, hovered: probes.hovered, pins: probes.pins }),

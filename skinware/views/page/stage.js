@@ -17,8 +17,8 @@ export class Stage {
 
   /**
    * @param {HTMLElement} host what the canvases fill.
-   * @param {object} options `flat`: without WebGL; `theme`; `drawOver(stage)`: draws over each frame; `moved()`: the
-   *     eye moved; `changed()`: taxels are drawn another way now.
+   * @param {object} options `flat`: without WebGL; `sharp`: all pixels, however slow that is; `theme`; `drawOver(stage)`: draws over
+   *     each frame; `moved()`: the eye moved; `changed()`: taxels are drawn another way now.
    */
   constructor(host, options) {
     this.host = host;
@@ -133,7 +133,7 @@ export class Stage {
     if (passed > 400) return; // nothing was to be drawn
     this.#interval_ms += 0.1 * (passed - this.#interval_ms);
     this.fps = 1000 / this.#interval_ms;
-    if (++this.#calm < 20) return;
+    if (this.options.sharp || ++this.#calm < 20) return;
     const best = Math.min(devicePixelRatio, 2);
     const at = RATIOS.findIndex((ratio) => ratio >= this.ratio);
     let ratio = this.ratio;

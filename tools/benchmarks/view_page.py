@@ -1,0 +1,161 @@
+"""The page of skin-view in Chromium with WebGL in software: pictures drawn per second, and what skin-view costs.
+
+tools/bench view-page [--seconds S] [--sensors N ...] [--hz HZ] [--size WIDTHxHEIGHT]
+
+A driver in a process of its own publishes a skin on a closed sleeve, with noise on every sensor and a touch that moves;
+one page shows it. The share of a core is that of skin-view (Python), without its start and the first turns. Where there
+is no graphics card, the browser itself computes every pixel, and takes what the machine has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from processes import Processes, answer, own_namespace
+
+from skinware import DriverWriter, Structure
+from skinware.geometry import Geometry
+from skinware.realtime import Periodic, now_ns
+from skinware.sensor_types import PRESSURE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from tests.browser.browsing import tell, until, viewing
+from tests.browser.chromium import chromium, program
+
+SENSORS = (5_376, 30_848)
+LEAST_FPS = {5_376: 0.9 * 25, 30_848: 0.9 * 7}
+MOST_SHARE = 0.08
+PER_MODULE, PER_PATCH = 16, 16
+PITCH_M = 0.004
+NOISE = 2.0
+
+
+def sleeve(sensors: int) -> Structure:
+    """Rings of taxels about the z axis, twice as long as around."""
+    modules = sensors // PER_MODULE
+    patches = -(-modules // PER_PATCH)
+    around = round((sensors / 2) ** 0.5)
+    ring, step = np.divmod(np.arange(sensors), around)
+    angle = 2 * np.pi * step / around
+    normal = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(sensors)))
+    places = Geometry(
+        type_name=np.full(sensors, "pressure"),
+        uid=np.arange(sensors, dtype=np.uint64),
+        frame=np.full(sensors, "arm"),
+        position_m=normal * PITCH_M * around / (2 * np.pi) + np.outer(ring * PITCH_M, [0, 0, 1.0]),
+        normal=normal,
+        radius_m=np.full(sensors, PITCH_M / 3),
+        confidence=np.full(sensors, np.nan),
+    )
+    return Structure(
+        types=[PRESSURE.measured(unit="counts", minimum=0, maximum=4095)],
+        buses=["can0"],
+        patch_name=[f"board {n}" for n in range(patches)],
+        patch_bus=[0] * patches,
+        module_patch=np.arange(modules) // PER_PATCH,
+        module_kind=["triangle"] * modules,
+        sensor_uid=np.arange(sensors),
+        sensor_type=[PRESSURE.id] * sensors,
+        sensor_module=np.arange(sensors) // PER_MODULE,
+        dtype="u2",
+        geometry=places,
+    )
+
+
+def drive(pipe: Connection, namespace: str, sensors: int, rate_hz: float) -> None:
+    """Publish until the other end says enough; then how many frames came too late."""
+    generator = np.random.default_rng(1)
+    noise = np.round(generator.normal(0, NOISE, (64, sensors))).astype(np.int64)
+    place = np.arange(sensors)
+    with DriverWriter("large", sleeve(sensors), namespace=namespace, rate_hz=rate_hz) as writer:
+        timer = Periodic(rate_hz)
+        while not pipe.poll():
+            columns = writer.begin()
+            columns["values"][:] = (
+                1000
+                + noise[generator.integers(64)]
+                + 2500 * np.exp(-(((place - writer.sequence * 40 % sensors) / 200) ** 2))
+            )
+            columns["status"][:] = 0
+            columns["patch_state"][:] = 1
+            columns["bus_state"][:] = 1
+            columns["module_time_ns"][:] = now_ns()
+            writer.commit(now_ns())
+            if writer.sequence == 1:
+                pipe.send("ready")
+            timer.wait()
+        pipe.send(timer.missed)
+
+
+@contextmanager
+def driving(namespace: str, sensors: int, rate_hz: float) -> Iterator[None]:
+    with Processes() as processes:
+        pipe = processes.start(drive, namespace, sensors, rate_hz)
+        answer(pipe, 60)
+        try:
+            yield
+        finally:
+            pipe.send("enough")
+            print(f"          the driver was late for {answer(pipe, 30)} frames")
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(sensors: int, seconds: float, rate_hz: float, size: tuple[int, int]) -> None:
+    """One line of the report."""
+    with (
+        own_namespace() as namespace,
+        driving(namespace.name, sensors, rate_hz),
+        viewing("--namespace", namespace.name) as (view, url),
+        chromium() as browser,
+    ):
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.goto(url)
+        until(page, "window.skin?.drawn > 20")
+        pid = view.process.pid
+        begin_s, used_s = time.monotonic(), cpu_s(pid)
+        drawn, turns = tell(page, "[skin.drawn, skin.turn]")
+        time.sleep(seconds)
+        drawn_now, turns_now = tell(page, "[skin.drawn, skin.turn]")
+        passed_s = time.monotonic() - begin_s
+        share = (cpu_s(pid) - used_s) / passed_s
+    fps, turns_hz = (drawn_now - drawn) / passed_s, (turns_now - turns) / passed_s
+    least = LEAST_FPS.get(sensors)
+    goal = "" if least is None else f" ({'met' if fps >= least else 'MISSED'}: at least {least:.1f})"
+    print(
+        f"  {sensors:6} sensors  {fps:5.1f} pictures/s drawn{goal}, {turns_hz:.1f} turns/s;"
+        f" skin-view {share:.1%} of a core ({'met' if share <= MOST_SHARE else 'MISSED'}: at most {MOST_SHARE:.0%})",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--sensors", type=int, nargs="+", default=list(SENSORS), metavar="N")
+    parser.add_argument("--hz", type=float, default=50.0, help="of the driver")
+    parser.add_argument("--size", default="1280x800", help="of the window, CSS pixels")
+    options = parser.parse_args()
+    if program() is None:
+        sys.exit("there is no Chromium (Debian: apt install chromium)")
+    width, height = map(int, options.size.split("x"))
+    print(f"{options.size}, driver at {options.hz:g} Hz, {options.seconds:g} s each; load {os.getloadavg()[0]:.1f}")
+    for sensors in options.sensors:
+        measure(sensors, options.seconds, options.hz, (width, height))
+
+
+if __name__ == "__main__":
+    main()

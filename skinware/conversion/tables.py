@@ -148,7 +148,7 @@ class Source(Protocol):
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong with the file, as far as it was read; a line each."""
+        """What is wrong with the file, as far as it was read, and what of it is in no table; a line each."""
 
     def close(self) -> None:
         """Let go of the file. Idempotent."""

@@ -25,6 +25,7 @@ from skinware.conversion.converting import FORMATS, opened
 from skinware.conversion.tables import Table
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.geometry import Geometry
+from skinware.recording import Recording
 from skinware.tactile.regions import Region, Regions
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
@@ -341,6 +342,14 @@ def test_a_cut_or_damaged_recording_is_converted_as_far_as_it_is_whole(path: Pat
     assert converted.notes == [f"{damaged}: 1 chunk damaged and left out"]
     convert(tmp_path / "damaged.npz", tmp_path / "back.mcap", "mcap")
     assert frames_of(tmp_path / "back.mcap") == frames_of(damaged)
+
+
+def test_what_went_over_wires_is_said_to_be_left_out(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Recording, "wires", (object(),))
+    converted = convert(path, tmp_path / "x.npz", "npz")
+    assert converted.notes == [f"{path}: what went over wires is left out: candump and pcapng have it"]
 
 
 def _newer(text: bytes) -> bytes:

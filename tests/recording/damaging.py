@@ -48,6 +48,15 @@ def damaged(data: bytes, generator: random.Random) -> tuple[bytes, list[range]]:
     return bytes(out), gone
 
 
+def with_a_bad_chunk(file: Path) -> bytes:
+    """A recording in which one bit of a chunk with frames is wrong."""
+    data = bytearray(file.read_bytes())
+    with McapSource(file) as source:
+        place = source.chunks[len(source.chunks) // 2]
+    data[place.compressed_at + place.compressed_size // 2] ^= 1
+    return bytes(data)
+
+
 def frames_of(file: Path) -> Frames:
     """All that can be read, frame by frame and as columns, which must be the same."""
     found: Frames = {}

@@ -29,7 +29,7 @@ from skinware.recording import Recording
 from skinware.tactile.regions import Region, Regions
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
-from tests.recording.damaging import frames_of
+from tests.recording.damaging import frames_of, with_a_bad_chunk
 from tests.recording.made import MadeSource, MadeTable, generation_of_service, made_recording
 from tests.recording.rig import recording, two_drivers_and_a_service
 
@@ -337,7 +337,7 @@ def test_a_cut_or_damaged_recording_is_converted_as_far_as_it_is_whole(path: Pat
     assert converted.notes == [f"{cut}: cut off or damaged: converted as far as it is whole"]
     assert 20 < converted.frames["torso"] < 75
     damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 1]) + data[len(data) // 2 + 1 :])
+    damaged.write_bytes(with_a_bad_chunk(path))
     converted = convert(damaged, tmp_path / "damaged.npz", "npz")
     assert converted.notes == [f"{damaged}: 1 chunk damaged and left out"]
     convert(tmp_path / "damaged.npz", tmp_path / "back.mcap", "mcap")

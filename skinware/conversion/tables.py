@@ -128,7 +128,12 @@ class Table(ABC):
     def sensor_names(self) -> list[str]:
         """Of each sensor of a driver, as people know it."""
         structure = self.structure
-        return [] if structure is None else [structure.sensor_name(each) for each in range(structure.n_sensors)]
+        if structure is None:
+            return []
+        names = np.zeros(structure.n_sensors, object)
+        for sensor_type in structure.types:
+            names[structure.index(sensor_type.name)] = structure.sensor_names(sensor_type.name)
+        return [str(name) for name in names]
 
 
 class Source(Protocol):

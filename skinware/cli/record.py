@@ -23,6 +23,7 @@ from skinware.cli._command import (
     signals_end,
     version_option,
 )
+from skinware.cli._enter_key import is_there, pressed_calls
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
@@ -64,7 +65,7 @@ def past(text: str) -> float:
         "skin-record                          all that runs or comes, until Ctrl-C",
         "skin-record torso -o walk.mcap -T 60  one driver, one minute",
         "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
-        "skin-record --last 60s               kill -USR1 saves the last minute",
+        "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
         "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
     ),
 )
@@ -88,7 +89,7 @@ def past(text: str) -> float:
     "last_s",
     metavar="TIME",
     type=past,
-    help="Keep only the last TIME (60s, 5min), in memory; saved on SIGUSR1 and at the end.",
+    help="Keep only the last TIME (60s, 5min), in memory; saved by Enter, SIGUSR1 and at the end.",
 )
 @click.option(
     "--viewers",
@@ -134,8 +135,9 @@ def command(
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, beside=beside)
     report = _Report(recorder, target, path, as_json)
     failed = True
-    with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):
-        report.ready(names, place.name)
+    keys = pressed_calls(recorder.save) if last_s is not None else contextlib.nullcontext()
+    with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
+        report.ready(names, place.name, is_past=last_s is not None)
         try:
             recorder.run(duration_s, report.status)
             failed = False
@@ -160,14 +162,18 @@ class _Report:
         self._recorder, self._target, self._path, self._as_json = recorder, target, path, as_json
         self._begin_s = time.monotonic()
         self._before: dict[str, int] = {}
+        self._is_past = False
+        self._saved: list[Path] = []
 
-    def ready(self, names: tuple[str, ...], namespace: str) -> None:
-        """Recording begins."""
+    def ready(self, names: tuple[str, ...], namespace: str, *, is_past: bool) -> None:
+        """Recording begins; only the past is kept, or all of it."""
+        self._is_past = is_past
         if self._as_json:
             print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})
         else:
             what = ", ".join(names) or "all drivers and services"
-            click.echo(f"recording {what} of namespace {namespace!r} into {self._path} (Ctrl-C ends)")
+            keys = f"{'Enter saves, ' * (is_past and is_there())}Ctrl-C ends"
+            click.echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
         """How it goes, once a second."""
@@ -185,6 +191,9 @@ class _Report:
         lost = f", lost {self._recorder.lost}" if self._recorder.lost else ""
         passed = time.strftime("%H:%M:%S", time.gmtime(time.monotonic() - self._begin_s))
         click.echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{lost}")
+        saved, self._saved = self._saved, self._target.paths if self._is_past else []
+        for path in self._saved[len(saved) :]:
+            click.echo(f"saved {path}")
 
     def stopped(self, failed: bool) -> None:
         """It has ended; the files are complete."""

@@ -128,7 +128,12 @@ class Table(ABC):
     def sensor_names(self) -> list[str]:
         """Of each sensor of a driver, as people know it."""
         structure = self.structure
-        return [] if structure is None else [structure.sensor_name(each) for each in range(structure.n_sensors)]
+        if structure is None:
+            return []
+        names = np.zeros(structure.n_sensors, object)
+        for sensor_type in structure.types:
+            names[structure.index(sensor_type.name)] = structure.sensor_names(sensor_type.name)
+        return [str(name) for name in names]
 
 
 class Source(Protocol):
@@ -148,7 +153,7 @@ class Source(Protocol):
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong with the file, as far as it was read; a line each."""
+        """What is wrong with the file, as far as it was read, and what of it is in no table; a line each."""
 
     def close(self) -> None:
         """Let go of the file. Idempotent."""

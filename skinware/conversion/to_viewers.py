@@ -16,6 +16,7 @@ from skinware.conversion.timed_frames import TimedFrame, timed_frames
 from skinware.conversion.viewers import Viewers
 from skinware.driver_frame import DriverFrame
 from skinware.errors import ConfigurationError
+from skinware.recording.generation import Generation
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import EVENTS, SCHEMAS, Channels
 from skinware.structure import Structure
@@ -68,13 +69,13 @@ def write_ros2(source: Source, folder: Path) -> None:
     name = f"{source.path.stem}_0.mcap"
     viewers = Viewers(json_state=False)
     writer = _Writer(folder / name, "ros2")
-    told: set[int] = set()
-    tables = {generation.generation: table for table in drivers for generation in table.generations}
+    told: set[Generation] = set()
+    tables = {generation: table for table in drivers for generation in table.generations}
     try:
         for timed in timed_frames(drivers):
-            if timed.generation.generation not in told:
-                told.add(timed.generation.generation)
-                writer.add(_sensors(timed, tables[timed.generation.generation]), timed.time_ns)
+            if timed.generation not in told:
+                told.add(timed.generation)
+                writer.add(_sensors(timed, tables[timed.generation]), timed.time_ns)
             writer.add(_skin_frame(timed), timed.time_ns)
             for message in viewers.messages(timed.service, timed.generation, timed.frame, timed.time_ns):
                 writer.add(message, timed.time_ns)

@@ -190,7 +190,8 @@ class McapSource:
                 place = self._chunk_at(index.chunk_start_offset, frozenset(index.message_index_offsets))
                 if place is None:
                     raise Damaged("a chunk is not where the summary says")
-                places.append(place)
+                # times before a chunk have no checksum, those of the summary have
+                places.append(replace(place, start_ns=index.message_start_time, end_ns=index.message_end_time))
             elif kind == Opcode.CHANNEL:
                 channel = _read(Channel, record)
                 self.channels[channel.id] = channel
@@ -211,7 +212,7 @@ class McapSource:
             else:
                 self.channels |= contents.channels
                 at = place.end
-                yield replace(place, channel_ids=frozenset(message.channel_id for message in contents.messages))
+                yield _as_it_is(place, contents)
 
     def _chunk_at(self, offset: int, channel_ids: frozenset[int] | None = None) -> ChunkPlace | None:
         """A chunk, if there is one that is complete."""
@@ -237,6 +238,13 @@ class McapSource:
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         self.close()
+
+
+def _as_it_is(place: ChunkPlace, contents: ChunkContents) -> ChunkPlace:
+    """A chunk with the channels and times of its messages: those that stand before it have no checksum."""
+    times_ns = [message.time_ns for message in contents.messages] or [place.start_ns]
+    channels = frozenset(message.channel_id for message in contents.messages)
+    return replace(place, start_ns=min(times_ns), end_ns=max(times_ns), channel_ids=channels)
 
 
 def _parsed(data: bytes) -> ChunkContents:

@@ -9,14 +9,15 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from skinware._columns import as_index
 from skinware.errors import BadRecording, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.recording.codec import HEADER, Run, runs
 from skinware.recording.frames import RecordedFrame, frames_of
-from skinware.recording.generation import Generation
+from skinware.recording.generation import PER_SENSOR, Generation
 from skinware.recording.mcap_reading import ChunkContents
 from skinware.recording.series import Series
-from skinware.structure import Structure
+from skinware.structure import Index, Structure
 
 _FOR_DRIVERS = ("values", "status", "module_time_ns")
 
@@ -118,47 +119,73 @@ class Track:
             yield from zip(part.time_s.tolist(), frames_of(part.generation, part.run), strict=True)
 
     def read(
-        self, columns: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+        self,
+        columns: Collection[str] | None = None,
+        *,
+        type_name: str | None = None,
+        sensors: Index | None = None,
+        start_s: float = 0.0,
+        end_s: float | None = None,
     ) -> Series:
         """Whole columns of all frames.
 
         Args:
             columns: names; default: all, of a driver values, status and times.
+            type_name: only sensors of this type; the series then has a structure of these alone.
+            sensors: of these, only some, in the order of ``structure.index(type_name)``: a region, for instance.
             start_s: where to begin, s since the recording began.
             end_s: where to end, likewise; default: with the last.
 
         Raises:
-            StructureError: the columns or tables changed in between: read the ``parts`` one by one.
+            StructureError: the columns or tables changed in between: read the ``parts`` one by one; or there are no
+                such sensors.
             KeyError: no such column.
         """
-        origin, names = self._asked(columns)
-        return Series.joined([_nothing(origin, names), *self.blocks(names, start_s=start_s, end_s=end_s)])
+        asked = self._asked(columns, type_name, sensors)
+        return Series.joined([_nothing(asked), *self._blocks(asked, start_s, end_s)])
 
     def blocks(
-        self, columns: Collection[str] | None = None, *, start_s: float = 0.0, end_s: float | None = None
+        self,
+        columns: Collection[str] | None = None,
+        *,
+        type_name: str | None = None,
+        sensors: Index | None = None,
+        start_s: float = 0.0,
+        end_s: float | None = None,
     ) -> Iterator[Series]:
         """The same in pieces of a quarter of a second, one after the other; for recordings that memory cannot hold.
 
         Args:
             columns: as for ``read``, which lists the errors.
+            type_name: likewise.
+            sensors: likewise.
             start_s: likewise.
             end_s: likewise.
         """
-        origin, names = self._asked(columns)
-        numbers = {column.name: number for number, column in enumerate(origin.coded)}
+        return self._blocks(self._asked(columns, type_name, sensors), start_s, end_s)
+
+    def _blocks(self, asked: _Asked, start_s: float, end_s: float | None) -> Iterator[Series]:
+        numbers = {column.name: number for number, column in enumerate(self._only_origin().coded)}
         for part in self._runs(start_s, end_s):
             rows = _rows(part.time_s, start_s, end_s)
-            arrays = {name: part.column(numbers[name], rows) for name in names}
-            yield Series(origin, part.run.headers[rows], part.time_s[rows], arrays)
+            arrays = {name: part.column(numbers[name], rows) for name in asked.columns}
+            if asked.positions is not None:
+                arrays |= {name: arrays[name][:, asked.positions] for name in PER_SENSOR if name in arrays}
+            yield Series(asked.origin, part.run.headers[rows], part.time_s[rows], arrays)
 
-    def _asked(self, columns: Collection[str] | None) -> tuple[Generation, tuple[str, ...]]:
-        """One of the generations, and the names of the columns that are wanted."""
+    def _asked(self, columns: Collection[str] | None, type_name: str | None, sensors: Index | None) -> _Asked:
         origin = self._only_origin()
         names = tuple(columns) if columns is not None else _FOR_DRIVERS if origin.is_driver else tuple(origin.columns)
         for name in names:
             if name not in origin.columns:
                 raise KeyError(f"no column {name!r}; there are {', '.join(origin.columns)}")
-        return origin, names
+        if type_name is None:
+            if sensors is not None:
+                raise StructureError("sensors are counted by type: give type_name")
+            return _Asked(origin, names, None)
+        positions = np.arange(self.structure.n_sensors)[self.structure.index(type_name)]
+        index = as_index(positions if sensors is None else positions[sensors])
+        return _Asked(origin.only(index), names, index)
 
     def _only_origin(self) -> Generation:
         origins = self.generations
@@ -195,6 +222,20 @@ class Track:
         return f"<Track of {self.name!r}>"
 
 
+class _Asked(NamedTuple):
+    """What is wanted of the frames.
+
+    Attributes:
+        origin: what they are made of, with no other sensors.
+        columns: names.
+        positions: in a frame, of the sensors; None: all.
+    """
+
+    origin: Generation
+    columns: tuple[str, ...]
+    positions: Index | None
+
+
 class _PartOfChunk(NamedTuple):
     """Frames of one generation that stand in one chunk.
 
@@ -217,10 +258,11 @@ class _PartOfChunk(NamedTuple):
         return wanted.view(np.uint8).view(dtype).reshape(len(wanted), *shape)
 
 
-def _nothing(generation: Generation, names: Collection[str]) -> Series:
+def _nothing(asked: _Asked) -> Series:
     """Columns of no frames."""
-    columns = {name: np.zeros((0, *shape), dtype) for name, (shape, dtype, _) in generation.columns.items()}
-    return Series(generation, np.zeros(0, HEADER), np.zeros(0), {name: columns[name] for name in names})
+    formats = asked.origin.columns
+    columns = {name: np.zeros((0, *formats[name][0]), formats[name][1]) for name in asked.columns}
+    return Series(asked.origin, np.zeros(0, HEADER), np.zeros(0), columns)
 
 
 def _rows(time_s: npt.NDArray[np.float64], start_s: float, end_s: float | None) -> slice:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
+import functools
 import json
 import os
 import random
 import resource
 import signal
 import subprocess
+import termios
 import threading
 import time
 from pathlib import Path
@@ -26,6 +29,7 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import BIN, PATIENCE_S, running
 from tests.recording.rig import contents_of
+from tests.unprivileged import without_rights_to_all_files
 
 KILLS = 3
 
@@ -88,6 +92,72 @@ def test_a_signal_saves_the_past(tmp_path: Path) -> None:
         recorder.process.send_signal(signal.SIGUSR1)
         wait_until(file.exists)
         assert recorder.stop()["files"] == [str(file), str(tmp_path / "fall-2.mcap")]
+
+
+def test_enter_saves_the_past(tmp_path: Path) -> None:
+    ours, terminal = os.openpty()
+    command = [str(BIN / "skin-record"), "--last", "5s", "-o", "fall.mcap"]
+    try:
+        with publishing(FakeSkin("torso")):
+            with subprocess.Popen(
+                command,
+                stdin=terminal,
+                stdout=subprocess.PIPE,
+                text=True,
+                cwd=tmp_path,
+                preexec_fn=functools.partial(take_terminal, terminal),
+            ) as process:
+                assert process.stdout is not None
+                assert process.stdout.readline().endswith("into fall.mcap (Enter saves, Ctrl-C ends)\n")
+                while "torso" not in process.stdout.readline():
+                    pass
+                os.write(ours, b"\n")
+                while process.stdout.readline() != "saved fall.mcap\n":
+                    assert process.poll() is None
+                os.write(ours, b"\n")
+                while process.stdout.readline() != "saved fall-2.mcap\n":
+                    assert process.poll() is None
+                process.send_signal(signal.SIGINT)
+                assert "fall-3.mcap: complete" in process.communicate(timeout=PATIENCE_S)[0]
+            assert process.returncode == 0
+    finally:
+        os.close(ours)
+        os.close(terminal)
+    for name in ("fall.mcap", "fall-2.mcap", "fall-3.mcap"):
+        with skinware.recording.open(tmp_path / name) as opened:
+            assert opened.is_whole
+            assert len(opened["torso"].read(["status"])) > 10
+
+
+def take_terminal(terminal: int) -> None:
+    """In a child: be in the foreground of a terminal."""
+    os.setsid()
+    fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+
+
+def test_no_permission_is_one_line(tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    done = subprocess.run(
+        [BIN / "skin-record", "-o", closed / "x.mcap"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        preexec_fn=without_rights_to_all_files,
+    )
+    assert (done.returncode, done.stderr) == (1, f"skin-record: {closed}/x.mcap: Permission denied\n")
+    assert list(closed.iterdir()) == []
+    unreadable = tmp_path / "unreadable.mcap"
+    unreadable.write_bytes(MAGIC)
+    unreadable.chmod(0)
+    done = subprocess.run(
+        [BIN / "skin-recover", unreadable],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        preexec_fn=without_rights_to_all_files,
+    )
+    assert (done.returncode, done.stderr) == (1, f"skin-recover: {unreadable}: Permission denied\n")
 
 
 @pytest.mark.parametrize(

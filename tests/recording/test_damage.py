@@ -12,7 +12,7 @@ import skinware.recording
 from skinware.errors import BadRecording
 from skinware.recording.mcap_reading import McapSource
 from skinware.recording.recovery import recover
-from tests.recording.damaging import Original, frames_of, recover_too
+from tests.recording.damaging import Original, frames_of, recover_too, with_a_bad_chunk
 from tests.recording.rig import two_drivers_and_a_service
 
 DAMAGES = 120
@@ -71,13 +71,31 @@ def test_what_is_damaged_is_left_out_when_it_is_made_whole(original: Original, t
 
 def test_damage_is_told(original: Original, tmp_path: Path) -> None:
     file = tmp_path / "damaged.mcap"
-    data = bytearray(original.data)
-    data[len(data) // 2] ^= 1
-    file.write_bytes(data)
+    file.write_bytes(with_a_bad_chunk(tmp_path / "original.mcap"))
     with skinware.recording.open(file) as opened:
         list(opened["torso"].frames())
         assert opened.problems == ["1 chunk damaged and left out"]
     assert recover(file, tmp_path / "whole.mcap").damaged == 1
+
+
+@pytest.mark.parametrize("is_cut", [False, True])
+def test_damaged_times_before_a_chunk_change_nothing(original: Original, tmp_path: Path, is_cut: bool) -> None:
+    """They are covered by no checksum, and told elsewhere too."""
+    file = tmp_path / "damaged.mcap"
+    with McapSource(tmp_path / "original.mcap") as source:
+        places = source.chunks[1:3]
+    with skinware.recording.open(tmp_path / "original.mcap") as opened:
+        times_ns = opened.start_ns, opened.end_ns
+    for offset in (9, 17):  # behind opcode and length: times of the first and the last message
+        for number in (0, 1 << 40, (1 << 63) + 5):
+            data = bytearray(original.data[:-1] if is_cut else original.data)
+            for place in places:
+                data[place.offset + offset : place.offset + offset + 8] = number.to_bytes(8, "little")
+            file.write_bytes(data)
+            assert frames_of(file) == original.frames
+            with skinware.recording.open(file) as opened:
+                assert (opened.start_ns, opened.end_ns) == times_ns
+                assert opened.is_whole is not is_cut
 
 
 def test_frames_without_their_generation_are_left_out_and_told(original: Original, tmp_path: Path) -> None:

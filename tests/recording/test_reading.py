@@ -15,6 +15,8 @@ from mcap.writer import Writer
 import skinware.recording
 from skinware.errors import BadRecording, ConfigurationError, StructureError
 from skinware.recording.mcap_writing import MAGIC
+from skinware.tactile.regions import Region, Regions
+from tests.commands import PATIENCE_S
 from tests.recording.rig import two_drivers_and_a_service
 
 
@@ -78,6 +80,50 @@ def test_a_part_of_the_time(path: Path) -> None:
         assert 0.4 <= min(times) <= max(times) < 0.8
         assert len(opened["torso"].read(start_s=1e6)) == 0
         assert opened["torso"].read(start_s=1e6).physical("pressure").shape[0] == 0
+
+
+def test_sensors_of_a_type_or_a_region_alone(path: Path) -> None:
+    palm = Regions([Region("palm", patch=("board 8", "board 10"))])
+    with skinware.recording.open(path) as opened:
+        torso = opened["torso"]
+        whole = torso.read()
+        of_type = torso.read(type_name="temperature")
+        assert np.array_equal(of_type.physical("temperature"), whole.physical("temperature"))
+        assert np.array_equal(of_type.fresh("temperature"), whole.fresh("temperature"))
+        assert of_type.column("values").shape == of_type.column("status").shape == (75, 128)
+        assert of_type.structure.n_sensors == 128
+        for sensors in (palm.of(torso.structure, "pressure")["palm"], np.array([3, 17, 200]), slice(5, 9)):
+            part = torso.read(type_name="pressure", sensors=sensors, start_s=0.2)
+            later = whole.time_s >= 0.2
+            assert np.array_equal(part.physical("pressure"), whole.physical("pressure")[later][:, sensors])
+            assert np.array_equal(part.status_of("pressure"), whole.status_of("pressure")[later][:, sensors])
+            assert np.array_equal(part.time_ns("pressure"), whole.time_ns("pressure")[later][:, sensors])
+            uid = torso.structure.sensor_uid[torso.structure.index("pressure")][sensors]
+            assert np.array_equal(part.structure.sensor_uid, uid)
+        pieces = list(torso.blocks(["values"], type_name="pressure"))
+        assert len(pieces) > 3
+        joined = np.concatenate([piece.raw("pressure") for piece in pieces])
+        assert np.array_equal(joined, whole.raw("pressure"))
+        with pytest.raises(StructureError, match="no sensor type 'force'"):
+            torso.read(type_name="force")
+        with pytest.raises(StructureError, match="give type_name"):
+            torso.read(sensors=slice(3))
+        with pytest.raises(StructureError, match="at least one sensor"):
+            torso.read(type_name="pressure", sensors=slice(0))
+        with pytest.raises(StructureError, match="'pose' is not a driver"):
+            opened["pose"].read(type_name="pressure")
+        with pytest.raises(KeyError, match="no column 'x'"):
+            torso.blocks(["x"])
+
+
+def test_the_example(path: Path) -> None:
+    example = Path(__file__).parents[2] / "examples" / "recording.py"
+    done = subprocess.run(
+        [sys.executable, "-W", "error", example, path], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert done.returncode == 0, done.stderr
+    assert "torso: 75 frames" in done.stdout
+    assert "board 7" in done.stdout
 
 
 def test_the_tools_of_others_read_it(path: Path) -> None:

@@ -1,6 +1,6 @@
 """Recordings of every driver's emulated hardware, damaged at random: no crash, and every undamaged chunk is read.
 
-``python tools/fuzzing/recordings.py [NAME ...] [--damages 1000] [--seed N]``. Exit status 1 if it is otherwise.
+``tools/fuzz recordings [NAME ...] [--damages 1000] [--seed N]``. Exit status 1 if it is otherwise.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import shutil
 import sys
 import tempfile
 import time
+import traceback
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -24,10 +25,10 @@ from tests.recording.damaging import Original
 
 
 def record(driver: str, file: Path) -> None:
-    """Two seconds of a driver on the bus `virtual`."""
+    """Two seconds of a driver on the bus `virtual`, with what goes over it, and with what viewers show."""
     with running("skin-driver", "--driver", driver, "--bus", "virtual") as source:
         source.wait_for("ready")
-        with running("skin-record", "-o", str(file), "-T", "2") as recorder:
+        with running("skin-record", "--wire", "--viewers", "-o", str(file), "-T", "2") as recorder:
             recorder.wait_for("stopped")
 
 
@@ -51,12 +52,18 @@ def main() -> None:
                         found = original.check(generator, Path(folder) / "damaged.mcap")
                     except Exception as error:  # noqa: BLE001, a crash is what is sought
                         failed += 1
-                        print(f"{name}, damage {number} of seed {options.seed}: {type(error).__name__}: {error}")
+                        kept = shutil.copy(Path(folder) / "damaged.mcap", f"damaged-{name}-{number}.mcap")
+                        shutil.copy(file, f"undamaged-{name}-{number}.mcap")
+                        print(
+                            f"{name}, damage {number} of seed {options.seed}: {type(error).__name__}: {error}; {kept}"
+                        )
+                        traceback.print_exc()
                         continue
                     read += found
                     worst = min(worst, found / len(original.frames))
                 share = read / (options.damages * len(original.frames))
-                print(f"{name}: {len(original.frames)} frames, {100 * share:.1f} % read, at worst {100 * worst:.1f} %")
+                what = f"{len(original.frames)} frames, {len(original.on_wires)} on wires"
+                print(f"{name}: {what}, {100 * share:.1f} % read, at worst {100 * worst:.1f} %", flush=True)
     finally:
         shutil.rmtree(Namespace().path, ignore_errors=True)
     sys.exit(failed > 0)

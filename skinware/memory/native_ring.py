@@ -173,7 +173,7 @@ class _WriterState(_Ring):
 
 
 class NativeRingWriter(RingWriter):
-    """The writer's end whose publication is a call of C."""
+    """The writer's end whose publication is a call of C; but not of frames before which some are left out."""
 
     def __init__(self, segment: Segment, library: native.Library) -> None:
         super().__init__(segment)
@@ -191,12 +191,18 @@ class NativeRingWriter(RingWriter):
         self._wake_call(self._state_at)
 
     def _take_next(self) -> None:
-        self._begin_call(self._state_at)
+        if self._skipped:
+            self._state.begun_ns = 0
+            super()._take_next()
+        else:
+            self._begin_call(self._state_at)
 
     def _has_begun(self) -> bool:
-        return bool(self._state.begun_ns)
+        return super()._has_begun() if self._skipped else bool(self._state.begun_ns)
 
     def _publish(self, acquired_ns: int, flags: int) -> int:
+        if self._skipped:
+            return super()._publish(acquired_ns, flags)
         return int(self._commit_call(self._state_at, acquired_ns, flags))
 
 

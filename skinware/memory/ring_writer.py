@@ -60,6 +60,7 @@ class RingWriter:
         self._contents = [slot[file_layout.SLOT.itemsize :] for slot in slots_of(segment)]
         self._statistics = self._words[_STATISTICS]
         self._begun_ns, self._cpu_ns = 0, time.thread_time_ns()
+        self._skipped = 0
         for page in range(0, layout.file_size, mmap.PAGESIZE):
             segment.data[page] = segment.data[page]  # touch every page now, not in the middle of a period
 
@@ -68,27 +69,35 @@ class RingWriter:
         """Sequence of the newest frame, 0 before the first."""
         return self._words[LATEST]
 
-    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
+    def begin(self, *, from_last: bool = False, skip: int = 0) -> dict[str, npt.NDArray[Any]]:
         """The columns of the next slot, to be filled; they hold an old frame.
 
         Until ``commit``, readers of that old frame are told that it is gone.
 
         Args:
             from_last: copy the newest frame into it first, for writers that change parts only.
+            skip: sequences before its own that are left out; readers count them as lost. It is one more where the slot
+                would be that of the newest frame, which stays readable meanwhile.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
         latest = self.sequence
-        slot = (latest + 1) % self._count
+        self._skipped = skip + (latest > 0 and (skip + 1) % self._count == 0)
+        slot = self._next % self._count
         self._take_next()
         if from_last and latest:
             self._contents[slot][:] = self._contents[latest % self._count]
         return self._columns[slot]
 
+    @property
+    def _next(self) -> int:
+        """The sequence of the next frame."""
+        return self.sequence + 1 + self._skipped
+
     def _take_next(self) -> None:
         """Take the next slot: tell the readers of the frame in it that it is gone."""
         self._begun_ns = now_ns()
-        self._slot_words[(self.sequence + 1) % self._count][SEQUENCE] = 0
+        self._slot_words[self._next % self._count][SEQUENCE] = 0
         fence()
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
@@ -127,7 +136,7 @@ class RingWriter:
         if acquired_ns < 0:
             acquired_ns = 0
             self._statistics[_BEFORE_BOOT] += 1
-        sequence = self.sequence + 1
+        sequence = self._next
         words = self._slot_words[sequence % self._count]
         published_ns = now_ns()
         words[ACQUIRED] = acquired_ns
@@ -135,7 +144,7 @@ class RingWriter:
         words[FLAGS] = flags
         fence()
         words[SEQUENCE] = sequence
-        begun_ns, self._begun_ns = self._begun_ns, 0
+        begun_ns, self._begun_ns, self._skipped = self._begun_ns, 0, 0
         self._words[LATEST] = sequence  # from now on it is published: this word alone says so
         self.wake()
         self._note(begun_ns, published_ns, acquired_ns)

@@ -73,6 +73,7 @@ class Republisher:
         self._services: dict[str, _Service] = {}
         self._deserted: dict[str, Generation] = {}
         self._surplus: list[str] = []
+        self._counts: dict[str, int] = {}
         self._paused = False
         self._epoll = select.epoll()
         self._calls: dict[int, Callable[[], object]] = {}
@@ -100,7 +101,7 @@ class Republisher:
         service.was_paused = False
         if writer.paused:
             writer.resume()
-        columns = writer.begin()
+        columns = writer.begin(skip=self._lost_before(name, frame, generation, follows))
         for column, into in columns.items():
             into[...] = frame.column(column)
         shift_ns = now_ns() - frame.published_ns  # last, so that filling the columns makes no frame older
@@ -229,6 +230,12 @@ class Republisher:
     def _take_requests(self, name: str) -> None:
         service = self._services[name]
         service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
+
+    def _lost_before(self, name: str, frame: RecordedFrame, generation: Generation, follows: bool) -> int:
+        """How many frames are not in the recording between a frame and the one before."""
+        count = generation.published_before + frame.sequence
+        before, self._counts[name] = self._counts.get(name), count
+        return max(0, count - before - 1) if follows and before is not None else 0
 
     @staticmethod
     def _reply(service: _Service, acquired_ns: int) -> None:

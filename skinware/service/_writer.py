@@ -71,12 +71,14 @@ class ServiceWriter(Ownership):
         self.missed_periods: int = 0
         self._stopping = False
 
-    def begin(self, *, from_last: bool = False) -> dict[str, npt.NDArray[Any]]:
+    def begin(self, *, from_last: bool = False, skip: int = 0) -> dict[str, npt.NDArray[Any]]:
         """Arrays of the next frame, to be filled in place; then ``commit``.
 
         Args:
             from_last: begin with the contents of the newest frame, to change parts of it only; otherwise the arrays
                 hold something old.
+            skip: sequences before this frame that are left out, for who passes frames on of which some did not arrive:
+                readers count them as lost. It may become one more: the newest frame stays readable meanwhile.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -87,7 +89,7 @@ class ServiceWriter(Ownership):
         if self._paused:
             self._require_open()
             raise Paused(f"service {self.name!r} is paused; call resume() first")
-        return self._ring.begin(from_last=from_last)
+        return self._ring.begin(from_last=from_last, skip=skip)
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish the frame: one system call wakes every reader.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from skinware import Namespace
+import skinware.recording
+from skinware import DriverReader, Namespace
 from skinware.cli._command import exit_status
 from skinware.cli.replay import command as replay
 from skinware_drivers.testing.waiting import wait_until
@@ -42,6 +43,35 @@ def test_others_see_what_was_recorded(file: Path, namespace: Namespace) -> None:
         stopped = player.stop()
         assert stopped["frames"]["torso"] > 60
         assert player.process.returncode == 0
+    assert namespace.services() == []
+
+
+def test_a_name_in_use_is_one_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("torso"):
+        assert exit_status(replay, [str(file)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("skin-replay: a running driver or service is called 'torso'")
+
+
+def test_it_waits_for_programs_and_stays_at_its_end(file: Path, namespace: Namespace) -> None:
+    options = "--paused", "--stay", "--times", "recorded"
+    with skinware.recording.open(file) as opened:
+        acquired_ns = opened["torso"].read(["status"]).acquired_ns.tolist()
+    with running("skin-replay", str(file), *options) as player:
+        assert player.wait_for("status", lambda status: bool(status["frames"]))["paused"]
+        with DriverReader("torso") as torso:
+            found = [torso.read().acquired_ns]
+            torso.call("speed", factor=0.5)
+            torso.call("resume")
+            for frame in torso.in_order(timeout_s=30):
+                if frame.acquired_ns > found[-1]:
+                    found.append(frame.acquired_ns)
+                if len(found) == len(acquired_ns):
+                    break
+            assert found == acquired_ns
+            assert player.wait_for("status", lambda status: status["paused"])["speed"] == 0.5
+        told = player.stop()
+        assert told["time_s"] == pytest.approx(told["duration_s"])
     assert namespace.services() == []
 
 

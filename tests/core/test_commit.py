@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from skinware import Frame, ServiceReader, ServiceWriter
+from skinware.errors import ServiceError
 from skinware.realtime import now_ns
 
 pytestmark = pytest.mark.usefixtures("data_path")
@@ -69,3 +70,38 @@ def test_a_stamp_before_boot_counts_as_boot_and_is_counted() -> None:
             writer.commit(acquired_ns)
             assert reader.read(timeout_s=0).acquired_ns == 0
         assert reader.writer_statistics.before_boot == 2
+
+
+def test_frames_that_are_left_out_are_lost_to_readers_and_the_newest_is_always_there() -> None:
+    with ServiceWriter("x", {"values": ("<i8", 4)}, slots=4) as writer, ServiceReader[Frame]("x") as reader:
+        frames = reader.in_order(timeout_s=30)
+        sequence, lost = 0, 0
+        for skip in (0, 1, 2, 0, 3, 4, 0, 5, 1000, 1003, 0):
+            more = skip == 3 or skip == 1003  # its slot would be the one of the newest
+            before = sequence
+            sequence += 1 + skip + more
+            lost += skip + more
+            writer.begin(skip=skip, from_last=True)["values"][:] = sequence
+            if before:
+                assert reader.read(timeout_s=0).sequence == before
+                assert reader.read(timeout_s=0).column("values").tolist() == [before] * 4
+            writer.begin(skip=skip)["values"][:] = sequence  # begun again
+            assert writer.commit(sequence) == writer.sequence == sequence
+            frame = next(frames)
+            assert (frame.sequence, frame.column("values").tolist()) == (sequence, [sequence] * 4)
+            assert reader.lost == lost
+            with pytest.raises(ServiceError, match="commit without begin"):
+                writer.commit(sequence)
+
+
+def test_a_frame_begun_anew_without_a_gap_has_none() -> None:
+    with service() as (writer, reader):
+        writer.begin(skip=4)["values"][:] = 2
+        writer.begin()["values"][:] = 3
+        assert writer.commit(8) == 2
+        writer.begin()["values"][:] = 4
+        writer.begin(skip=2)["values"][:] = 5
+        with pytest.raises(ValueError, match="64 for flags"):
+            writer.commit(9, flags=-1)
+        assert writer.commit(9) == 5
+        assert reader.read(timeout_s=0).column("values").tolist() == [5] * 4

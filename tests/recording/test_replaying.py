@@ -123,3 +123,35 @@ def test_a_name_that_is_in_use_is_refused(tmp_path: Path) -> None:
         with pytest.raises(NameInUse, match="'torso'"):
             replayer.run()
         replayer.close()
+
+
+def test_frames_that_the_recording_lost_are_lost_in_the_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    published = 0
+    with recording(first) as recorder:
+        for slots in (64, 4):  # it restarts in between
+            with FakeSkin("torso", fake_structure(1), slots=slots) as torso:
+                for count, room in ((1, 1 << 27), (151, 0), (1, 1 << 27)):
+                    monkeypatch.setattr("skinware.recording.recorder._MOST_WAITING", room)
+                    time.sleep(0.1)
+                    torso.publish(count)
+                    published += count
+                    time.sleep(0.1)
+                wait_until(
+                    lambda published=published: (  # type: ignore[misc]
+                        recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == published
+                    )
+                )
+        lost = recorder.lost
+    assert lost > 200
+    with recording(second) as recorder, replaying(first, speed=0.5):
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) + recorder.lost == published)
+    with skinware.recording.open(first) as then, skinware.recording.open(second) as now:
+        old, new = then["torso"].read(["status"]), now["torso"].read(["status"])
+        assert new.sequence.tolist() == old.sequence.tolist()
+        losses = [
+            [(event["count"], event["before"]) for event in opened.events if event["event"] == "lost"]
+            for opened in (then, now)
+        ]
+        assert losses[0] == losses[1]
+        assert sum(count for count, _ in losses[0]) == lost == now.lost

@@ -54,12 +54,12 @@ def check(evidence: Evidence) -> Iterator[Note]:
         yield Looked(
             AREA, f"driver {driver.name}", f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}"
         )
-        yield from _statuses(driver, evidence)
-        yield from _health(driver, evidence)
+        yield from _statuses(driver)
+        yield from _health(driver)
         yield from _places(driver)
 
 
-def _statuses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
+def _statuses(driver: DriverSeen) -> Iterator[Finding]:
     for name, meaning in _BY_STATUS.items():
         count = driver.statuses.get(name, 0)
         if not count:
@@ -75,9 +75,9 @@ def _statuses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             AREA,
             f"{plural(count, 'sensor')} {meaning.what if count > 1 else _singular(meaning.what)}",
             f"driver {driver.name}",
-            f"status {name.replace('_', ' ')}: {', '.join(named)}{more}",
+            f"status {name.replace('_', ' ')}: {'; '.join(named)}{more}",
             meaning.action,
-            (command,) if evidence.is_live else (),
+            (command,),
             _STATUS if name != "unhealthy" else _HEALTH,
         )
 
@@ -89,7 +89,7 @@ def _singular(what: str) -> str:
     return what
 
 
-def _health(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
+def _health(driver: DriverSeen) -> Iterator[Note]:
     seen = driver.health
     if seen is None:
         yield NotLooked(AREA, f"health of {driver.name}", "no frame to judge by")
@@ -107,11 +107,11 @@ def _health(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
             f"driver {driver.name}",
             f"{told}{' ...' if count > len(some) else ''} (judged by {seen.source})",
             "touch them and see what they show; heed them no more if they are broken",
-            ("skin-wipe", f"skin-info {driver.name} --health") if evidence.is_live else (),
+            ("skin-wipe", f"skin-info {driver.name} --health"),
             _HEALTH,
         )
     for what, why in seen.missing.items():
-        is_last = evidence.is_live and what == list(seen.missing)[-1]
+        is_last = what == list(seen.missing)[-1]
         yield NotLooked(
             AREA, f"{what} of {driver.name}", why, (f"skin-calm {driver.name}", "skin-wipe") if is_last else ()
         )

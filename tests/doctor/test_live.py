@@ -70,7 +70,7 @@ def test_a_board_that_dies(skins: Skins) -> None:
     finding = found_until(of("patches", "board 8 fell silent"))
     assert (finding.severity, finding.see) == (Severity.ERROR, "reference/faults.md#patches")
     assert "1 of 2 patches are live" in finding.evidence
-    assert finding.commands == ("skin-find bus0",)  # of a driver whose type nobody knows
+    assert finding.commands == ("skin-info skin", "skin-find bus0")  # of a driver whose type nobody knows
 
 
 def test_a_board_that_never_answered() -> None:

@@ -317,7 +317,8 @@ def _foreign(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
 def _shared(evidence: Evidence) -> Iterator[Finding]:
     """Drivers that have one bus between them."""
     told: set[frozenset[tuple[str, str]]] = set()
-    for driver in evidence.drivers:
+    have_buses = {(one.namespace, one.name) for one in evidence.running}
+    for driver in [one for one in evidence.drivers if (one.namespace, one.name) in have_buses]:
         for bus in driver.buses:
             for other in evidence.running:
                 both = frozenset({(driver.namespace, driver.name), (other.namespace, other.name)})

@@ -353,7 +353,7 @@ class Evidence:
         interfaces: of CAN.
         kernel_has_can: it does.
         ports: serial ones.
-        running: living drivers in all namespaces that may be read.
+        running: living drivers in all namespaces that may be read; without those that publish another one's frames.
         waiting: processes of ``skin-driver`` that have published nothing so far.
         readers: programs that read the drivers frame by frame.
     """

@@ -28,7 +28,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         drivers = watch(namespace, seconds, tell)
     except NamespaceError:  # told as a namespace that cannot be looked at
         drivers = ()
-    living = tuple(running.running_drivers())
+    living = running.running_drivers()
     return Evidence(
         seconds=seconds,
         namespace=namespace.name,
@@ -38,7 +38,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         interfaces=surroundings.interfaces_seen(before, interfaces.can_interfaces()),
         kernel_has_can=interfaces.kernel_has_can(),
         ports=tuple(ports.serial_ports()),
-        running=living,
+        running=tuple(one for one in living if not programs.publishes_again(one.pid)),
         waiting=programs.waiting_drivers({one.pid for one in living}),
         readers=readers.seen(),
     )

@@ -10,7 +10,8 @@ from skinware_drivers.doctor.evidence import ReaderSeen
 
 _EVERY_FRAME = "in order"
 """How readers read that want every frame; others are meant to skip some."""
-_DRIVER = "skin-driver"
+_DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay")
+_PROC = Path("/proc")
 
 
 class ReadersWatch:
@@ -38,21 +39,33 @@ class ReadersWatch:
         return {(one.pid, one.service): one for one in living_readers(self._namespace)}
 
 
-def waiting_drivers(known: set[int], proc: Path = Path("/proc")) -> tuple[int, ...]:
+def waiting_drivers(known: set[int], proc: Path = _PROC) -> tuple[int, ...]:
     """Processes of ``skin-driver`` that publish nothing.
 
     Args:
         known: processes of drivers that do.
         proc: procfs.
     """
-    found = set()
-    for path in proc.glob("[0-9]*/comm"):
-        try:
-            if path.read_text(errors="replace").strip() == _DRIVER:
-                found.add(int(path.parent.name))
-        except OSError:  # it ended meanwhile
-            continue
+    found = {int(path.name) for path in proc.glob("[0-9]*") if program_of(int(path.name), proc) == _DRIVER}
     return tuple(sorted(found - known))
 
 
-__all__ = ["ReadersWatch", "waiting_drivers"]
+def publishes_again(pid: int, proc: Path = _PROC) -> bool:
+    """Whether a process has no bus: what it publishes is another driver's, or was once.
+
+    Args:
+        pid: of a driver.
+        proc: procfs.
+    """
+    return program_of(pid, proc) in _SECOND_HAND
+
+
+def program_of(pid: int, proc: Path = _PROC) -> str:
+    """Name of a process' program; empty if there is no such process."""
+    try:
+        return (proc / str(pid) / "comm").read_text(errors="replace").strip()
+    except OSError:
+        return ""
+
+
+__all__ = ["ReadersWatch", "program_of", "publishes_again", "waiting_drivers"]

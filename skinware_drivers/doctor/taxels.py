@@ -83,7 +83,7 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
 
 
 def _singular(what: str) -> str:
-    for several, one in (("are ", "is "), ("do ", "does ")):
+    for several, one in (("are ", "is "), ("do ", "does "), ("have ", "has ")):
         if what.startswith(several):
             return one + what.removeprefix(several)
     return what
@@ -128,7 +128,10 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
     modules: dict[str, set[str]] = {}
     for sensor_type in structure.types:
         index = structure.index(sensor_type.name)
-        for finding in check_file(structure.geometry[index], structure.module_of(sensor_type.name)):
+        geometry = structure.geometry[index]
+        if not geometry.known.any():
+            continue  # temperatures, say, whose places nobody needs
+        for finding in check_file(geometry, structure.module_of(sensor_type.name)):
             counts[finding.kind] += len(finding.taxels)
             modules.setdefault(finding.kind, set()).update(structure.module_names[row] for row in finding.modules)
     yield Looked(AREA, f"places of {driver.name}", f"{int(np.count_nonzero(structure.geometry.known))} known")
@@ -138,7 +141,7 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
             yield Finding(
                 Severity.WARNING if kind == SHARED else Severity.NOTE,
                 AREA,
-                f"{plural(counts[kind], 'sensor')} {what}",
+                f"{plural(counts[kind], 'sensor')} {what if counts[kind] > 1 else _singular(what)}",
                 f"driver {driver.name}",
                 f"modules {', '.join(names[:_MOST_NAMES])}{' ...' if len(names) > _MOST_NAMES else ''}",
                 "correct the geometry, or measure it by touch",

@@ -214,6 +214,14 @@ def test_a_program_that_does_not_keep_up(namespace: Namespace) -> None:
     assert f"pid {os.getpid()}" in finding.where
 
 
+def test_a_calmed_driver_is_no_second_one_on_its_bus(tmp_path: Path) -> None:
+    for pid, program in ((17, "skin-calm"), (18, "skin-replay"), (19, "skin-driver"), (20, "python3")):
+        (tmp_path / str(pid)).mkdir()
+        (tmp_path / str(pid) / "comm").write_text(f"{program}\n")
+    assert [pid for pid in range(16, 22) if programs.publishes_again(pid, tmp_path)] == [17, 18]
+    assert programs.waiting_drivers({20}, tmp_path) == (19,)
+
+
 def test_names_of_others_cannot_move_the_cursor(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = evidence(namespace="x\x1b[2Jy\nz")
     told = examine(seen)

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from skinware.cli._format import age_text, count_text, plural
-from skinware_drivers.bus_names import place_of_bus
 from skinware_drivers.doctor.evidence import BusSeen, Change, DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.losses import brief, lost_text
+from skinware_drivers.doctor.losses import lost_text
 from skinware_drivers.doctor.machine import circumstances
+from skinware_drivers.doctor.naming import brief, typed
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.finding.running import same_bus
 from skinware_drivers.running.limits import FULL, HIGH_LOAD
@@ -221,7 +221,7 @@ def _state(bus: BusSeen, driver: DriverSeen, evidence: Evidence) -> Iterator[Fin
             where,
             f"{told}{'; ' + _port_text(port) if port else ''}",
             advice.action,
-            _typed(advice.commands, bus.name, driver.name),
+            typed(advice.commands, bus.name, driver.name),
             _PROBLEM,
         )
     away_s = _away_s(bus, evidence.seconds)
@@ -234,7 +234,7 @@ def _state(bus: BusSeen, driver: DriverSeen, evidence: Evidence) -> Iterator[Fin
             where,
             f"{one.state}{', ' + one.reason if one.reason else ''} from {one.time_s:.1f} s on; {_span(away_s)} in all",
             "check plug, cable and power",
-            _typed(("journalctl -k | tail",), bus.name, driver.name) if evidence.is_live else (),
+            typed(("journalctl -k | tail",), bus.name, driver.name),
             "troubleshooting.md#a-bus-comes-and-goes",
         )
     if len(bus.changes) > _FLAPS:
@@ -272,7 +272,7 @@ def _load(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
         f"driver {driver.name}, bus {brief(bus.name)}",
         f"load {100 * bus.load:.0f} %: frames with high identifiers wait, or never come",
         "fewer boards on it, a longer period, and see what else sends",
-        (f"skin-find {bus.name}", "skin-driver ... --period-ms 100"),
+        typed(("skin-find {name}", "skin-driver ... --period-ms 100"), bus.name),
         _MISSING,
     )
 
@@ -291,7 +291,7 @@ def _losses(bus: BusSeen, driver: DriverSeen, evidence: Evidence) -> Iterator[Fi
             f"driver {driver.name}, bus {brief(bus.name)}",
             f"{told.text}{of}{told.hours}{why}",
             loss.action,
-            _typed(loss.commands, bus.name, driver.name),
+            typed(loss.commands, bus.name, driver.name),
             _MISSING if name not in ("bus_offs", "errors") else _PROBLEM,
         )
 
@@ -309,7 +309,7 @@ def _foreign(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
         f"driver {driver.name}, bus {brief(bus.name)}",
         f"{plural(unknown, 'frame')} of unknown identifiers{', such as ' + samples[0] if samples else ''}",
         "harmless in itself; if a board is missing, see whose frames these are",
-        (f"skin-find {bus.name}",),
+        typed(("skin-find {name}",), bus.name),
         _MISSING,
     )
 
@@ -317,7 +317,8 @@ def _foreign(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
 def _shared(evidence: Evidence) -> Iterator[Finding]:
     """Drivers that have one bus between them."""
     told: set[frozenset[tuple[str, str]]] = set()
-    for driver in evidence.drivers:
+    have_buses = {(one.namespace, one.name) for one in evidence.running}
+    for driver in [one for one in evidence.drivers if (one.namespace, one.name) in have_buses]:
         for bus in driver.buses:
             for other in evidence.running:
                 both = frozenset({(driver.namespace, driver.name), (other.namespace, other.name)})
@@ -331,7 +332,7 @@ def _shared(evidence: Evidence) -> Iterator[Finding]:
                     f"driver {driver.name}, bus {brief(bus.name)}",
                     f"{other} has it too; this one has sent {plural(bus.counted.total.get('sent', 0), 'frame')}",
                     "stop one of them, or start it so that it sends nothing",
-                    (f"skin-driver --bus {bus.name} --listen-only",),
+                    typed(("skin-driver --bus {name} --listen-only",), bus.name),
                     _TWO,
                 )
 
@@ -345,14 +346,6 @@ def _port_text(port: SerialPort) -> str:
     parts = [] if port.may_open else [f"this account may not open {port.path} (group {port.group or 'none'})"]
     parts += [f"{user.program} (pid {user.pid}) has it open" for user in port.users]
     return "; ".join(parts) or f"{port.path} is there"
-
-
-def _typed(commands: tuple[str, ...], bus_name: str, driver: str) -> tuple[str, ...]:
-    """Commands with the names filled in; those that are about an interface only where there is one."""
-    place = place_of_bus(bus_name)
-    channel = place.channel if place.interface == "socketcan" else ""
-    meant = [one for one in commands if channel or "{channel}" not in one]
-    return tuple(one.format(name=bus_name, channel=channel, driver=driver) for one in meant)
 
 
 def _span(seconds: float) -> str:

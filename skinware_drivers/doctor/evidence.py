@@ -323,6 +323,23 @@ class RecordingSeen:
 
 
 @dataclass(frozen=True)
+class ReaderSeen:
+    """A program that reads a driver frame by frame.
+
+    Attributes:
+        program, pid: of its process.
+        driver: that it reads.
+        frames, lost: that it took, and that it did not, while somebody looked.
+    """
+
+    program: str
+    pid: int
+    driver: str
+    frames: int
+    lost: int
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Everything that was seen.
 
@@ -336,7 +353,9 @@ class Evidence:
         interfaces: of CAN.
         kernel_has_can: it does.
         ports: serial ones.
-        running: living drivers in all namespaces that may be read.
+        running: living drivers in all namespaces that may be read; without those that publish another one's frames.
+        waiting: processes of ``skin-driver`` that have published nothing so far.
+        readers: programs that read the drivers frame by frame.
     """
 
     seconds: float
@@ -349,6 +368,8 @@ class Evidence:
     kernel_has_can: bool = True
     ports: tuple[SerialPort, ...] = ()
     running: tuple[RunningDriver, ...] = ()
+    waiting: tuple[int, ...] = ()
+    readers: tuple[ReaderSeen, ...] = ()
 
     @property
     def is_live(self) -> bool:

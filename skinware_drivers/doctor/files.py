@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 
 from skinware.cli._format import age_text, count_text, plural
@@ -11,6 +12,7 @@ from skinware_drivers.doctor.finding import Finding, Looked, Note, Severity
 AREA = "files"
 _PROGRAMS, _RECORD = "reference/faults.md#programs", "how-to/record.md#after-a-crash"
 _MIB = 1 << 20
+_MOST_COMMANDS = 3
 _FORGOTTEN_S = 600.0
 """Another namespace in which nothing lives and nothing happens for so long."""
 
@@ -22,7 +24,8 @@ def check(evidence: Evidence) -> Iterator[Note]:
             told = f"{plural(len(namespace.living), 'service')} alive, {len(namespace.dead)} dead"
             yield Looked(AREA, f"namespace {namespace.name}", told)
         yield from _damaged(namespace)
-        yield from _left(namespace, {driver.name for driver in evidence.drivers} if namespace.is_ours else set())
+    yield from _left(evidence)
+    yield from _forgotten(evidence)
     if evidence.recording is not None:
         yield from _recording(evidence.recording)
 
@@ -41,23 +44,44 @@ def _damaged(namespace: NamespaceSeen) -> Iterator[Finding]:
         )
 
 
-def _left(namespace: NamespaceSeen, drivers: set[str]) -> Iterator[Finding]:
-    """What nobody uses any more; drivers of the namespace that was asked for are told as killed ones already."""
-    dead = [name for name in namespace.dead if name not in drivers]
-    is_forgotten = namespace.is_ours or (not namespace.living and namespace.idle_s > _FORGOTTEN_S)
-    if not dead or not is_forgotten:
-        return
-    since = "" if namespace.is_ours else f", untouched for {age_text(namespace.idle_s * 1e9)}"
-    yield Finding(
-        Severity.NOTE,
-        AREA,
-        f"{plural(len(dead), 'file')} of killed programs {'are' if len(dead) > 1 else 'is'} left",
-        f"namespace {namespace.name}",
-        f"{', '.join(dead)}: {namespace.bytes_of_dead / _MIB:.1f} MiB of shared memory{since}",
-        "start them again, or remove what nobody needs any more",
-        tuple(f"rm {namespace.path}/{name}.ring" for name in dead[:3]),
-        _PROGRAMS,
-    )
+def _left(evidence: Evidence) -> Iterator[Finding]:
+    """What killed programs left in the namespace that was asked for; its drivers are told as killed ones already."""
+    drivers = {driver.name for driver in evidence.drivers}
+    for namespace in evidence.namespaces:
+        dead = [name for name in namespace.dead if name not in drivers]
+        if namespace.is_ours and dead:
+            yield Finding(
+                Severity.NOTE,
+                AREA,
+                f"{plural(len(dead), 'file')} of killed programs {'are' if len(dead) > 1 else 'is'} left",
+                f"namespace {namespace.name}",
+                f"{', '.join(dead)}: {namespace.bytes_of_dead / _MIB:.1f} MiB of shared memory",
+                "start them again, or remove what nobody needs any more",
+                tuple(f"rm {namespace.path}/{name}.ring" for name in dead[:_MOST_COMMANDS]),
+                _PROGRAMS,
+            )
+
+
+def _forgotten(evidence: Evidence) -> Iterator[Finding]:
+    """Other namespaces in which nothing lives."""
+    found = [
+        one
+        for one in evidence.namespaces
+        if not one.is_ours and one.dead and not one.living and one.idle_s > _FORGOTTEN_S
+    ]
+    if found:
+        size = sum(one.bytes_of_dead for one in found) / _MIB
+        told = [f"{one.name} (untouched for {age_text(one.idle_s * 1e9)})" for one in found[:_MOST_COMMANDS]]
+        yield Finding(
+            Severity.NOTE,
+            AREA,
+            f"{plural(len(found), 'namespace')} of killed programs {'are' if len(found) > 1 else 'is'} left",
+            ", ".join(told) + (" ..." if len(found) > len(told) else ""),
+            f"{sum(len(one.dead) for one in found)} services, none alive: {size:.1f} MiB of shared memory",
+            "remove what nobody needs any more",
+            tuple(f"rm -r {one.path}" for one in found[:_MOST_COMMANDS]),
+            _PROGRAMS,
+        )
 
 
 def _recording(recording: RecordingSeen) -> Iterator[Note]:
@@ -73,7 +97,7 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
             recording.name,
             "its index is missing: the recorder was killed, the disk was full, or the end of the file is lost",
             "all but the last 0.3 s can be read; tools of others need a whole file",
-            (f"skin-recover {recording.name}",),
+            (f"skin-recover {shlex.quote(recording.name)}",),
             _RECORD,
         )
     for problem in recording.problems:
@@ -84,7 +108,7 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
             recording.name,
             problem,
             "what is damaged is left out of everything; check the disk",
-            (f"skin-recover {recording.name}",),
+            (f"skin-recover {shlex.quote(recording.name)}",),
             _RECORD,
         )
     if recording.lost:

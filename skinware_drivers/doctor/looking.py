@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
-from skinware_drivers.doctor import surroundings
+from skinware_drivers.doctor import programs, surroundings
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.watching import watch
 from skinware_drivers.finding import interfaces, ports, running
@@ -20,7 +20,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         seconds: how long.
         tell: called now and then with how long that is by now, s.
     """
-    machine = surroundings.MachineWatch()
+    machine, readers = surroundings.MachineWatch(), programs.ReadersWatch(namespace)
     before = interfaces.can_interfaces()
     namespaces = surroundings.namespaces_seen(namespace)
     drivers: tuple[DriverSeen, ...]
@@ -28,6 +28,7 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         drivers = watch(namespace, seconds, tell)
     except NamespaceError:  # told as a namespace that cannot be looked at
         drivers = ()
+    living = running.running_drivers()
     return Evidence(
         seconds=seconds,
         namespace=namespace.name,
@@ -37,7 +38,9 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         interfaces=surroundings.interfaces_seen(before, interfaces.can_interfaces()),
         kernel_has_can=interfaces.kernel_has_can(),
         ports=tuple(ports.serial_ports()),
-        running=tuple(running.running_drivers()),
+        running=tuple(one for one in living if not programs.publishes_again(one.pid)),
+        waiting=programs.waiting_drivers({one.pid for one in living}),
+        readers=readers.seen(),
     )
 
 

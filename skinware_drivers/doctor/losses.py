@@ -45,11 +45,6 @@ def lost_text(counted: Counted, name: str, unit: str, evidence: Evidence) -> Tol
     return Told(True, text, _hours(counted, name, evidence))
 
 
-def brief(bus_name: str) -> str:
-    """A bus' name without options, which make it long."""
-    return bus_name.partition("?")[0]
-
-
 def _hours(counted: Counted, name: str, evidence: Evidence) -> str:
     of_hours = [(counts.get(name, 0), hour) for hour, counts in counted.hours]
     worst = sorted((one for one in of_hours if one[0]), reverse=True)[:_MOST_HOURS]
@@ -63,4 +58,4 @@ def _span(evidence: Evidence) -> str:
     return age_text(evidence.seconds * 1e9)
 
 
-__all__ = ["Told", "brief", "lost_text"]
+__all__ = ["Told", "lost_text"]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from statistics import median
 from typing import NamedTuple
 
 from skinware.cli._format import age_text, count_text, plural
-from skinware_drivers.bus_names import place_of_bus
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.losses import brief, lost_text
+from skinware_drivers.doctor.losses import lost_text
+from skinware_drivers.doctor.naming import brief, typed
 
 AREA = "patches"
 _FAULTS, _MISSING = "reference/faults.md#patches", "troubleshooting.md#data-is-missing"
@@ -119,8 +120,7 @@ def _asking(driver: DriverSeen, patch: PatchSeen) -> tuple[str, ...]:
     """How to see whether it answers."""
     if driver.driver_type == "roboskin":
         return (f"skin-config {driver.name} versions",)
-    place = place_of_bus(patch.bus)
-    return (f"skin-info {driver.name}",) if place.interface == "virtual" else (f"skin-find {patch.bus}",)
+    return typed(("skin-info {driver}", "skin-find {name}"), patch.bus, driver.name)
 
 
 def _flapping(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
@@ -138,7 +138,7 @@ def _flapping(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
                 f"driver {driver.name}, bus {brief(patch.bus)}, {patch.name}",
                 f"{plural(len(silent), 'time')} in {age_text(evidence.seconds * 1e9)}: at {times}",
                 "check its plug and power",
-                _asking(driver, patch) if evidence.is_live else (),
+                _asking(driver, patch),
                 _FAULTS,
             )
 
@@ -166,7 +166,7 @@ def _losses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             f"driver {driver.name}, {plural(len(told), 'patch', 'patches')}",
             "; ".join(shown) + (" ..." if len(told) > len(shown) else ""),
             "see whether its bus loses frames, is full or is damaged: cable, termination, load",
-            (f"skin-info {driver.name}", f"skin-find {worst.bus}") if evidence.is_live else (),
+            typed(("skin-info {driver}", "skin-find {name}"), worst.bus, driver.name),
             _MISSING,
         )
 
@@ -197,7 +197,7 @@ def _twice(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
     of_period = evidence.seconds * 1e9 / driver.timing.period_ns if driver.timing.period_ns else None
     usual = median(enough.values()) if len(enough) > 2 else of_period
     for patch in driver.patches:
-        count = enough.get(patch.name, 0.0)
+        count, only = enough.get(patch.name, 0.0), shlex.quote(f"patch={patch.name}")
         if usual and count > _TWICE * usual and _collides(patch):
             yield Finding(
                 Severity.ERROR,
@@ -206,7 +206,7 @@ def _twice(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
                 f"driver {driver.name}, bus {brief(patch.bus)}, {patch.name}",
                 f"data of {count:.0f} updates of a module in {age_text(evidence.seconds * 1e9)}, {usual:.0f} are due",
                 "unplug the board and see whether the address still sends; then give one of the two another address",
-                (f"skin-find {patch.bus}", f"skin-config {patch.bus} set_address address=9 patch='{patch.name}'"),
+                typed(("skin-find {name}", f"skin-config {{name}} set_address address=9 {only}"), patch.bus),
                 "how-to/find-and-set-up.md#configure-boards",
             )
 

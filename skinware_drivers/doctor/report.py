@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from skinware.cli._format import age_text, plural
 from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
-from skinware_drivers.doctor.finding import Finding
+from skinware_drivers.doctor.finding import Finding, printable
 from skinware_drivers.doctor.scrubbing import Secrets, scrubbed
 
 
@@ -19,7 +19,7 @@ def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None 
         found: what came of it.
         secrets: what must not be in it; default: those of this machine.
     """
-    text = "\n".join(_lines(evidence, found)) + "\n"
+    text = "\n".join(map(printable, _lines(evidence, found))) + "\n"
     return scrubbed(text, secrets or Secrets.of_this_machine())
 
 

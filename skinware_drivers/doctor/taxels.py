@@ -54,12 +54,12 @@ def check(evidence: Evidence) -> Iterator[Note]:
         yield Looked(
             AREA, f"driver {driver.name}", f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}"
         )
-        yield from _statuses(driver, evidence)
-        yield from _health(driver, evidence)
+        yield from _statuses(driver)
+        yield from _health(driver)
         yield from _places(driver)
 
 
-def _statuses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
+def _statuses(driver: DriverSeen) -> Iterator[Finding]:
     for name, meaning in _BY_STATUS.items():
         count = driver.statuses.get(name, 0)
         if not count:
@@ -75,21 +75,21 @@ def _statuses(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             AREA,
             f"{plural(count, 'sensor')} {meaning.what if count > 1 else _singular(meaning.what)}",
             f"driver {driver.name}",
-            f"status {name.replace('_', ' ')}: {', '.join(named)}{more}",
+            f"status {name.replace('_', ' ')}: {'; '.join(named)}{more}",
             meaning.action,
-            (command,) if evidence.is_live else (),
+            (command,),
             _STATUS if name != "unhealthy" else _HEALTH,
         )
 
 
 def _singular(what: str) -> str:
-    for several, one in (("are ", "is "), ("do ", "does ")):
+    for several, one in (("are ", "is "), ("do ", "does "), ("have ", "has ")):
         if what.startswith(several):
             return one + what.removeprefix(several)
     return what
 
 
-def _health(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
+def _health(driver: DriverSeen) -> Iterator[Note]:
     seen = driver.health
     if seen is None:
         yield NotLooked(AREA, f"health of {driver.name}", "no frame to judge by")
@@ -107,11 +107,11 @@ def _health(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
             f"driver {driver.name}",
             f"{told}{' ...' if count > len(some) else ''} (judged by {seen.source})",
             "touch them and see what they show; heed them no more if they are broken",
-            ("skin-wipe", f"skin-info {driver.name} --health") if evidence.is_live else (),
+            ("skin-wipe", f"skin-info {driver.name} --health"),
             _HEALTH,
         )
     for what, why in seen.missing.items():
-        is_last = evidence.is_live and what == list(seen.missing)[-1]
+        is_last = what == list(seen.missing)[-1]
         yield NotLooked(
             AREA, f"{what} of {driver.name}", why, (f"skin-calm {driver.name}", "skin-wipe") if is_last else ()
         )
@@ -128,7 +128,10 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
     modules: dict[str, set[str]] = {}
     for sensor_type in structure.types:
         index = structure.index(sensor_type.name)
-        for finding in check_file(structure.geometry[index], structure.module_of(sensor_type.name)):
+        geometry = structure.geometry[index]
+        if not geometry.known.any():
+            continue  # temperatures, say, whose places nobody needs
+        for finding in check_file(geometry, structure.module_of(sensor_type.name)):
             counts[finding.kind] += len(finding.taxels)
             modules.setdefault(finding.kind, set()).update(structure.module_names[row] for row in finding.modules)
     yield Looked(AREA, f"places of {driver.name}", f"{int(np.count_nonzero(structure.geometry.known))} known")
@@ -138,7 +141,7 @@ def _places(driver: DriverSeen) -> Iterator[Note]:
             yield Finding(
                 Severity.WARNING if kind == SHARED else Severity.NOTE,
                 AREA,
-                f"{plural(counts[kind], 'sensor')} {what}",
+                f"{plural(counts[kind], 'sensor')} {what if counts[kind] > 1 else _singular(what)}",
                 f"driver {driver.name}",
                 f"modules {', '.join(names[:_MOST_NAMES])}{' ...' if len(names) > _MOST_NAMES else ''}",
                 "correct the geometry, or measure it by touch",

@@ -29,6 +29,7 @@ def check(evidence: Evidence) -> Iterator[Note]:
         if driver.life != "dead":
             yield from _late(driver, evidence)
         yield from _clock(driver)
+    yield from _readers(evidence)
     if evidence.is_live and not evidence.drivers:
         yield from _nobody(evidence)
     if evidence.is_live:
@@ -57,6 +58,9 @@ def _nobody(evidence: Evidence) -> Iterator[Finding]:
     """No driver has published anything."""
     elsewhere = [str(one) for one in evidence.running]
     told = f"; elsewhere: {', '.join(elsewhere)}" if elsewhere else ""
+    if evidence.waiting:
+        pids = ", ".join(map(str, evidence.waiting))
+        told += f"; skin-driver runs (pid {pids}), and has found no device so far"
     there = [f"skin-doctor --namespace {one.namespace}" for one in evidence.running[:1]]
     yield Finding(
         Severity.ERROR,
@@ -64,10 +68,27 @@ def _nobody(evidence: Evidence) -> Iterator[Finding]:
         "no driver has published anything",
         f"namespace {evidence.namespace}",
         f"there is none in /dev/shm/skinware.{evidence.namespace}{told}",
-        "see what is plugged in and start a driver; one that runs already has found no board so far: see its log",
+        "see what is plugged in and start a driver; of one that runs, see the log, and its boards (power, bit rate)",
         (*there, "skin-find", "skin-driver --bus can0"),
         "tutorials/first-run.md",
     )
+
+
+def _readers(evidence: Evidence) -> Iterator[Note]:
+    """Programs that want every frame, and do not keep up."""
+    for one in evidence.readers:
+        yield Looked(AREA, f"reader {one.program}", f"{one.frames} frames of {one.driver} taken, {one.lost} missed")
+        if one.lost:
+            yield Finding(
+                Severity.WARNING,
+                AREA,
+                "a program does not keep up with a driver whose frames it wants all",
+                f"{one.program}, pid {one.pid}, reads {one.driver}",
+                f"{plural(one.lost, 'frame')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
+                "give that program more processor time, or the driver more slots, in which frames wait",
+                ("skin-driver ... --slots 64", "skin-info"),
+                "reference/faults.md#programs",
+            )
 
 
 def _life(driver: DriverSeen) -> Iterator[Finding]:

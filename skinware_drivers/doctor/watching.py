@@ -189,15 +189,11 @@ def _by_calm(reader: DriverReader, life: str) -> HealthSeen | None:
 
 
 def _calm_health(entry: Mapping[str, Any]) -> HealthSeen:
-    kinds = entry["kinds"]
-    missing = {}
-    if kinds["unknown"] or kinds["never_touched"]:
-        untold = kinds["unknown"] + kinds["never_touched"]
-        missing["dead and weak taxels"] = (
-            f"nothing has touched {untold:,} of {entry['sensors']:,} since skin-calm began"
-        )
+    kinds, judged, missing = entry["kinds"], entry["sensors"] - entry["kinds"]["unknown"], {}
+    if kinds["never_touched"]:
+        missing["dead and weak taxels"] = f"nothing has touched {kinds['never_touched']:,} of {judged:,} so far"
     faults = tuple(TaxelFault(one["name"], one["kind"], one["evidence"]) for one in entry["faults"])
-    return HealthSeen("skin-calm", entry["sensors"] - kinds["unknown"], faults, missing)
+    return HealthSeen("skin-calm", judged, faults, missing)
 
 
 __all__ = ["watch"]

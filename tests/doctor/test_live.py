@@ -24,6 +24,8 @@ from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
+from tests.cli.test_regions import placed_structure
+from tests.cli.test_sensor_health import looked_after
 from tests.doctor.rig import found, found_until, looked, of
 from tests.sdk.driving import driving
 
@@ -70,7 +72,7 @@ def test_a_board_that_dies(skins: Skins) -> None:
     finding = found_until(of("patches", "board 8 fell silent"))
     assert (finding.severity, finding.see) == (Severity.ERROR, "reference/faults.md#patches")
     assert "1 of 2 patches are live" in finding.evidence
-    assert finding.commands == ("skin-find bus0",)  # of a driver whose type nobody knows
+    assert finding.commands == ("skin-info skin", "skin-find bus0")  # of a driver whose type nobody knows
 
 
 def test_a_board_that_never_answered() -> None:
@@ -161,6 +163,33 @@ def test_frames_without_partners_and_foreign_ones(skins: Skins) -> None:
     assert foreign.severity == Severity.NOTE
     assert "such as" in foreign.evidence
     assert skin.driver.failure is None
+
+
+def test_what_skin_calm_says_of_taxels(namespace: Namespace) -> None:
+    with looked_after(namespace):
+        seen = looked(0.1)
+    told = examine(seen)
+    findings = {one.what: one.evidence for one in told.findings if one.area == "taxels"}
+    assert findings == {
+        "1 taxel is stuck": "board 7, triangle 0, taxel 5: at 73 counts for 700 s, while its module was touched"
+        " (judged by skin-calm)",
+        "1 taxel is noisy": "board 7, triangle 1, taxel 7: noise 6 counts, 7.5 times that of the others"
+        " (judged by skin-calm)",
+    }
+    assert "nothing has touched 2 of 640 so far" in {one.why for one in told.not_looked}
+
+
+def test_places_that_are_shared_or_missing() -> None:
+    structure = placed_structure()
+    assert structure.geometry is not None
+    position = structure.geometry.position_m
+    position[1], position[5] = position[0], np.nan
+    with publishing(FakeSkin("torso", structure)):
+        told = {one.what: one for one in found() if one.area == "taxels"}
+    assert told["2 sensors are at places of others"].severity == Severity.WARNING
+    assert told["1 sensor has no place"].severity == Severity.NOTE
+    assert "triangle 0" in told["2 sensors are at places of others"].evidence
+    assert "skin-calibrate check skin.toml" in told["1 sensor has no place"].commands
 
 
 # -- buses ----------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ A bus knows nothing of skins. It moves frames between a wire and a :class:`Frame
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -42,6 +42,7 @@ BATCH_FRAMES, _FRAMES_OF_A_BUS, _FEWEST_FRAMES, _BATCH_BYTES = 2048, 256, 64, 1 
 _MEDIA = {
     "can": ("a CAN bus", ", as vcan0, can0, slcan:/dev/ttyACM0 or virtual"),
     "serial": ("a serial line", ", as /dev/ttyUSB0, ./port (a path has a slash in it) or virtual"),
+    "modbus": ("a Modbus line", ", as modbus:/dev/ttyUSB0 or modbus:tcp://192.168.1.10"),
     "virtual": ("a bus of this process", ": virtual"),
 }
 """What the buses of a medium are called, and how they are written."""
@@ -176,7 +177,7 @@ class Bus(ABC):
     Attributes:
         medium: kind of bus, as drivers name it; None: whatever the driver speaks.
         opens_slowly: ``open`` may take long, and ``close`` too: a driver calls them in threads of their own.
-        device_end: class of the end at which emulated devices are; None: both ends are alike.
+        device_end: makes the end at which emulated devices are, like the class itself; None: both ends are alike.
         counters: what happened on it so far.
         samples: some of the frames that could not be used.
         tap: what goes over the wire, in both directions, as long as somebody wants it.
@@ -201,7 +202,7 @@ class Bus(ABC):
 
     medium: ClassVar[str | None] = None
     opens_slowly: ClassVar[bool] = False
-    device_end: ClassVar[type[Bus] | None] = None
+    device_end: ClassVar[Callable[..., Bus] | None] = None
 
     def __init__(
         self,
@@ -230,6 +231,11 @@ class Bus(ABC):
     def instead(self, medium: str) -> str:
         """What to give instead to a driver that it does not fit, for people: the end of a sentence."""
         return _MEDIA[medium][1] if medium in _MEDIA else ""
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks its devices by itself, so that the next question waits until the answer is taken."""
+        return False
 
     @abstractmethod
     def open(self) -> None:

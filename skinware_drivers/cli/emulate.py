@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
 
 _DEFAULT_DRIVER = "roboskin"
-_LONGEST_COMMAND = {"can": 8, "serial": 4096}
+_LONGEST_COMMAND = {"can": 8, "serial": 4096, "modbus": 4096}
 
 
 class EmulateCommand(HardwareCommand):
@@ -109,7 +109,7 @@ def command(
     medium = medium_of(emulator)
     longest = getattr(emulator, "payload_size", _LONGEST_COMMAND[medium])
     bus = make_bus(bus_name, payload_size=longest, for_devices=True)
-    if not bus.fits(medium):
+    if not bus.fits("serial" if medium == "modbus" else medium):  # the bytes of both are the same
         such_as = "vcan0 or can0" if medium == "can" else "pty:./port, a port that is there, or tcp://127.0.0.1:5000"
         raise ConfigurationError(
             f"--bus {bus_name}: devices of {short_name(driver)} are attached to {kind_of_bus(medium)}; give {such_as}"

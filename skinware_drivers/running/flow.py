@@ -131,7 +131,7 @@ class Flow:
 
     def _rest_s(self) -> float:
         links = [line.link for line in self._lines]
-        if any(link.expects_data for link in links):
+        if any(link.expects_data for link in links) or any(line.bus.asks for line in self._lines):
             return min(self._latency_s, _LATENCY_IN_STEP_S)
         if any(link.is_awaiting for link in links):
             return min(self._latency_s, _LATENCY_WHILE_ASKING_S)

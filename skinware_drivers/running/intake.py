@@ -96,8 +96,9 @@ class Intake:
         else:
             loop.remove_reader(self._epoll.fileno())
             links = [line.link for line in self._lines]
+            asks = any(line.bus.asks for line in self._lines)
             factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
-            if any(link.expects_data for link in links):
+            if asks or any(link.expects_data for link in links):
                 factor = _REST_IN_STEP  # the answer alone is what comes, and then the next question
             rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
             self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)

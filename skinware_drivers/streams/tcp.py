@@ -11,6 +11,7 @@ import contextlib
 import os
 import select
 import socket
+from collections.abc import Callable
 from typing import Annotated, ClassVar
 
 import msgspec
@@ -188,7 +189,7 @@ class TcpBus(SerialBus):
         ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
 
-    device_end: ClassVar[type[Bus] | None] = TcpServerBus
+    device_end: ClassVar[Callable[..., Bus] | None] = TcpServerBus
 
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False

@@ -174,7 +174,7 @@ class Comparison:
         damaged_ns = np.array(sorted(damage.time_ns for damage in self.rig.wire.damages))
         reach_ns = self.rig.period_ns + _LATE_NS
         # on a serial line a frame can lose its end, and the next one its beginning
-        back_ns = _LATE_NS + (self.rig.period_ns if self.rig.adapter.medium == "serial" else 0)
+        back_ns = _LATE_NS + (self.rig.period_ns if self.rig.adapter.medium in ("serial", "modbus") else 0)
 
         def is_spoilt(time_ns: int) -> bool:
             first = np.searchsorted(damaged_ns, time_ns - back_ns - 1)

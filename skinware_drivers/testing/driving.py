@@ -196,8 +196,9 @@ def emulated_skin(
         if not bus:
             if factory is None:
                 defect(f"say which emulator {driver} is to run on")
-            if adapter.medium == "serial":
+            if adapter.medium in ("serial", "modbus"):
                 bus = running.enter_context(emulated_on_a_pty(factory, **emulator_options))
+                bus = f"{adapter.medium}:{bus}"
         elif emulator is not None:
             own = make_bus(bus, payload_size=adapter.payload_size)
             running.enter_context(emulated_on(own, emulator, **emulator_options))

@@ -71,7 +71,7 @@ class FaultTests(Suite):
 
         async def scenario(clock: HandClock) -> None:
             rig = self.running(clock)
-            if rig.adapter.medium == "serial":
+            if rig.adapter.medium in ("serial", "modbus"):
                 async with rig:
                     await self._damage(rig, "noise")
                     comparison = Comparison(rig)

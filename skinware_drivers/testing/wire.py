@@ -16,6 +16,7 @@ import numpy.typing as npt
 from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.testing.clock import HandClock, HandTimer
@@ -240,6 +241,31 @@ class _EmulatedPort(Port):
         self._timer.wake_at(0 if self._bytes else self._hardware.next_due_ns())
 
 
+class _Line:
+    """The line of emulated devices."""
+
+    def __init__(self, hardware: EmulatedHardware, clock: HandClock) -> None:
+        self._hardware = hardware
+        self._clock = clock
+        self._present = True
+        self._emulated: _EmulatedPort | None = None
+
+    def open(self) -> Port:
+        if not self._present:
+            raise BusNotAvailable("the emulated line is away")
+        self._emulated = _EmulatedPort(self._hardware, self._clock)
+        return self._emulated
+
+    def vanish(self) -> None:
+        self._present = False
+        if self._emulated is not None:
+            self._emulated.present = False
+            self._emulated.wake()
+
+    def come_back(self) -> None:
+        self._present = True
+
+
 class EmulatedSerialBus(SerialBus):
     """A serial line with emulated devices, in a clock's time."""
 
@@ -247,30 +273,42 @@ class EmulatedSerialBus(SerialBus):
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
-        self._hardware = hardware
-        self._clock = clock
-        self._present = True
-        self._emulated: _EmulatedPort | None = None
+        self._line = _Line(hardware, clock)
 
     def _open_port(self) -> Port:
-        if not self._present:
-            raise BusNotAvailable("the emulated line is away")
-        self._emulated = _EmulatedPort(self._hardware, self._clock)
-        return self._emulated
+        return self._line.open()
 
     def vanish(self) -> None:
         """Go away, as if unplugged."""
-        self._present = False
-        if self._emulated is not None:
-            self._emulated.present = False
-            self._emulated.wake()
+        self._line.vanish()
 
     def come_back(self) -> None:
         """End :meth:`vanish`."""
-        self._present = True
+        self._line.come_back()
 
 
-EmulatedBus = VirtualCanBus | EmulatedSerialBus
+class EmulatedModbusBus(ModbusBus):
+    """A Modbus line with emulated devices, in a clock's time."""
+
+    opens_slowly: ClassVar[bool] = False
+
+    def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
+        super().__init__("emulated", payload_size=payload_size, listen_only=listen_only, make_timer=clock.timer)
+        self._line = _Line(hardware, clock)
+
+    def _open_port(self) -> Port:
+        return self._line.open()
+
+    def vanish(self) -> None:
+        """Go away, as if unplugged."""
+        self._line.vanish()
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`."""
+        self._line.come_back()
+
+
+EmulatedBus = VirtualCanBus | EmulatedSerialBus | EmulatedModbusBus
 
 
 def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
@@ -285,6 +323,8 @@ def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, 
         )
     if adapter.medium == "serial":
         return EmulatedSerialBus(hardware, clock, adapter.payload_size, listen_only)
+    if adapter.medium == "modbus":
+        return EmulatedModbusBus(hardware, clock, adapter.payload_size, listen_only)
     return defect(f"{type(adapter).__name__}: there is no emulated bus of the medium {adapter.medium!r}")
 
 
@@ -299,6 +339,7 @@ __all__ = [
     "Burst",
     "Damage",
     "EmulatedBus",
+    "EmulatedModbusBus",
     "EmulatedSerialBus",
     "Fault",
     "Interference",

@@ -3,6 +3,7 @@
 from skinware_drivers.virtual.adapter import VirtualAdapter
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator
 from skinware_drivers.virtual.emulator_options import EmulatorOptions
+from skinware_drivers.virtual.modbus_device import ModbusEmulator
 from skinware_drivers.virtual.press import on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
 
@@ -11,6 +12,7 @@ __all__ = [
     "Device",
     "Emulator",
     "EmulatorOptions",
+    "ModbusEmulator",
     "SerialEmulator",
     "SerialEmulatorOptions",
     "VirtualAdapter",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 
 from skinware_drivers.bus import Bus
+from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
@@ -64,6 +65,33 @@ class VirtualSerialBus(SerialBus):
         return _EmulatedPort(self.hardware)
 
 
+class VirtualModbusBus(ModbusBus):
+    """Emulated Modbus devices as a bus; its name is as that of :class:`VirtualSerialBus`.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        emulator = load_emulator(channel)
+        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus virtual:{self.channel}"
+
+    def instead(self, medium: str) -> str:
+        """Emulators of devices on that medium."""
+        return emulators_instead(medium) or super().instead(medium)
+
+    def _open_port(self) -> Port:
+        return _EmulatedPort(self.hardware)
+
+
 class _EmulatedPort(Port):
     """The host's end of a line with emulated devices at the other."""
 
@@ -102,18 +130,20 @@ class _EmulatedPort(Port):
 def virtual_bus(
     channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
 ) -> Bus:
-    """The bus ``virtual``: CAN or a serial line, as the devices need it.
+    """The bus ``virtual``: CAN, a serial line or a Modbus line, as the devices need it.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
     emulator = load_emulator(channel or DEFAULT_EMULATOR)
-    bus: type[VirtualSerialBus | VirtualCanBus] = VirtualCanBus
+    bus: type[VirtualSerialBus | VirtualModbusBus | VirtualCanBus] = VirtualCanBus
     if medium_of(emulator) == "serial":
         bus = VirtualSerialBus
+    elif medium_of(emulator) == "modbus":
+        bus = VirtualModbusBus
     elif isinstance(emulator, type) and issubclass(emulator, PlacedHardware):
         bus = PlacedCanBus
     return bus(channel, options, payload_size=payload_size, listen_only=listen_only)
 
 
-__all__ = ["VirtualSerialBus", "virtual_bus"]
+__all__ = ["VirtualModbusBus", "VirtualSerialBus", "virtual_bus"]

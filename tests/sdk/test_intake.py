@@ -56,7 +56,7 @@ def rest_after_a_take(
         gather.stop()
 
     line: Any = SimpleNamespace(
-        bus=SimpleNamespace(receive=receive, fileno=lambda: read),
+        bus=SimpleNamespace(receive=receive, fileno=lambda: read, asks=False),
         link=SimpleNamespace(is_awaiting=is_awaiting, expects_data=in_step),
         ordinal=0,
     )

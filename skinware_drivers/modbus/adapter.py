@@ -1,0 +1,178 @@
+"""The adapter that drivers of Modbus devices subclass: which registers hold which values, and nothing about asking."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BusError, ConfigurationError
+from skinware_drivers.adapter import Adapter
+from skinware_drivers.bus import Bus
+from skinware_drivers.conditions import Identifier
+from skinware_drivers.layout import Flag, Frame, Layout, Sentinel, StatusBytes, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.modbus import wire
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.master import ANSWERS
+from skinware_drivers.modbus.registers import Order, Registers, Wanted
+from skinware_drivers.options import OptionsT
+from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
+
+_MOST_BLOCKS = 200
+
+
+class ModbusException(BusError):
+    """A device answered a question with an exception.
+
+    Attributes:
+        code: 1 to 255; see the Modbus specification.
+    """
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class ModbusAdapter(Adapter[OptionsT]):
+    """One Modbus line or connection of a driver; see :class:`skinware_drivers.adapter.Adapter`.
+
+    It reads and never writes by itself. Values are those of the registers; ``layout`` follows from them.
+
+    Attributes:
+        registers: blocks of registers, each with values of one module.
+        flags: what sets status bits, in every block (values that mean "none", say).
+        timeout_s: how long to wait for a reply.
+        turnaround_s: pause after a reply; None: what the standard wants.
+        baudrate: of serial lines, unless the bus' name says another.
+        byte_order: of the bytes of a register.
+        word_order: of the registers of a value that has several.
+        address_step: by how much the address grows from one register to the next: 2 where addresses count bytes.
+        largest_gap: registers that nobody wants, but that are read along rather than ask twice.
+        most_registers: of a read.
+    """
+
+    medium: ClassVar[str] = "modbus"
+    registers: Sequence[Registers] = ()
+    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
+    timeout_s: float = 0.1
+    turnaround_s: float | None = None
+    baudrate: int = DEFAULT_BAUDRATE
+    byte_order: Order = "big"
+    word_order: Order = "big"
+    address_step: int = 1
+    largest_gap: int = 16
+    most_registers: int = wire.MOST_REGISTERS
+    _line: ModbusBus | None = None
+
+    def __init__(self, options: OptionsT) -> None:
+        super().__init__(options)
+        if self.registers:
+            self.layout = self._layout()
+
+    @property
+    def payload_size(self) -> int:
+        """Longest frame; also answers to questions of its own must fit."""
+        return max(self.layout.payload_size if self.registers else 0, 256)
+
+    def check(self) -> None:
+        """Also the registers.
+
+        Raises:
+            ConfigurationError: something is missing, or contradicts something else; the message says what.
+        """
+        if type(self).describe is Adapter.describe and not self.registers:
+            raise ConfigurationError(f"{type(self).__name__} has no `registers`")
+        super().check()
+
+    def fit(self, bus: Bus) -> None:
+        """Tell the bus what to ask.
+
+        Raises:
+            ConfigurationError: it is another kind of bus.
+        """
+        super().fit(bus)
+        self._line = bus if isinstance(bus, ModbusBus) else None
+        self.use_registers(self.registers)
+
+    def use_registers(self, registers: Sequence[Registers]) -> None:
+        """Go over to other registers, for devices that tell in ``describe`` what they have.
+
+        Raises:
+            ConfigurationError: they cannot be read.
+        """
+        self.registers = registers
+        if registers:
+            self.layout = self._layout()
+        if self._line is not None:
+            wanted = Wanted(
+                registers,
+                self.address_step,
+                self.largest_gap,
+                self.most_registers,
+                self.byte_order,
+                self.word_order,
+            )
+            self._line.use(wanted, self.period_s, self.timeout_s, self.turnaround_s, self.baudrate)
+
+    async def probe(self, link: Link, patch: object) -> bool:  # noqa: ARG002
+        """Nothing: the registers of a silent device are asked for all the time."""
+        return False
+
+    async def read(
+        self, link: Link, address: int, count: int = 1, *, unit: int = 1, function: int = wire.READ_HOLDING
+    ) -> npt.NDArray[np.uint16]:
+        """Read registers once; (count,) uint16.
+
+        Raises:
+            HandshakeTimeout: no answer.
+            ModbusException: the device refuses.
+        """
+        question = wire.question_to_read(function, address, count)
+        answer = await self._ask(link, unit, question)
+        return np.frombuffer(answer[2:], ">u2" if self.byte_order == "big" else "<u2").astype(np.uint16)
+
+    async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:
+        """Write registers (function 16): only what a device's documentation allows, and only when a person wants it.
+
+        Raises:
+            HandshakeTimeout: no answer.
+            ModbusException: the device refuses.
+            ValueError: too many, or none.
+        """
+        if not 1 <= len(values) <= wire.MOST_WRITTEN:
+            raise ValueError(f"{len(values)} registers: give 1 to {wire.MOST_WRITTEN}")
+        data = np.array(values, ">u2" if self.byte_order == "big" else "<u2").tobytes()
+        await self._ask(link, unit, struct.pack(">BHHB", wire.WRITE_MANY, address, len(values), len(data)) + data)
+
+    async def _ask(self, link: Link, unit: int, question: bytes) -> bytes:
+        timeout_s = 4 * self.timeout_s + 1  # it waits for the read before, and for what is written beside it
+        reply = await link.request(unit, question, Match(ANSWERS | unit), timeout_s=timeout_s)
+        if code := wire.exception_of(reply.payload):
+            raise ModbusException(f"{link.bus_name}, unit {unit}: {wire.exception_text(code)}", code)
+        return reply.payload
+
+    def _layout(self) -> Layout:
+        if len(self.registers) > _MOST_BLOCKS:
+            raise ConfigurationError(f"{len(self.registers)} blocks of registers: give at most {_MOST_BLOCKS}")
+        return Layout([self._frame(number, block) for number, block in enumerate(self.registers)])
+
+    def _frame(self, number: int, block: Registers) -> Frame:
+        block.check()
+        values = Values(0, f">{block.dtype}", block.count // block.words, block.to)
+        name = f"registers {block.address} of unit {block.unit} ({number})"
+        return Frame(
+            name,
+            [Identifier(number)],
+            [2 * block.count],
+            values,
+            patch=block.patch,
+            module=block.module,
+            flags=self.flags,
+        )
+
+
+__all__ = ["ModbusAdapter", "ModbusException"]

@@ -1,0 +1,233 @@
+"""Which registers a driver wants, in which reads they are asked for, and what has been heard of them.
+
+A driver declares *blocks*: each becomes one frame of its layout. The plan of reads is made from them: near blocks are
+asked for together, long ones in several reads. A frame comes when all registers of its block have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
+
+Order = Literal["big", "little"]
+
+
+@dataclass(frozen=True)
+class Registers:
+    """A block of registers with values of one module.
+
+    Attributes:
+        address: of the first register, as the protocol counts: from 0.
+        count: of registers.
+        unit: address of the device on its line.
+        function: with which it is read: 3 or 4.
+        dtype: of the values: ``u2``, ``i2``, ``u4``, ``i4`` or ``f4``.
+        to: channel of the module that each value belongs to, None = dropped; default: 0, 1, 2 ...
+        patch: key of the patch, if a bus has several.
+        module: key of the module, if the patch has several.
+        every: it is read in each cycle (1), in every second one (2) ...
+    """
+
+    address: int
+    count: int
+    unit: int = 1
+    function: int = READ_HOLDING
+    dtype: str = "u2"
+    to: Sequence[int | None] | None = None
+    patch: int | None = None
+    module: int | None = None
+    every: int = 1
+
+    @property
+    def words(self) -> int:
+        """Registers of a value."""
+        return np.dtype(self.dtype).itemsize // 2
+
+    def check(self) -> None:
+        """Refuse what cannot be.
+
+        Raises:
+            ConfigurationError: what is wrong.
+        """
+        name = f"registers {self.address} of unit {self.unit}"
+        if self.dtype not in ("u2", "i2", "u4", "i4", "f4"):
+            raise ConfigurationError(f"{name}: dtype {self.dtype!r}: give u2, i2, u4, i4 or f4")
+        if self.function not in READS:
+            raise ConfigurationError(f"{name}: function {self.function}: registers are read with 3 or 4")
+        if self.count < 1 or self.count % self.words or self.every < 1 or not 0 <= self.unit <= 255:
+            raise ConfigurationError(f"{name}: {self.count} registers of {self.dtype}, every {self.every}: cannot be")
+
+
+@dataclass(frozen=True)
+class Read:
+    """One question of a cycle.
+
+    Attributes:
+        area: number of its area in the image.
+        first: its first register in that area.
+    """
+
+    unit: int
+    function: int
+    address: int
+    count: int
+    every: int
+    area: int
+    first: int
+
+    @property
+    def question(self) -> bytes:
+        """As a message."""
+        return question_to_read(self.function, self.address, self.count)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a device is asked for.
+
+    Attributes:
+        blocks: of registers.
+        step: by how much the address grows from one register to the next: 2 where addresses count bytes.
+        largest_gap: registers that nobody wants, but that are read along rather than ask twice.
+        most: registers of a read.
+        byte_order: of the bytes of a register.
+        word_order: of the registers of a value that has several.
+    """
+
+    blocks: Sequence[Registers]
+    step: int = 1
+    largest_gap: int = 16
+    most: int = MOST_REGISTERS
+    byte_order: Order = "big"
+    word_order: Order = "big"
+
+    def reads(self) -> list[Read]:
+        """The questions of a cycle: as few as possible, in order of address."""
+        return [
+            Read(
+                area.unit,
+                area.function,
+                area.address + self.step * first,
+                min(self.most, area.count - first),
+                area.every,
+                number,
+                first,
+            )
+            for number, area in enumerate(self.areas())
+            for first in range(0, area.count, self.most)
+        ]
+
+    def areas(self) -> list[Registers]:
+        """What is read without a gap, as blocks without meaning."""
+        found: list[Registers] = []
+        for block in sorted(self.blocks, key=lambda b: (b.unit, b.function, b.every, b.address)):
+            last = found[-1] if found else None
+            if last is not None and _key(last) == _key(block):
+                place = (block.address - last.address) // self.step
+                if (block.address - last.address) % self.step == 0 and place <= last.count + self.largest_gap:
+                    count = max(last.count, place + block.count)
+                    found[-1] = Registers(last.address, count, block.unit, block.function, every=block.every)
+                    continue
+            found.append(Registers(block.address, block.count, block.unit, block.function, every=block.every))
+        return found
+
+
+def _key(block: Registers) -> tuple[int, int, int]:
+    return block.unit, block.function, block.every
+
+
+class Row(NamedTuple):
+    """A frame that is whole."""
+
+    time_ns: int
+    identifier: int
+    payload: bytes
+
+
+class _Area:
+    def __init__(self, where: Registers) -> None:
+        self.where = where
+        self.registers: npt.NDArray[np.uint8] = np.zeros((where.count, 2), np.uint8)
+        self.heard_ns: npt.NDArray[np.int64] = np.zeros(where.count, np.int64)
+        self.blocks: list[tuple[int, int, Registers]] = []  # identifier, first register
+
+
+class Image:
+    """What was last heard of all wanted registers.
+
+    Args:
+        wanted: the blocks; the identifier of a frame is the number of its block.
+    """
+
+    def __init__(self, wanted: Wanted) -> None:
+        self._wanted = wanted
+        self._areas = [_Area(area) for area in wanted.areas()]
+        self._told_ns = [0] * len(wanted.blocks)
+        for number, block in enumerate(wanted.blocks):
+            area, first = next(found for found in map(self._place, self._areas, [block] * len(self._areas)) if found)
+            area.blocks.append((number, first, block))
+
+    def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
+        """Take registers that were read.
+
+        Args:
+            area: of the plan.
+            first: register in it.
+            data: their bytes.
+            time_ns: when they came.
+            since_ns: registers that were heard before do not count.
+
+        Returns:
+            The frames that are whole now.
+        """
+        place = self._areas[area]
+        end = first + len(data) // 2
+        place.registers[first:end] = np.frombuffer(data, np.uint8).reshape(-1, 2)
+        place.heard_ns[first:end] = time_ns
+        rows = []
+        for number, begin, block in place.blocks:
+            if begin + block.count <= first or begin >= end:
+                continue
+            oldest_ns = int(place.heard_ns[begin : begin + block.count].min())
+            if oldest_ns > self._told_ns[number] and oldest_ns >= since_ns:
+                self._told_ns[number] = time_ns
+                rows.append(Row(oldest_ns, number, self._bytes(place.registers[begin : begin + block.count], block)))
+        return rows
+
+    def overhear(self, unit: int, question: bytes, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
+        """Take registers that another master has read, as far as they are wanted; see :meth:`put`."""
+        address, count = int.from_bytes(question[1:3], "big"), int.from_bytes(question[3:5], "big")
+        rows: list[Row] = []
+        for number, area in enumerate(self._areas):
+            where, step = area.where, self._wanted.step
+            if (where.unit, where.function) != (unit, question[0]) or (address - where.address) % step:
+                continue
+            place = (address - where.address) // step
+            begin, end = max(0, -place), min(count, where.count - place)
+            if begin < end:
+                rows += self.put(number, place + begin, data[2 * begin : 2 * end], time_ns, since_ns)
+        return rows
+
+    def _place(self, area: _Area, block: Registers) -> tuple[_Area, int] | None:
+        where = area.where
+        first, odd = divmod(block.address - where.address, self._wanted.step)
+        is_in = _key(where) == _key(block) and not odd and 0 <= first <= where.count - block.count
+        return (area, first) if is_in else None
+
+    def _bytes(self, registers: npt.NDArray[np.uint8], block: Registers) -> bytes:
+        """In the order of the layout: the most significant byte first."""
+        if self._wanted.byte_order == "little":
+            registers = registers[:, ::-1]
+        if self._wanted.word_order == "little" and block.words > 1:
+            registers = registers.reshape(-1, block.words, 2)[:, ::-1]
+        return registers.tobytes()
+
+
+__all__ = ["Image", "Order", "Read", "Registers", "Row", "Wanted"]

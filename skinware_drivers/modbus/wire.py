@@ -1,0 +1,247 @@
+"""Modbus as bytes: questions, replies, and what is put around them on a serial line (RTU) and over TCP.
+
+A *message* is what both have in common: a function and its data. Sources: MODBUS Application Protocol Specification
+V1.1b3, MODBUS over Serial Line V1.02, MODBUS Messaging on TCP/IP V1.0b.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from skinware_drivers.counters import FramerCounters
+from skinware_drivers.serial.checksums import CRC16_MODBUS
+
+READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY = 3, 4, 6, 16
+READS = (READ_HOLDING, READ_INPUT)
+WRITES = (WRITE_ONE, WRITE_MANY)
+MOST_REGISTERS, MOST_WRITTEN = 125, 123
+"""Of one read, and of one write."""
+LONGEST_MESSAGE = 253
+FAILED = 0x80
+"""Bit of the function in a reply that is an exception."""
+ACKNOWLEDGE, BUSY = 5, 6
+EXCEPTIONS = {
+    1: "it does not know this function",
+    2: "it has no such registers",
+    3: "it does not take this value, or so many registers",
+    4: "it failed",
+    ACKNOWLEDGE: "it needs more time",
+    BUSY: "it is busy",
+    8: "its memory has a parity error",
+    10: "the gateway has no way to it",
+    11: "it does not answer the gateway",
+}
+_CRC = 2
+_MBAP = struct.Struct(">HHHB")
+
+
+class Message(NamedTuple):
+    """A message of a unit.
+
+    Attributes:
+        unit: address of the device, 0 to 255.
+        data: function and what follows it.
+        number: of its transaction; 0 on serial lines, which have none.
+    """
+
+    unit: int
+    data: bytes
+    number: int = 0
+
+
+def question_to_read(function: int, address: int, count: int) -> bytes:
+    """Ask for registers.
+
+    Raises:
+        ValueError: there is no such question.
+    """
+    if function not in READS or not 1 <= count <= MOST_REGISTERS or not 0 <= address <= 0xFFFF:
+        raise ValueError(f"function {function}, {count} registers from {address}: there is no such question")
+    return struct.pack(">BHH", function, address, count)
+
+
+def reply_size(question: bytes) -> int:
+    """Bytes of the reply to a question, unless it is an exception (which has 2); 0: not known."""
+    if question[0] in READS and len(question) == 5:
+        return 2 + 2 * int.from_bytes(question[3:5], "big")
+    return 5 if question[0] in WRITES else 0
+
+
+def is_reply(question: bytes, reply: bytes) -> bool:
+    """Whether a message can be the reply to a question: a good one, or an exception."""
+    if reply[:1] == bytes([question[0] | FAILED]):
+        return len(reply) == 2
+    if reply[:1] != question[:1] or len(reply) != reply_size(question):
+        return False
+    return reply[1] == len(reply) - 2 if question[0] in READS else reply[1:5] == question[1:5]
+
+
+def exception_of(reply: bytes) -> int:
+    """Code of an exception; 0: it is none."""
+    return reply[1] if reply[0] & FAILED and len(reply) > 1 else 0
+
+
+def exception_text(code: int) -> str:
+    """What an exception means, for people."""
+    return f"{EXCEPTIONS.get(code, 'no known reason')} (exception {code})"
+
+
+def rtu_frame(message: Message) -> bytes:
+    """A message as it is on a serial line."""
+    frame = bytes([message.unit]) + message.data
+    return frame + CRC16_MODBUS.to_bytes(frame)
+
+
+def tcp_frame(message: Message) -> bytes:
+    """A message as it is in a connection."""
+    return _MBAP.pack(message.number, 0, len(message.data) + 1, message.unit) + message.data
+
+
+class TcpMessages:
+    """Finds the messages in what comes over a connection.
+
+    Args:
+        counters: told what is found.
+    """
+
+    def __init__(self, counters: FramerCounters) -> None:
+        self._counters = counters
+        self._rest = b""
+
+    def feed(self, chunk: bytes) -> Iterator[Message]:
+        """The messages that a chunk completes.
+
+        Raises:
+            ValueError: this is no Modbus: nothing that follows can be found either.
+        """
+        self._counters.bytes_in += len(chunk)
+        self._rest += chunk
+        while len(self._rest) >= _MBAP.size:
+            number, protocol, size, unit = _MBAP.unpack_from(self._rest)
+            if protocol or not 2 <= size <= LONGEST_MESSAGE + 1:
+                self._counters.refused += 1
+                self.drop()
+                raise ValueError("what comes over this connection is no Modbus")
+            end = _MBAP.size - 1 + size
+            if len(self._rest) < end:
+                return
+            data, self._rest = self._rest[_MBAP.size : end], self._rest[end:]
+            self._counters.frame_bytes += end
+            self._counters.frames += 1
+            yield Message(unit, data, number)
+
+    def drop(self) -> None:
+        """Forget what was left over."""
+        self._counters.skipped_bytes += len(self._rest)
+        self._rest = b""
+
+
+class RtuMessages:
+    """Finds messages in what comes over a serial line, on which only lengths and checksums tell where they are.
+
+    Args:
+        counters: told what is found.
+    """
+
+    def __init__(self, counters: FramerCounters) -> None:
+        self._counters = counters
+        self._rest = b""
+
+    def feed(self, chunk: bytes) -> None:
+        """Take what has come."""
+        self._counters.bytes_in += len(chunk)
+        self._rest += chunk
+
+    def reply_to(self, unit: int, question: bytes) -> Message | None:
+        """The reply to a question, if it has arrived; what comes before it is skipped."""
+        return self._first([(unit, question)], also_questions=False)
+
+    def next_of(self, asked: Message | None) -> Message | None:
+        """The next message on a line on which others speak: the reply to what was asked before, or a question."""
+        return self._first([] if asked is None else [(asked.unit, asked.data)], also_questions=True)
+
+    def drop(self) -> None:
+        """Forget what was left over."""
+        self._skip(len(self._rest))
+
+    def _first(self, asked: list[tuple[int, bytes]], *, also_questions: bool) -> Message | None:
+        place, rest, was_damaged = 0, self._rest, False
+        while place < len(rest):
+            here = rest[place:]
+            sizes = [size for unit, question in asked for size in _sizes_of_reply(here, unit, question)]
+            if also_questions:
+                sizes.append(_size_of_question(here))
+            whole = [size for size in sizes if 0 < size <= len(here)]
+            for size in whole:
+                if CRC16_MODBUS.of(here[: size - _CRC]) == int.from_bytes(here[size - _CRC : size], "little"):
+                    return self._take(place, size)
+            was_damaged |= bool(whole)
+            if any(size > len(here) for size in sizes):
+                break
+            place += 1
+        self._counters.checksum_errors += was_damaged and place > 0
+        self._skip(place)
+        return None
+
+    def _take(self, place: int, size: int) -> Message:
+        self._skip(place)
+        frame, self._rest = self._rest[:size], self._rest[size:]
+        self._counters.frame_bytes += size
+        self._counters.frames += 1
+        return Message(frame[0], frame[1:-_CRC])
+
+    def _skip(self, count: int) -> None:
+        self._counters.skipped_bytes += count
+        self._rest = self._rest[count:]
+
+
+def _sizes_of_reply(here: bytes, unit: int, question: bytes) -> list[int]:
+    """Bytes of the frames that may begin here and answer a question."""
+    good = bytes([unit]) + question[:1]
+    if question[0] in READS:
+        good += bytes([reply_size(question) - 2])
+    failed = bytes([unit, question[0] | FAILED])
+    sizes = []
+    for begin, size in ((good, 1 + reply_size(question) + _CRC), (failed, 3 + _CRC)):
+        n = min(len(begin), len(here))
+        if here[:n] == begin[:n]:
+            sizes.append(size)
+    return sizes
+
+
+def _size_of_question(here: bytes) -> int:
+    """Bytes of the question that may begin here; 0: none does."""
+    if len(here) < 2:
+        return 8
+    if 1 <= here[1] <= WRITE_ONE:
+        return 8
+    if here[1] not in (15, WRITE_MANY):
+        return 0
+    return 9 + here[6] if len(here) > 6 else 9
+
+
+__all__ = [
+    "ACKNOWLEDGE",
+    "BUSY",
+    "LONGEST_MESSAGE",
+    "MOST_REGISTERS",
+    "MOST_WRITTEN",
+    "READS",
+    "READ_HOLDING",
+    "READ_INPUT",
+    "WRITES",
+    "WRITE_MANY",
+    "WRITE_ONE",
+    "Message",
+    "RtuMessages",
+    "TcpMessages",
+    "exception_of",
+    "exception_text",
+    "is_reply",
+    "question_to_read",
+    "reply_size",
+    "rtu_frame",
+    "tcp_frame",
+]

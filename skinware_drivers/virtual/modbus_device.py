@@ -1,0 +1,153 @@
+"""Emulators of Modbus devices: a unit says which registers it has, and what is in them.
+
+They answer a question in the way in which it was asked, as on a serial line (RTU) or as over TCP, so that one emulator
+serves both. Nothing here is shared with the drivers.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.serial_device import OptionsT, SerialEmulator
+
+_HEADER_OF_TCP = 6
+_READS, _WRITE_ONE, _WRITE_MANY = (3, 4), 6, 16
+_NO_SUCH_FUNCTION, _NO_SUCH_REGISTERS = 1, 2
+_MOST_READ = 125
+_SAMPLE, _ASKED = "sample", "asked"  # in the memory of a device
+
+
+class _Asked(NamedTuple):
+    """A question: with its number over TCP, else None."""
+
+    number: bytes | None
+    unit: int
+    message: bytes
+
+
+class ModbusEmulator(SerialEmulator[OptionsT]):
+    """Emulated Modbus units, whose numbers are their addresses.
+
+    A unit samples its sensors when it is asked for its lowest register, or for others before any sample. Until then,
+    questions for the others are answered from the same sample: a whole round of questions is one burst.
+
+    Attributes:
+        step: by how much the address grows from one register to the next.
+        function: with which the registers are read, 3 or 4.
+    """
+
+    medium = "modbus"
+    step: int = 1
+    function: int = 3
+
+    @abstractmethod
+    def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
+        """What is in the registers while the sensors feel this: address -> 16 bits."""
+
+    def written(self, device: Device, address: int, value: int) -> bool:  # noqa: ARG002
+        """A register is written; tells whether it can be. By default none can."""
+        return False
+
+    # What it need not care about
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """Wait to be asked."""
+
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """Cut questions out of a stream, as on a line or as over TCP."""
+        found: list[bytes] = []
+        while heard:
+            size = _size_on_line(heard) or _size_over_tcp(heard)
+            if size is None:
+                return found, heard
+            if size:
+                found.append(heard[:size])
+            heard = heard[size or 1 :]
+        return found, b""
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        """Obey a question to this unit."""
+        asked = _read(command)
+        if asked.unit != device.number:
+            return None
+        function = asked.message[0]
+        address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
+        if function == self.function and 1 <= count <= _MOST_READ:
+            device.memory[_ASKED] = asked
+            if _SAMPLE not in device.memory or address == min(device.memory[_SAMPLE]):
+                self.burst(device, now_ns)
+                return b""
+            return self._told(device, asked)
+        if function in (_WRITE_ONE, _WRITE_MANY):
+            return self._write(device, asked, address)
+        return _reply(asked, bytes([function | 0x80, _NO_SUCH_FUNCTION]))
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        """A new sample, and the answer to the question that wanted it."""
+        device.memory[_SAMPLE] = self.registers(device, values)
+        return [self._told(device, device.memory[_ASKED])]
+
+    def _told(self, device: Device, asked: _Asked) -> bytes:
+        address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
+        sample: dict[int, int] = device.memory[_SAMPLE]
+        wanted = range(address, address + count * self.step, self.step)
+        if not all(one in sample for one in wanted):
+            return _reply(asked, bytes([asked.message[0] | 0x80, _NO_SUCH_REGISTERS]))
+        data = b"".join(sample[one].to_bytes(2, "big") for one in wanted)
+        return _reply(asked, bytes([asked.message[0], len(data)]) + data)
+
+    def _write(self, device: Device, asked: _Asked, address: int) -> bytes:
+        message = asked.message
+        data = message[3:5] if message[0] == _WRITE_ONE else message[6:]
+        pairs: Any = zip(range(address, address + len(data) // 2), data[::2], data[1::2], strict=True)
+        if all(self.written(device, register, high << 8 | low) for register, high, low in pairs):
+            return _reply(asked, message[:5])
+        return _reply(asked, bytes([message[0] | 0x80, _NO_SUCH_REGISTERS]))
+
+
+def _size_on_line(heard: bytes) -> int:
+    """Bytes of the question as on a line that begins here; 0: none does, as far as is known."""
+    size = 9 + heard[6] if len(heard) > 6 and heard[1] == _WRITE_MANY else 8
+    whole = heard[:size]
+    return size if len(whole) == size and _crc(whole[:-2]) == whole[-2:] else 0
+
+
+def _size_over_tcp(heard: bytes) -> int | None:
+    """Bytes of the question as over TCP that begins here; 0: none can, None: this is not known yet."""
+    if any(heard[2:4]):
+        return 0
+    if len(heard) < _HEADER_OF_TCP:
+        return None
+    size = _HEADER_OF_TCP + int.from_bytes(heard[4:6], "big")
+    if not _HEADER_OF_TCP + 6 <= size <= _HEADER_OF_TCP + 254:
+        return None if len(heard) < 8 else 0  # it may be one of a line that is not whole
+    return size if len(heard) >= size else None
+
+
+def _read(command: bytes) -> _Asked:
+    if _size_on_line(command) == len(command):
+        return _Asked(None, command[0], command[1:-2])
+    return _Asked(command[:2], command[6], command[7:])
+
+
+def _reply(asked: _Asked, message: bytes) -> bytes:
+    told = bytes([asked.unit]) + message
+    if asked.number is None:
+        return told + _crc(told)
+    return asked.number + b"\0\0" + len(told).to_bytes(2, "big") + told
+
+
+def _crc(data: bytes) -> bytes:
+    """Of Modbus: polynomial 8005, reflected, from FFFF, low byte first."""
+    remainder = 0xFFFF
+    for byte in data:
+        remainder ^= byte
+        for _ in range(8):
+            remainder = remainder >> 1 ^ (0xA001 if remainder & 1 else 0)
+    return remainder.to_bytes(2, "little")
+
+
+__all__ = ["ModbusEmulator"]

@@ -1,0 +1,315 @@
+"""Against servers and a client of somebody else's making, over TCP and on lines; and lines that are lost."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+from pymodbus.constants import ExcCodes
+from pymodbus.simulator import SimDevice
+
+from skinware import DriverReader
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.sensor_types import PRESSURE
+from skinware.status import PatchState, Status
+from skinware_drivers import Module, NoOptions, Patch, taxels
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.link import Link
+from skinware_drivers.modbus import ModbusAdapter, Registers
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.operations import operation
+from skinware_drivers.registry import make_bus
+from skinware_drivers.testing.driving import Driving, driving_lines
+from skinware_drivers.testing.waiting import read_until, wait_until
+from tests.commands import running
+from tests.modbus.hands import FINGER_AT, Array
+from tests.modbus.peers import Action, device, line, rtu_server, rtu_server_on, tcp_server
+from tests.streams.peers import LOCAL, free_port, server
+
+N = 300
+pytestmark = pytest.mark.usefixtures("namespace")
+
+
+class Palm(ModbusAdapter[NoOptions]):
+    """300 taxels in one block: three reads."""
+
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint16
+    patches = (Patch("palm", [Module(taxels(N))]),)
+    registers = (Registers(FINGER_AT, N),)
+    period_s = 0.01
+
+    @operation()
+    async def set(self, link: Link, patches: object, address: int, value: int) -> int:
+        """Write a register and read it again."""
+        await self.write(link, address, [value])
+        return int((await self.read(link, address))[0])
+
+
+def palm(action: Action | None = None, unit: int = 1) -> SimDevice:
+    return device(unit, FINGER_AT, range(1000, 1000 + N), action)
+
+
+@contextmanager
+def driven(name: str, adapter: ModbusAdapter[Any] | None = None, **more: Any) -> Iterator[tuple[Driving, DriverReader]]:
+    adapter = adapter or Palm(NoOptions())
+    bus = make_bus(name, payload_size=adapter.payload_size)
+    with driving_lines([(adapter, bus)], "palm", **more) as driving, DriverReader("palm", timeout_s=30) as reader:
+        yield driving, reader
+
+
+def until_right(reader: DriverReader) -> None:
+    right = np.arange(1000, 1000 + N)
+    read_until(reader, lambda frame: not frame.status.any() and (frame.values == right).all())
+
+
+def counted(driving: Driving) -> dict[str, Any]:
+    [bus] = driving.status()["buses"]
+    return dict(bus)
+
+
+@pytest.fixture(params=["tcp", "rtu"])
+def over(request: pytest.FixtureRequest) -> Any:
+    return tcp_server if request.param == "tcp" else rtu_server
+
+
+# Names
+
+
+def test_names() -> None:
+    assert parse_bus_name("modbus:tcp://10.0.0.2") == ("modbus", "tcp://10.0.0.2", {})
+    assert parse_bus_name("modbus:/dev/ttyUSB0?baudrate=9600") == ("modbus", "/dev/ttyUSB0", {"baudrate": "9600"})
+    over_tcp = make_bus("modbus:tcp://10.0.0.2?timeout_ms=5&patience_s=3")
+    assert isinstance(over_tcp, ModbusBus)
+    assert str(over_tcp._address) == "10.0.0.2:502"
+    assert make_bus("modbus:/dev/ttyUSB0?listen=yes").listen_only
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("modbus:tcp://", "which host"),
+        ("modbus:tcp://host:0x10", "HOST:PORT"),
+        ("modbus:tcp://host?baudrate=9600", "unknown option"),
+        ("modbus:tcp://host?listen=yes", "only a line can be tapped"),
+        ("modbus:/dev/ttyUSB0?timeout_ms=0", "timeout_ms"),
+        ("modbus:/dev/ttyUSB0?byte_order=middle", "byte_order"),
+        ("modbus:/dev/ttyUSB0?patience_s=3", "unknown option"),
+    ],
+)
+def test_names_that_are_none(name: str, told: str) -> None:
+    with pytest.raises(ConfigurationError, match=told):
+        make_bus(name)
+
+
+def test_other_drivers_do_not_run_on_it() -> None:
+    with pytest.raises(ConfigurationError, match="is a serial line; Array needs a Modbus line, as modbus:/dev/ttyUSB0"):
+        Array(NoOptions()).fit(make_bus("/dev/ttyUSB0"))
+
+
+# Values
+
+
+def test_a_driver_reads_a_server(over: Any) -> None:
+    with over(palm()) as name, driven(name) as (driving, reader):
+        until_right(reader)
+        counters = counted(driving)
+        assert counters["polls_unanswered"] == counters["errors"] == counters["skipped_bytes"] == 0
+        assert counters["bytes_in"] == counters["frame_bytes"]
+
+
+def test_values_follow_in_the_order_of_the_device(over: Any) -> None:
+    """The server raises all registers before each first read: no frame may be older than the one before, or torn."""
+
+    async def rise(function: int, start: int, address: int, count: int, registers: list[int], _set: object) -> None:
+        if address == FINGER_AT:
+            registers[:] = [registers[0] + 1] * len(registers)
+
+    with over(device(1, FINGER_AT, [0] * N, rise)) as name, driven(name) as (_, reader):
+        newest = 0
+        for _ in range(20):
+            before = newest
+            frame = read_until(reader, lambda frame, before=before: frame.values[0] > before)  # type: ignore[misc]
+            assert (frame.values == frame.values[0]).all()
+            newest = int(frame.values[0])
+
+
+def test_several_units_on_one_line_one_of_them_dead() -> None:
+    class Fingers(ModbusAdapter[NoOptions]):
+        types = Palm.types
+        dtype = np.uint16
+        timeout_s = 0.02
+        patches = tuple(Patch(f"finger {n}", [Module(taxels(4, first_uid=n << 8))], key=n) for n in (1, 2, 3))
+        registers = tuple(Registers(0, 4, unit=n, patch=n, function=4) for n in (1, 2, 3))
+
+    units = [device(n, 0, range(10 * n, 10 * n + 4)) for n in (1, 3)]
+    with rtu_server(*units) as name, driven(name, Fingers(NoOptions()), wait=False) as (driving, reader):
+        frame = read_until(reader, lambda frame: not (frame.status[[0, 1, 2, 3, 8, 9, 10, 11]]).any())
+        assert frame.values[[0, 1, 2, 3, 8, 9, 10, 11]].tolist() == [10, 11, 12, 13, 30, 31, 32, 33]
+        assert (frame.status[4:8] & Status.NEVER_SEEN).all()
+        # this server says that the unit does not answer; a line would be silent
+        wait_until(lambda: counted(driving)["polls_unanswered"] + counted(driving)["errors"] >= 3)
+
+
+def test_exceptions_are_counted_and_values_come_when_they_end() -> None:
+    is_busy = True
+
+    async def act(*_: object) -> ExcCodes | None:
+        return ExcCodes.DEVICE_BUSY if is_busy else None
+
+    with tcp_server(palm(act)) as name, driven(name, wait=False) as (driving, reader):
+        wait_until(lambda: driving.runner is not None and counted(driving)["errors"] > 5)
+        is_busy = False
+        until_right(reader)
+
+
+def test_a_server_that_answers_late_never_shifts_values() -> None:
+    """Every twentieth reply comes late. If another question is open by then, this server gives it its number."""
+    asked = 0
+
+    async def act(*_: object) -> None:
+        nonlocal asked
+        asked += 1
+        await asyncio.sleep(0.15 if asked % 20 == 0 else 0)
+
+    with tcp_server(palm(act)) as name, driven(f"{name}?timeout_ms=100") as (driving, reader):
+        right = np.arange(1000, 1000 + N)
+        wait_until(lambda: counted(driving)["refused"] > 2)
+        for _ in range(50):
+            frame = read_until(reader, lambda frame: True)
+            fresh = (frame.status & Status.NEVER_SEEN) == 0
+            assert (frame.values[fresh] == right[fresh]).all()
+
+
+def test_two_programs_on_one_server() -> None:
+    with tcp_server(palm()) as name, driven(name) as (driving, reader):
+        host, port = name.removeprefix("modbus:tcp://").split(":")
+        with ModbusTcpClient(host, port=int(port)) as other:
+            for _ in range(50):
+                answer = other.read_holding_registers(FINGER_AT, count=10, device_id=1)
+                assert answer.registers == list(range(1000, 1010))
+        until_right(reader)
+        assert counted(driving)["refused"] == 0
+
+
+def test_a_driver_may_write_and_is_told_of_exceptions(over: Any) -> None:
+    with over(palm()) as name, driven(name) as (_, reader):
+        until_right(reader)
+        [answer] = reader.call("set", address=FINGER_AT + 9, value=77).values()
+        assert answer == 77
+        with pytest.raises(Exception, match="no such registers"):
+            reader.call("set", address=9, value=77)
+
+
+# Lines that are lost, and other troubles
+
+
+def test_a_server_that_ends_is_called_again() -> None:
+    port = free_port()
+    with contextlib.ExitStack() as stack:
+        with tcp_server(palm(), port=port) as name:
+            driving, reader = stack.enter_context(driven(name))
+            until_right(reader)
+        read_until(reader, lambda frame: (frame.patch_state == PatchState.STALE).all())
+        assert counted(driving)["state"] == "gone"
+        with tcp_server(palm(), port=port):
+            until_right(reader)
+
+
+def test_half_a_reply_and_then_nothing() -> None:
+    with server() as peer:
+        bus = make_bus(f"modbus:tcp://{LOCAL}:{peer.port}?timeout_ms=20", payload_size=600)
+        Palm(NoOptions()).fit(bus)
+        bus.open()
+        try:
+            caller = peer.answer()
+            batch = FrameBatch(8, 600)
+
+            def take() -> None:
+                with contextlib.suppress(BlockingIOError):
+                    bus.receive(batch, 0)
+
+            def next_question() -> bytes:
+                caller.settimeout(0.01)
+                for _ in range(1000):
+                    take()
+                    with contextlib.suppress(TimeoutError):
+                        return caller.recv(12)
+                raise AssertionError("it asks nothing")
+
+            first = next_question()
+            reply = first[:4] + struct.pack(">HBBB", 253, 1, 3, 250) + bytes(250)
+            caller.sendall(reply[:100])
+            second = next_question()
+            assert second[:2] != first[:2]
+            assert bus.counters.polls_unanswered == 1
+            caller.sendall(reply[100:])  # late, and whole now
+            wait_until(lambda: bus.receive(batch, 0) == 0 and bus.counters.refused == 1)
+            assert bus.counters.framing.skipped_bytes == 0
+            caller.sendall(b"HTTP/1.1 400 Bad Request")
+            with pytest.raises(BusNotAvailable, match="no Modbus"):
+                wait_until(lambda: bus.receive(batch, 0) == -1)
+        finally:
+            bus.close()
+
+
+def test_what_cannot_be_sent_is_refused() -> None:
+    with tcp_server(palm()) as name:
+        bus = make_bus(name, payload_size=600)
+        with pytest.raises(BusSendError, match="not open"):
+            bus.send(1, b"\x03\0\0\0\1")
+        bus.open()
+        for unit, message in ((1, b"\x2b\x0e\1\0"), (1, b""), (300, b"\x03\0\0\0\1")):
+            with pytest.raises(BusSendError, match="cannot be sent"):
+                bus.send(unit, message)
+        bus.close()
+        assert bus.fileno() == -1
+
+
+# Listening
+
+
+def test_the_traffic_of_another_master_is_shown_and_nothing_is_sent() -> None:
+    stop = threading.Event()
+    with line() as between, rtu_server_on(between.other, palm()):
+
+        def ask() -> None:
+            with ModbusSerialClient(between.one, baudrate=115_200, timeout=1) as master:
+                while not stop.is_set():
+                    for first in range(0, N, 100):
+                        master.read_holding_registers(FINGER_AT + first, count=100, device_id=1)
+                    master.write_register(FINGER_AT + N - 1, 1000 + N - 1, device_id=1)
+                    time.sleep(0.005)
+
+        master = threading.Thread(target=ask)
+        master.start()
+        try:
+            with driven(f"modbus:{between.tap}?listen=yes", wait=False) as (driving, reader):
+                until_right(reader)
+                assert counted(driving)["sent"] == 0
+        finally:
+            stop.set()
+            master.join(30)
+        assert between.from_tap == b""
+
+
+# Commands
+
+
+def test_the_commands() -> None:
+    name, file = f"modbus:tcp://{LOCAL}:{free_port()}", str(Path(__file__).parent / "array_file.py")
+    with running("skin-emulate", "--driver", file, "--bus", name) as devices:
+        devices.wait_for("ready")
+        with running("skin-driver", "--driver", file, "--bus", name) as driver:
+            driver.wait_for("status", lambda event: event["buses"][0]["state"] == "live")

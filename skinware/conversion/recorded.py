@@ -81,7 +81,8 @@ class RecordedSource:
     def problems(self) -> list[str]:
         """Likewise."""
         cut = [] if self._recording.is_whole else ["cut off or damaged: converted as far as it is whole"]
-        return [f"{self.path}: {problem}" for problem in [*cut, *self._recording.problems]]
+        wires = ["what went over buses is left out: candump and pcapng hold it"] if self._recording.wires else []
+        return [f"{self.path}: {problem}" for problem in [*cut, *self._recording.problems, *wires]]
 
     def close(self) -> None:
         """Likewise."""

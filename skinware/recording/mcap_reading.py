@@ -188,11 +188,12 @@ class McapSource:
         places = []
         for kind, record in _records(self._data[start:footer_at]):
             if kind == Opcode.CHUNK_INDEX:
-                place = self._chunk_at(*_chunk_index(record))
+                start_ns, end_ns, offset, channel_ids = _chunk_index(record)
+                place = self._chunk_at(offset, channel_ids)
                 if place is None:
                     raise Damaged("a chunk is not where the summary says")
                 # times before a chunk have no checksum, those of the summary have
-                places.append(replace(place, start_ns=index.message_start_time, end_ns=index.message_end_time))
+                places.append(replace(place, start_ns=start_ns, end_ns=end_ns))
             elif kind == Opcode.CHANNEL:
                 channel = _read(Channel, record)
                 self.channels[channel.id] = channel
@@ -283,16 +284,16 @@ def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at += length
 
 
-def _chunk_index(record: memoryview) -> tuple[int, frozenset[int]]:
-    """Where a chunk begins, and the ids of its channels. An hour has some 14,000 of these records.
+def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
+    """When the messages of a chunk begin and end, where it begins, and the ids of its channels. An hour has some 14,000 of these records.
 
     Raises:
         Damaged: it is not one.
     """
     try:
-        _, _, offset, _, size = _CHUNK_INDEX.unpack_from(record)
+        start_ns, end_ns, offset, _, size = _CHUNK_INDEX.unpack_from(record)
         channels = _MESSAGE_INDEX.iter_unpack(record[_CHUNK_INDEX.size : _CHUNK_INDEX.size + size])
-        return offset, frozenset(channel for channel, _ in channels)
+        return start_ns, end_ns, offset, frozenset(channel for channel, _ in channels)
     except struct.error as error:
         raise Damaged(f"a record cannot be read ({error})") from None
 

@@ -178,9 +178,10 @@ class WireSender:
         for _, _, recorded in wires:
             recorded.skip(begin_ns)
         while not self._stopping:
-            for name, bus, recorded in wires:
-                for frame in recorded.emit(time.monotonic_ns()):
-                    self._send(name, bus, frame.identifier, frame.payload)
+            now_ns = time.monotonic_ns()
+            due_now = [(frame, name, bus) for name, bus, recorded in wires for frame in recorded.emit(now_ns)]
+            for frame, name, bus in sorted(due_now, key=lambda one: one[0].time_ns):
+                self._send(name, bus, frame.identifier, frame.payload)
             dues = [due for _, _, recorded in wires if (due := recorded.next_due_ns()) is not None]
             if not dues:
                 return

@@ -52,7 +52,7 @@ class RecordedWire:
         first_ns: time of the recording, CLOCK_MONOTONIC of then, at which it begins.
         speed: 2.0: twice as fast.
         waits: for the questions that were asked when it was recorded.
-        name: for messages.
+        name: that the end is logged under; empty: it is not.
     """
 
     def __init__(
@@ -136,7 +136,8 @@ class RecordedWire:
         self._next = next(self._items, None)
         if self._next is None and not self._is_over:
             self._is_over = True
-            log.warning("%s: the recording is over", self._name)
+            if self._name:
+                log.warning("%s: the recording is over", self._name)
 
 
 def _kind(item: WireItem) -> int:

@@ -16,6 +16,7 @@ import pytest
 
 import skinware.recording
 from skinware import Namespace, ServiceWriter
+from skinware.conversion import convert
 from skinware.memory.announcement import is_wished
 from skinware.memory.segments import living_inode
 from skinware.recording import WireTrack
@@ -24,7 +25,10 @@ from skinware.recording.recovery import recover
 from skinware.recording.topics import Channels
 from skinware.wire import COLUMNS, IS_CUT, IS_FD, KIND, WISH, service_name
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch
+from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.pythoncan import PythonCanBus
+from skinware_drivers.layout import Frame as FrameKind
+from skinware_drivers.layout import Identifier, Layout, Values
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import NoOptions
 from skinware_drivers.testing.driving import Driving, driving_lines, emulated_skin
@@ -121,9 +125,45 @@ def test_a_can_bus_is_recorded_with_everything_on_it(path: Path, cable: Cable, w
         assert (np.diff(frames["time_ns"]) >= 0).all()
         assert before_ns - 1_000_000 <= frames["epoch_ns"][0]
         assert frames["epoch_ns"][-1] <= after_ns + 1_000_000
+        notes = convert(path, None, "npz").notes
+        assert notes == [f"{path}: what went over wires is left out: candump and pcapng have it"]
         # the times of the frames are those by which the driver decoded them
         series = opened["tip"].read(["module_time_ns"])
         assert set(series.column("module_time_ns").ravel().tolist()) - {0} <= set(frames["time_ns"].tolist())
+
+
+class FdTip(CanAdapter[NoOptions]):
+    """Tip, with CAN FD frames of 12 bytes."""
+
+    types, dtype, patches, period_s = Tip.types, Tip.dtype, Tip.patches, Tip.period_s
+    layout = Layout([FrameKind("all", [Identifier(TIP_IDENTIFIER)], length=(12,), values=Values(4, "u1", 8))])
+
+
+@pytest.mark.parametrize("way", [EndOfCable, ForPython])
+def test_frames_of_a_can_fd_bus_are_recorded_as_far_as_their_driver_knows_them(
+    path: Path, cable: Cable, way: type[EndOfCable]
+) -> None:
+    bus = way(cable.end)
+    bus.payload_size = FdTip.layout.payload_size
+    driver = driving_lines([(FdTip(NoOptions()), bus)], "tip", bus_names=["can0"], wait=False)
+    long, short = bytes(range(64)), bytes(range(12))
+    with recording(path, with_wires=True) as recorder, driver:
+        cable.out.send(struct.pack("=IBB2x64s", 0x100, 64, 3, long))  # what it leaves behind is in no later frame
+        cable.out.send(struct.pack("=IBB2x64s", TIP_IDENTIFIER, 12, 1, short))
+        cable.out.send(struct.pack("=IBB2x64s", 0x101, 2, 0, b"ab"))
+        cable.put(0x102, b"abc")
+        is_recorded(recorder)
+        wait_until(lambda: bus.counters.frames == 3)
+    with skinware.recording.open(path) as opened:
+        (wire,) = opened.wires
+        frames = wire.frames()
+        assert frames_of(wire) == [
+            (False, 0x100, 3 | IS_FD | IS_CUT, long[:16]),
+            (False, TIP_IDENTIFIER, 1 | IS_FD, short),
+            (False, 0x101, IS_FD, b"ab"),
+            (False, 0x102, 0, b"abc"),
+        ]
+        assert all(not row["payload"][row["length"] :].any() for row in frames)
 
 
 def test_part_of_the_time(path: Path, cable: Cable) -> None:

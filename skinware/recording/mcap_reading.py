@@ -285,7 +285,9 @@ def _records(data: memoryview) -> Iterator[tuple[int, memoryview]]:
 
 
 def _chunk_index(record: memoryview) -> tuple[int, int, int, frozenset[int]]:
-    """When the messages of a chunk begin and end, where it begins, and the ids of its channels. An hour has some 14,000 of these records.
+    """When the messages of a chunk begin and end, where it begins, and the ids of its channels.
+
+    An hour has some 14,000 of these records.
 
     Raises:
         Damaged: it is not one.

@@ -8,6 +8,7 @@ group of a namespace may read that.
 
 from __future__ import annotations
 
+import hashlib
 import hmac
 import ipaddress
 import os
@@ -17,8 +18,6 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, parse_qsl, urlencode, urlsplit
 
 from skinware.views.peers import account_of
-
-_COOKIE = "skin-view"
 
 
 class Refused(Exception):
@@ -43,6 +42,8 @@ class Access:
 
     def __init__(self, host: str, token: str | None = None) -> None:
         self.token = token
+        # browsers have one set of cookies for all ports of a machine
+        self._cookie_name = f"skin-view-{hashlib.sha256((token or '').encode()).hexdigest()[:8]}"
         self._hosts = None if not is_loopback(host) else {"localhost", "127.0.0.1", "::1", host.lower()}
 
     def check(self, target: str, headers: Mapping[str, str]) -> None:
@@ -54,16 +55,18 @@ class Access:
 
         Raises:
             Refused: it may not.
+            ValueError: something in it cannot be an address.
         """
         host = _only(headers, "Host")
-        name = _host_of(f"http://{host}")
-        if name is None or (self._hosts is not None and name not in self._hosts):
+        name = urlsplit(f"http://{host}").hostname
+        if not host or (self._hosts is not None and name not in self._hosts):
             raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so: open the address that skin-view printed")
         origin = _only(headers, "Origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             raise Refused(HTTPStatus.FORBIDDEN, "pages of other sites may not see this skin")
         if self.token is not None and not (
-            self.has_token(target) or hmac.compare_digest(_cookie(headers).encode(), self.token.encode())
+            self.has_token(target)
+            or hmac.compare_digest(_cookie(headers, self._cookie_name).encode(), self.token.encode())
         ):
             raise Refused(HTTPStatus.UNAUTHORIZED, "open the address that skin-view printed, with its token")
 
@@ -93,7 +96,7 @@ class Access:
     @property
     def cookie(self) -> str:
         """By which a browser keeps the token, out of sight of the page."""
-        return f"{_COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
 
 def is_loopback(host: str) -> bool:
@@ -112,16 +115,9 @@ def _only(headers: Mapping[str, str], name: str) -> str | None:
         raise Refused(HTTPStatus.BAD_REQUEST, f"more than one {name}") from None
 
 
-def _host_of(url: str) -> str | None:
+def _cookie(headers: Mapping[str, str], name: str) -> str:
     try:
-        return urlsplit(url).hostname
-    except ValueError:
-        return None
-
-
-def _cookie(headers: Mapping[str, str]) -> str:
-    try:
-        found = SimpleCookie(_only(headers, "Cookie") or "").get(_COOKIE)
+        found = SimpleCookie(_only(headers, "Cookie") or "").get(name)
     except CookieError:
         return ""
     return "" if found is None else found.value

@@ -120,6 +120,8 @@ class ViewServer:
             return self._file(path, request)
         except Refused as refused:
             return _response(refused.status, f"{refused}\n".encode(), "text/plain")
+        except ValueError:  # of what cannot be an address
+            return _response(HTTPStatus.BAD_REQUEST, b"", "text/plain")
 
     def _file(self, path: str, request: Request) -> Response:
         if path == "/" and self._access.has_token(request.path):  # kept by the browser, and out of the address

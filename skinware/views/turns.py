@@ -204,7 +204,7 @@ class Viewer:
         if picture.shear is not None:
             told |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
         contact_of = driver.contact_of(quantity)
-        if contact_of is not None:
+        if contact_of is not None and (contact_of >= 0).any():
             told["contact_of"] = blobs.add(contact_of, "i1")
         status, key = driver.status[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.structure import Index, Structure
+from skinware.tactile.neighbours import pitch_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,7 @@ class Quantity:
         type: of the value: of three axes the one along the normal.
         index: (n,) int64, positions in a frame of the n sensors that tell the values.
         where: the same, as a slice where it is one.
+        geometry: places of the n taxels.
         shear: (n, 2) int64, positions of those that tell the two axes within the skin, -1 where there is none; None
             where the skin has no such sensors.
     """
@@ -28,10 +32,18 @@ class Quantity:
     type: SensorType
     index: npt.NDArray[np.int64]
     where: Index
+    geometry: Geometry
     shear: npt.NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.index)
+
+    @cached_property
+    def pitch_m(self) -> float:
+        """From a taxel to the nearest other, usually, m; NaN where places are not known."""
+        pitch = pitch_m(self.geometry)
+        pitch = pitch[pitch > 0]
+        return float(np.median(pitch)) if len(pitch) else float("nan")
 
 
 def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
@@ -52,10 +64,19 @@ def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
             types[name],
             positions[structure.index(name)],
             structure.index(name),
+            _geometry(structure, name),
             _beside(structure, name, axes[name]) if name in axes else None,
         )
         for name in shown
     )
+
+
+def _geometry(structure: Structure, name: str) -> Geometry:
+    where = structure.index(name)
+    if structure.geometry is not None:
+        return structure.geometry[where]
+    uid = structure.sensor_uid[where]
+    return Geometry.unknown([name] * len(uid), uid)
 
 
 def _beside(structure: Structure, name: str, axes: tuple[str, str]) -> npt.NDArray[np.int64]:

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.structure import Structure
-from skinware.tactile.neighbours import pitch_m
 from skinware.views.quantities import Quantity
 from skinware.views.shapes import shape_of
 
@@ -100,16 +99,13 @@ class Scene:
         return max(0.0, float(self._right + gap - left))
 
     def _place(self, driver: str, structure: Structure, quantities: Sequence[Quantity]) -> None:
-        geometries = [_geometry(structure, quantity) for quantity in quantities]
-        flat = [
-            laid_out(structure, quantity.index[~geometry.known])
-            for quantity, geometry in zip(quantities, geometries, strict=True)
-        ]
+        flat = [laid_out(structure, quantity.index[~quantity.geometry.known]) for quantity in quantities]
         width = max((float(places[:, 0].max()) for places in flat if len(places)), default=None)
         shift = 0.0 if width is None else self._way_right(0.0, width)
         if width is not None:
             self._right = max(self._right, shift + width)
-        for quantity, geometry, places in zip(quantities, geometries, flat, strict=True):
+        for quantity, places in zip(quantities, flat, strict=True):
+            geometry = quantity.geometry
             position, normal = geometry.position_m.copy(), geometry.normal.copy()
             for frame in _frames(geometry):
                 rows, pose = geometry.known & (geometry.frame == frame), self.pose(frame)
@@ -117,21 +113,13 @@ class Scene:
                 normal[rows] = normal[rows] @ pose[:3, :3].T
             position[~geometry.known] = places + np.array([shift, 0, 0])
             normal[~geometry.known] = 0, 0, 1
-            pitch = pitch_m(geometry)
-            pitch = pitch[pitch > 0]
             self._placed[driver, quantity.name] = Placed(
                 position.astype(np.float32),
                 normal.astype(np.float32),
                 geometry.radius_m.astype(np.float32),
                 bool(2 * geometry.known.sum() > len(quantity)),
-                float(np.median(pitch)) if len(pitch) else FLAT_PITCH_M,
+                FLAT_PITCH_M if np.isnan(quantity.pitch_m) else quantity.pitch_m,
             )
-
-
-def _geometry(structure: Structure, quantity: Quantity) -> Geometry:
-    if structure.geometry is not None:
-        return structure.geometry[quantity.index]
-    return Geometry.unknown([quantity.type.name] * len(quantity), structure.sensor_uid[quantity.index])
 
 
 def _frames(geometry: Geometry) -> list[str]:

@@ -176,16 +176,12 @@ class Look:
         self, driver: Followed, quantity: Quantity, watched: _Watched
     ) -> tuple[npt.NDArray[np.int8] | None, float]:
         """How far the two axes within the skin are from rest."""
-        if quantity.shear is None or driver.frame is None:
+        if not quantity.axes or driver.frame is None:
             return None, 0.0
         values = driver.all_physical()
         from_rest = np.where(quantity.shear >= 0, (values - watched.rest.baseline)[quantity.shear], np.float32(0))
         lengths = np.nan_to_num(np.linalg.norm(from_rest, axis=1))
-        noise = max(
-            watched.rest.noise(one.name)
-            for one in driver.structure.types
-            if one.id in driver.structure.sensor_type[quantity.shear[0]]
-        )
+        noise = max(map(watched.rest.noise, quantity.axes))
         longest = watched.spans.setdefault((quantity.name, "shear"), ChangeSpan()).follow(
             lengths, noise, driver.frame.published_ns
         )

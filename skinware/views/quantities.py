@@ -24,8 +24,8 @@ class Quantity:
         index: (n,) int64, positions in a frame of the n sensors that tell the values.
         where: the same, as a slice where it is one.
         geometry: places of the n taxels.
-        shear: (n, 2) int64, positions of those that tell the two axes within the skin, -1 where there is none; None
-            where the skin has no such sensors.
+        axes: names of the types of the two axes within the skin; none where the skin has no such sensors.
+        shear: (n, 2) int64, positions of the sensors of these axes, -1 where there is none.
     """
 
     name: str
@@ -33,7 +33,8 @@ class Quantity:
     index: npt.NDArray[np.int64]
     where: Index
     geometry: Geometry
-    shear: npt.NDArray[np.int64] | None = None
+    axes: tuple[str, ...]
+    shear: npt.NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.index)
@@ -65,7 +66,8 @@ def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
             positions[structure.index(name)],
             structure.index(name),
             _geometry(structure, name),
-            _beside(structure, name, axes[name]) if name in axes else None,
+            axes.get(name, ()),
+            _beside(structure, name, axes.get(name, ())),
         )
         for name in shown
     )
@@ -79,15 +81,15 @@ def _geometry(structure: Structure, name: str) -> Geometry:
     return Geometry.unknown([name] * len(uid), uid)
 
 
-def _beside(structure: Structure, name: str, axes: tuple[str, str]) -> npt.NDArray[np.int64]:
-    """(n, 2) positions of the sensors of two axes that have the uids of those of a type."""
+def _beside(structure: Structure, name: str, axes: tuple[str, ...]) -> npt.NDArray[np.int64]:
+    """(n, 2) positions of the sensors of two axes that have the uids of those of a type; (n, 0) without axes."""
     uid = structure.sensor_uid[structure.index(name)].tolist()
     columns = []
     for axis in axes:
         positions = np.arange(structure.n_sensors)[structure.index(axis)].tolist()
         of_uid = dict(zip(structure.sensor_uid[positions].tolist(), positions, strict=True))
         columns.append([of_uid.get(one, -1) for one in uid])
-    return np.array(columns, np.int64).T
+    return np.array(columns, np.int64).reshape(len(axes), len(uid)).T
 
 
 __all__ = ["Quantity", "quantities_of"]

@@ -336,7 +336,7 @@ def _driver(driver: Followed, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "placed": placed.is_known,
                 "neighbour_spacing_m": placed.spacing_m,
             }
-            | ({"axes": ["x", "y", "z"]} if quantity.shear is not None else {})
+            | ({"axes": ["x", "y", "z"]} if quantity.axes else {})
         )
     kinds = [kind.decode() for kind in structure.module_kind.tolist()]
     return {

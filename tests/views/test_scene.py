@@ -113,7 +113,7 @@ def test_frames_lie_beside_each_other_or_where_they_are_said_to_be() -> None:
 def test_three_axes_are_one_picture() -> None:
     (force,) = quantities_of(structure_of([(0, "4x6", 24)], FORCE))
     assert (force.name, force.type.name) == ("force", "force_z")
-    assert force.shear is not None
+    assert force.axes == ("force_x", "force_y")
     assert force.index.tolist() == list(range(2, 72, 3))
     assert force.shear.tolist() == [[at, at + 1] for at in range(0, 72, 3)]
     names = [quantity.name for quantity in quantities_of(structure_of([(0, "", 2)], (*MAGNETIC_FIELD, TEMPERATURE)))]
@@ -122,7 +122,7 @@ def test_three_axes_are_one_picture() -> None:
 
 def test_shear_belongs_to_pressure() -> None:
     (pressure,) = quantities_of(structure_of([(0, "", 2)], (SHEAR_X, SHEAR_Y, PRESSURE)))
-    assert pressure.shear is not None
+    assert pressure.axes == ("shear_x", "shear_y")
     assert pressure.shear.tolist() == [[0, 1], [3, 4]]
     incomplete = structure_of([(0, "", 2)], (SHEAR_X, PRESSURE))
     assert [quantity.name for quantity in quantities_of(incomplete)] == ["shear_x", "pressure"]

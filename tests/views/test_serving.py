@@ -10,6 +10,7 @@ import pytest
 
 from skinware import Namespace, Status
 from skinware.geometry import Geometry
+from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import rest
 from skinware.views.robot import Robot
@@ -19,6 +20,7 @@ from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, pu
 from tests.tactile.skins import triangles
 from tests.views.client import Page, page_of
 from tests.views.conftest import Serve
+from tests.views.test_scene import structure_of
 
 
 def types(page: Page, driver: int = 0) -> dict[str, dict[str, object]]:
@@ -236,6 +238,22 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         assert np.flatnonzero(picture["contact_of"] >= 0).tolist() == [2, 3]
         assert page.status[0, "pressure"][9] & Status.UNHEALTHY
         assert types(page)["pressure"]["placed"]
+
+
+def test_shear_is_how_far_two_axes_are_from_rest(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rest, "SETTLING_S", 0.1)
+    skin = FakeSkin("finger", structure_of([(0, "2x3", 6)], FORCE))
+    skin.values = np.arange(18) * 10
+    with publishing(skin), serving() as url, page_of(url) as page:
+        for _ in range(5):
+            assert not page.pull_picture()["shear"].any()
+        assert types(page)["force"]["axes"] == ["x", "y", "z"]
+        skin.values = skin.values + np.where(np.arange(18) == 9, 50, 0) - np.where(np.arange(18) == 10, 100, 0)
+        picture = page.pull_picture(condition=lambda picture: picture["longest_shear"] > 100)
+        assert np.flatnonzero(picture["shear"].any(axis=1)).tolist() == [3]
+        x, y = picture["shear"][3] / 127 * picture["longest_shear"]
+        assert (x, y) == (pytest.approx(50, abs=3), pytest.approx(-100, abs=3))
+        assert picture["type"] == "force"
 
 
 def test_two_look_differently_at_the_same(serving: Serve) -> None:

@@ -187,19 +187,3 @@ function smallestStep(position) {
   }
   return best === Infinity ? 0 : best;
 }
-
-/** Smallest and greatest coordinates of some taxels: [x, y, z, x, y, z], m; null of none. */
-export function boxOf(sheets, isIn = () => true) {
-  const box = [Infinity, Infinity, Infinity, -Infinity, -Infinity, -Infinity];
-  for (const sheet of sheets) {
-    for (let i = 0; i < sheet.n; i++) {
-      if (!isIn(sheet, i)) continue;
-      for (let c = 0; c < 3; c++) {
-        const x = sheet.position[3 * i + c];
-        if (x < box[c]) box[c] = x;
-        if (x > box[3 + c]) box[3 + c] = x;
-      }
-    }
-  }
-  return box[0] === Infinity ? null : box;
-}

@@ -54,6 +54,8 @@ export class Wipe {
   update(told) {
     if (!told) return;
     this.told = told;
+    this.isRunning = told.running ?? this.isRunning;
+    setText(this.run, this.isRunning ? "Stop" : "Start anew");
     setText(this.text, `${count(told.touched)} of ${count(told.of)} touched`);
     this.meter.max = Math.max(told.of, 1);
     this.meter.value = told.touched;

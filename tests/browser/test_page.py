@@ -253,6 +253,13 @@ def test_a_fixed_scale_is_asked_for_and_forgotten(page: Page, server: FakeServer
     wait_until(lambda: server.look["scale"] is None)
 
 
+def test_an_address_of_another_skin_shows_this_one(server: FakeServer, open_page: OpenPage) -> None:
+    page = open_page(f"{server.url}#type=force&mode=dream&selected=default/gone&pin=default/gone:force:1&pin=x")
+    until(page, f"{READY} && skin.type === 'pressure' && skin.mode === 'raw'")
+    assert tell(page, "[skin.pixelOf(0, 0).length, skin.stateOf(0, 0).dimmed, skin.pins.length]") == [2, False, 0]
+    wait_until(lambda: asked(server, "look")[-1]["type"] is None)
+
+
 def test_a_malformed_turn_is_survived(page: Page, server: FakeServer, troubles: Troubles) -> None:
     """The page says nothing of it and connects again; it does not go blank for ever."""
     troubles.expected = ("uncaught",)

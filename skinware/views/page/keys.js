@@ -4,7 +4,7 @@ import { h } from "./dom.js";
 import { FRESH, MARKS } from "./marks.js";
 import { picture } from "./legend.js";
 
-export const KEYS = [
+const KEYS = [
   ["1 2 3 4", "values, change, peaks, wipe test"],
   ["t", "next type of sensor"],
   ["b", "zero: what is felt now becomes rest"],

@@ -61,7 +61,13 @@ const stage = new Stage(byId("stage"), {
   sharp: wanted.sharp,
   theme: view.theme,
   drawOver: (its) =>
-    overlay.draw(its, { theme: view.theme, normals: view.normals, contacts: now.contacts, hovered: probes.hovered, pins: probes.pins }),
+    overlay.draw(its, {
+      theme: view.theme,
+      normals: view.normals,
+      contacts: now.contacts,
+      hovered: probes.hovered,
+      pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
+    }),
   moved: () => keep(),
   resized: () => now.isAlive && frameAll(true),
   changed: () => notify(stage.isSolid ? "" : "WebGL is lost: drawn without it"),
@@ -128,7 +134,6 @@ function turn(message) {
   now.turn = header.turn;
   if (header.error) notify(header.error);
   if (skin.take(header, told.blob)) restructured();
-  if (header.names) skin.sheet(header.names.driver, header.names.type).names = header.names.of;
   if (header.state) takeState(header.state);
   if (header.wipe) now.wipe = header.wipe;
   now.contacts = touches.update(skin, { contacts: lastOf("contacts", header), regions: lastOf("regions", header) });
@@ -154,6 +159,10 @@ function restructured() {
   past.keepOnly(skin.sheets());
   for (const id of states.keys()) if (!skin.drivers.has(id)) states.delete(id);
   for (const name of Object.keys(newest)) delete newest[name];
+  if (view.type && skin.types().length && !skin.types().includes(view.type)) {
+    view.type = null; // of another skin
+    sendLook();
+  }
   fillTypes();
   sheetsChanged();
   probes.find(skin, wanted.pins ?? probes.keys);

@@ -10,7 +10,7 @@ export const MASKED = 6;
 export const NEVER_SEEN = 7;
 export const NOT_CONNECTED = 8;
 export const UNTOUCHED = 9;
-export const WITHOUT_VALUE = 10;
+const WITHOUT_VALUE = 10;
 
 export const DIMMED = 0x80; // beside the mark: not part of what is selected
 

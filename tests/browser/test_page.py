@@ -159,15 +159,16 @@ def test_a_replay_is_controlled(page: Page, server: FakeServer) -> None:
     panel = page.locator(role("replay"))
     panel.wait_for()
     assert "0:03.0 of 1:00.0" in panel.inner_text()
-    for name in ("Pause", "Step", "Loop"):
+    for name in ("Pause", "Back", "Step", "Loop"):
         panel.get_by_role("button", name=name).click()
     assert panel.locator("select").input_value() == "1.5"
     panel.locator("select").select_option("4")
     panel.locator("input").evaluate("slider => { slider.value = 30; slider.dispatchEvent(new Event('change')) }")
-    wait_until(lambda: len(asked(server, "replay")) == 5)
+    wait_until(lambda: len(asked(server, "replay")) == 6)
     assert [(one["action"], one["value"]) for one in asked(server, "replay")] == [
         ("pause", None),
-        ("step", None),
+        ("step", -1),
+        ("step", 1),
         ("loop", True),
         ("speed", 4),
         ("seek", 30),
@@ -206,7 +207,7 @@ def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: Fa
     place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9, "driver": 0}
     server.extra["contacts"] = [contact | place]
     until(page, "skin.contacts.length === 1 && skin.contacts[0].id === 12")
-    assert "12\thold\t31.5 counts" in page.locator("#contacts").inner_text()
+    assert "12\thold\t31.5\t0\t2" in page.locator("#contacts").inner_text()
     page.wait_for_timeout(200)
     after = look(page)
     for taxel in (20, 65):
@@ -252,6 +253,13 @@ def test_a_fixed_scale_is_asked_for_and_forgotten(page: Page, server: FakeServer
     wait_until(lambda: server.look["scale"] is None)
 
 
+def test_an_address_of_another_skin_shows_this_one(server: FakeServer, open_page: OpenPage) -> None:
+    page = open_page(f"{server.url}#type=force&mode=dream&selected=default/gone&pin=default/gone:force:1&pin=x")
+    until(page, f"{READY} && skin.type === 'pressure' && skin.mode === 'raw'")
+    assert tell(page, "[skin.pixelOf(0, 0).length, skin.stateOf(0, 0).dimmed, skin.pins.length]") == [2, False, 0]
+    wait_until(lambda: asked(server, "look")[-1]["type"] is None)
+
+
 def test_a_malformed_turn_is_survived(page: Page, server: FakeServer, troubles: Troubles) -> None:
     """The page says nothing of it and connects again; it does not go blank for ever."""
     troubles.expected = ("uncaught",)
@@ -273,7 +281,7 @@ def test_everything_has_a_name_and_is_reached_by_keys(server: FakeServer, open_p
         ).map(one => one.outerHTML.slice(0, 80))"""
         assert tell(page, unnamed) == []
         reached = set()
-        for _ in range(40):
+        for _ in range(18):
             page.keyboard.press("Tab")
             reached.add(tell(page, "document.activeElement.dataset.role ?? document.activeElement.id"))
         assert {"mode", "record", "row", "stage", "pause", "past", "help"} <= reached

@@ -4,7 +4,7 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`; what is missing is left out.
+ *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`, `flat`, `sharp`; what is missing is left out.
  */
 export function toHash(view) {
   const parts = new URLSearchParams();
@@ -14,12 +14,15 @@ export function toHash(view) {
   if (view.scale) parts.set("scale", numbers(view.scale));
   if (view.selected) parts.set("selected", view.selected);
   for (const pin of view.pins ?? []) parts.append("pin", pin);
-  if (view.normals) parts.set("normals", "1");
   if (view.theme) parts.set("theme", view.theme);
+  for (const how of ["normals", "flat", "sharp"]) if (view[how]) parts.set(how, "1");
   return `#${parts}`;
 }
 
-/** The view of a hash; what is not in it, or not understood, is left out. */
+/**
+ * The view of a hash; what is not in it, or not understood, is left out. Not of the view, but of how it is drawn:
+ * `flat`, without WebGL; `sharp`, in all pixels also where that is slow.
+ */
 export function fromHash(hash) {
   const parts = new URLSearchParams(hash.replace(/^#/, ""));
   const list = (name, length) => {

@@ -2,7 +2,7 @@
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { age, figure, measure } from "./format.js";
-import { statusText } from "./marks.js";
+import { markOf, NO_ACK, statusText } from "./marks.js";
 import { polyline } from "./spark.js";
 
 const SVG = "http://www.w3.org/2000/svg";
@@ -48,8 +48,9 @@ class Card {
     const shown = past ? past(probe) : probe.exact;
     setText(this.letter, probe.letter);
     setText(this.name, probe.name);
-    setText(this.value, `${past ? "≈ " : ""}${measure(shown?.value, sheet.unit)}`);
     const status = shown?.status ?? sheet.shown.status[i];
+    const value = markOf(status) < NO_ACK ? shown?.value : null;
+    setText(this.value, `${past ? "≈ " : ""}${measure(value, sheet.unit)}`);
     const isOld = sheet.driver.isOld && !past;
     setText(this.status, isOld && status === 0 ? "stale: driver silent" : statusText(status));
     this.status.dataset.fresh = String(status === 0 && !isOld);

@@ -2,11 +2,8 @@
 
 import { Matrix4 } from "./vendor/three.min.js";
 import * as marks from "./marks.js";
-import { GROUND, INK, ramp } from "./palette.js";
+import { CLEAR, DIM, INSIDE, inksOf, signOf } from "./signs.js";
 
-const STALE_FADE = 0.6;
-const VEILS = [0, 0.7, 0.78]; // none, seen from inside, not selected
-const [INSIDE, DIM] = [1, 2];
 const PLACE = 5; // numbers of a taxel's place: x, y, radius (negative: from inside), slopes of its disc
 
 export class Flat {
@@ -19,21 +16,8 @@ export class Flat {
   }
 
   setTheme(theme) {
-    const colours = ramp(theme);
-    const ground = GROUND[theme];
-    const between = (one, share) => [0, 1, 2].map((c) => one[c] + share * (ground[c] - one[c]));
-    this.ground = packed(ground);
-    this.inks = VEILS.map((veil) => {
-      const veiled = (rgb) => packed(between(rgb, veil));
-      const fills = (fade) =>
-        Uint32Array.from({ length: 256 }, (_, level) => veiled(between(colours.subarray(4 * level, 4 * level + 3), fade)));
-      const [ink, soft, hollow] = [0, 0.55, 0.88].map((share) => veiled(between(INK[theme], share)));
-      const away = Uint32Array.from({ length: 256 }, (_, level) => {
-        const own = colours.subarray(4 * level, 4 * level + 3);
-        return veiled(apart(own, INK[theme]) > apart(own, ground) ? INK[theme] : ground);
-      });
-      return { ink, soft, hollow, away, fresh: fills(0), stale: fills(STALE_FADE) };
-    });
+    this.inks = inksOf(theme);
+    this.ground = this.inks[0].ground;
   }
 
   setSheets(sheets) {
@@ -122,8 +106,9 @@ export class Flat {
     const x = places[PLACE * at] - 0.5, y = places[PLACE * at + 1] - 0.5; // as middles of pixels count
     const right = places[PLACE * at + 3], up = places[PLACE * at + 4];
     const mark = this.marks[at] & ~marks.DIMMED;
-    const inks = this.inks[this.marks[at] & marks.DIMMED ? DIM : places[PLACE * at + 2] < 0 ? INSIDE : 0];
-    const fill = (mark === marks.STALE ? inks.stale : inks.fresh)[this.levels[at]];
+    const inks = this.inks[this.marks[at] & marks.DIMMED ? DIM : places[PLACE * at + 2] < 0 ? INSIDE : CLEAR];
+    const level = this.levels[at];
+    const fill = inks.fresh[level];
     const reach = size + 0.5; // half a pixel more: rims are smooth
     const x0 = Math.max(0, Math.ceil(x - reach)), x1 = Math.min(width - 1, Math.floor(x + reach));
     const y0 = Math.max(0, Math.ceil(y - reach)), y1 = Math.min(height - 1, Math.floor(y + reach));
@@ -135,8 +120,7 @@ export class Flat {
         const depth = right * u + up * v;
         const rr = u * u + v * v + depth * depth;
         if (rr > outer) continue;
-        const colour =
-          mark === marks.FRESH ? fill : sign(mark, u, v, Math.sqrt(rr), size, fill, inks, inks.away[this.levels[at]], this.ground);
+        const colour = mark === marks.FRESH ? fill : signOf(mark, u, v, Math.sqrt(rr), size, level, inks);
         const to = py * width + px;
         pixels[to] = rr < inner ? colour : blended(pixels[to], colour, (1 - Math.sqrt(rr)) * size + 0.5);
       }
@@ -148,38 +132,6 @@ export class Flat {
   }
 }
 
-const apart = (one, other) => Math.hypot(...[0, 1, 2].map((c) => one[c] - other[c]));
-const packed = (rgb) => ((255 << 24) | (Math.round(rgb[2]) << 16) | (Math.round(rgb[1]) << 8) | Math.round(rgb[0])) >>> 0;
-
-/** The colour of one pixel of a taxel that is not fresh: the signs of cloud.js. */
-function sign(mark, u, v, r, size, fill, { ink, soft, hollow }, away, ground) {
-  const pen = Math.min(Math.max(1.3 / size, 0.14), 0.4);
-  const isRim = r > 1 - pen;
-  switch (mark) {
-    case marks.STALE:
-      return isRim ? soft : r > 0.62 ? ground : fill;
-    case marks.OUT_OF_RANGE:
-      return isRim || (r > 1 - 3 * pen && r < 1 - 2 * pen) ? away : fill;
-    case marks.SUSPECT:
-      return r < 0.3 ? ink : r < 0.66 ? ground : fill;
-    case marks.UNHEALTHY:
-      return Math.min(Math.abs(u), Math.abs(v)) < pen ? away : fill;
-    case marks.NO_ACK: {
-      const stripe = (u + v) * Math.min(1.6, size / 5);
-      return isRim || stripe - Math.floor(stripe) < 0.42 ? soft : ground;
-    }
-    case marks.MASKED:
-      return isRim || Math.abs(v) < 0.7 * pen ? soft : ground;
-    case marks.NEVER_SEEN:
-      return r < 0.42 ? ink : isRim ? soft : ground;
-    case marks.NOT_CONNECTED:
-      return Math.abs(Math.abs(u) - Math.abs(v)) < pen ? ink : ground;
-    case marks.UNTOUCHED:
-      return r > 1 - 1.8 * pen ? ink : hollow;
-    default:
-      return isRim ? soft : ground;
-  }
-}
 
 /** One packed colour over another, of which a share of the pixel is covered. */
 function blended(under, over, share) {

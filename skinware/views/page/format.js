@@ -29,6 +29,12 @@ export function figure(x) {
   return String(Number(x.toPrecision(4)));
 }
 
+/** A number with about three digits, where there is little room. */
+export function short(x) {
+  if (!isKnown(x)) return NONE;
+  return Math.abs(x) >= 100 ? x.toFixed(0) : String(Number(x.toPrecision(3)));
+}
+
 export function measure(x, unit) {
   return isKnown(x) && unit ? `${figure(x)} ${unit}` : figure(x);
 }
@@ -52,6 +58,3 @@ export function clock(s) {
   const minutes = Math.floor(tenths / 600);
   return `${minutes}:${(tenths / 10 - 60 * minutes).toFixed(1).padStart(4, "0")}`;
 }
-
-/** The name of one taxel without anything: where it is in a frame. */
-export const plainName = (position) => `sensor ${position}`;

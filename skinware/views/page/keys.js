@@ -4,13 +4,14 @@ import { h } from "./dom.js";
 import { FRESH, MARKS } from "./marks.js";
 import { picture } from "./legend.js";
 
-export const KEYS = [
+const KEYS = [
   ["1 2 3 4", "values, change, peaks, wipe test"],
   ["t", "next type of sensor"],
   ["b", "zero: what is felt now becomes rest"],
   ["w l", "start or end the wipe test; save its list"],
   ["space", "pause, and go on"],
   ["[ ]", "scroll back and forth while paused"],
+  [", .", "a frame back or forth in a replay"],
   ["r", "record"],
   ["s", "save a picture"],
   ["f", "show all; what is selected, if something is"],
@@ -44,7 +45,7 @@ export function fillHelp(dialog, theme) {
  * Listen to keys.
  * @param {Object<string, Function>} actions by the key's name; those with alt, ctrl or meta are the browser's.
  */
-export function listen(actions) {
+export function onKeys(actions) {
   document.addEventListener("keydown", (event) => {
     if (event.altKey || event.ctrlKey || event.metaKey || event.defaultPrevented) return;
     if (event.target.closest("input:not([type=range]), select, dialog")) return;

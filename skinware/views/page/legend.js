@@ -3,9 +3,11 @@
 import { byId, h, setChildren, setPressed, setText } from "./dom.js";
 import { count, figure } from "./format.js";
 import { DIMMED, FRESH, MARKS } from "./marks.js";
-import { gradient, GROUND, INK } from "./palette.js";
+import { gradient } from "./palette.js";
+import { CLEAR, inksOf, signOf } from "./signs.js";
 
 const SIZE = 16;
+const MIDDLE_LEVEL = 90; // of marks that show a value
 
 export class Legend {
   #items = new Map(); // mark -> element
@@ -60,35 +62,18 @@ export class Legend {
 
 /** A mark as it looks in the skin. */
 export function picture(mark, theme) {
-  const ratio = Math.min(devicePixelRatio, 2);
-  const canvas = h("canvas", { width: SIZE * ratio, height: SIZE * ratio, class: "sign", "aria-hidden": "true" });
+  const size = Math.round(SIZE * Math.min(devicePixelRatio, 2));
+  const canvas = h("canvas", { width: size, height: size, class: "sign", "aria-hidden": "true" });
   const context = canvas.getContext("2d");
-  const [ground, ink] = [GROUND[theme], INK[theme]];
-  const soft = ground.map((x, c) => 0.55 * x + 0.45 * ink[c]);
-  const css = (rgb) => `rgb(${rgb.map(Math.round)})`;
-  context.scale((SIZE * ratio) / 2, (SIZE * ratio) / 2);
-  context.translate(1, 1);
-  context.beginPath();
-  context.arc(0, 0, 0.84, 0, 7);
-  context.clip();
-  context.fillStyle = mark <= 4 ? css(theme === "dark" ? [59, 91, 142] : [116, 191, 194]) : css(ground);
-  if (mark === 1) context.fillStyle = css(soft.map((x, c) => 0.5 * x + 0.5 * ground[c]));
-  context.fillRect(-1, -1, 2, 2);
-  context.strokeStyle = context.fillStyle = [2, 3, 4, 8, 9].includes(mark) ? css(ink) : css(soft);
-  context.lineWidth = 0.3;
-  const circle = (r) => context.beginPath() || context.arc(0, 0, r, 0, 7);
-  const lines = (...all) => {
-    context.beginPath();
-    for (const [x1, y1, x2, y2] of all) context.moveTo(x1, y1) || context.lineTo(x2, y2);
-    context.stroke();
-  };
-  if (mark === 3 || mark === 7) circle(0.3) || context.fill();
-  if (mark === 2) circle(0.45) || context.stroke();
-  if (mark === 4) lines([-0.6, 0, 0.6, 0], [0, -0.6, 0, 0.6]);
-  if (mark === 5) lines([-1, 0, 0, -1], [-1, 1, 1, -1], [0, 1, 1, 0]);
-  if (mark === 6) lines([-1, 0, 1, 0]);
-  if (mark === 8) lines([-1, -1, 1, 1], [-1, 1, 1, -1]);
-  context.lineWidth = mark === 9 ? 0.6 : 0.34;
-  if (mark !== 3 && mark !== 4 && mark !== 8) circle(0.84) || context.stroke();
+  const image = context.createImageData(size, size);
+  const pixels = new Uint32Array(image.data.buffer);
+  const inks = inksOf(theme)[CLEAR];
+  const radius = size / 2;
+  for (let at = 0; at < pixels.length; at++) {
+    const [u, v] = [((at % size) + 0.5) / radius - 1, 1 - (Math.floor(at / size) + 0.5) / radius];
+    const r = Math.hypot(u, v);
+    if (r <= 1) pixels[at] = signOf(mark, u, v, r, radius, MIDDLE_LEVEL, inks);
+  }
+  context.putImageData(image, 0, 0);
   return canvas;
 }

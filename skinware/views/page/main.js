@@ -3,33 +3,32 @@
 import * as address from "./address.js";
 import { Bar } from "./bar.js";
 import { Cards } from "./cards.js";
-import { byId, h, save, setHidden, setPressed, setText, stamp } from "./dom.js";
-import { bytes, clock, measure } from "./format.js";
+import { byId, h, setHidden, setText } from "./dom.js";
+import { Modes, onPointer, useTabs } from "./controls.js";
+import { measure } from "./format.js";
 import { Past } from "./history.js";
-import { fillHelp, listen } from "./keys.js";
+import { boxOf, directionOf, withRoom } from "./framing.js";
+import { hooks } from "./hooks.js";
+import { fillHelp, onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
-import { MARKS, DIMMED } from "./marks.js";
 import { fetchMeshes } from "./meshes.js";
 import { Overlay } from "./overlay.js";
-import { GROUND, ramp } from "./palette.js";
 import { pick } from "./picking.js";
+import { savePicture, showRecording } from "./keeping.js";
 import { Probes } from "./probes.js";
 import { Problems } from "./problems.js";
-import { boxOf, Skin } from "./skin.js";
+import { Skin } from "./skin.js";
 import { Stage } from "./stage.js";
 import { Touches } from "./touches.js";
 import { ReplayControls, Rewind } from "./transport.js";
 import { Tree } from "./tree.js";
 import { decode } from "./turn.js";
-import { untouched, Wipe } from "./wipe.js";
+import { afterFrame, notify, reload, storedTheme, storeTheme } from "./window.js";
+import { Wipe } from "./wipe.js";
 
 const MODES = { raw: "Values", change: "Change", peak: "Peaks", wipe: "Wipe test" };
-const FROM = [0, -0.86, 0.51]; // where a skin is looked at from, if its normals do not say
-const TURN = 0.12; // rad, of a key
-const CLICK_PX = 4; // a mouse that moved less has clicked
-const HIDDEN_MS = 1000; // between turns of a page that nobody sees
-const NOTICE_MS = 6000;
+const [TURN, NEARER, SCROLL_S] = [0.12, 0.85, 0.2]; // of a key: rad, of the distance, s
 const TELL_EVERY_MS = 90; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
@@ -44,31 +43,40 @@ const view = {
   type: wanted.type ?? null,
   scale: wanted.scale,
   normals: wanted.normals,
-  theme: wanted.theme ?? stored() ?? (system.matches ? "light" : "dark"),
-  isThemeChosen: Boolean(wanted.theme ?? stored()),
+  theme: wanted.theme ?? storedTheme() ?? (system.matches ? "light" : "dark"),
+  isThemeChosen: Boolean(wanted.theme ?? storedTheme()),
 };
-let isAlive = false; // turns come
-let contacts = [];
-let problems = [];
-let recording = null;
-let wipeTold = null;
-let turnNumber = 0;
-let told_ms = 0; // when figures were brought up to date
+const now = {
+  isAlive: false, // turns come
+  turn: 0,
+  contacts: [],
+  problems: [],
+  recording: null,
+  wipe: null,
+  told_ms: 0, // when figures were brought up to date
+};
 
 const stage = new Stage(byId("stage"), {
   flat: query.has("flat") || wanted.flat,
   sharp: wanted.sharp,
   theme: view.theme,
   drawOver: (its) =>
-    overlay.draw(its, { theme: view.theme, normals: view.normals, contacts, hovered: probes.hovered, pins: probes.pins }),
+    overlay.draw(its, {
+      theme: view.theme,
+      normals: view.normals,
+      contacts: now.contacts,
+      hovered: probes.hovered,
+      pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
+    }),
   moved: () => keep(),
-  changed: () => notify(stage.isSolid ? "" : "WebGL is lost: drawn without it", NOTICE_MS),
+  resized: () => now.isAlive && frameAll(true),
+  changed: () => notify(stage.isSolid ? "" : "WebGL is lost: drawn without it"),
 });
 const overlay = new Overlay(byId("stage"));
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live${location.search}`, {
   open: connected,
   lost: disconnected,
-  error: (text) => notify(text, NOTICE_MS),
+  error: (text) => notify(text),
   turn,
 });
 const send = (op) => link.send(op);
@@ -87,6 +95,7 @@ const rewind = new Rewind({ pause: byId("pause"), slider: byId("past"), when: by
   tell();
 });
 const replay = new ReplayControls(byId("replay"), (action, value) => send({ op: "replay", action, value }));
+const modes = new Modes(byId("modes"), MODES, setMode);
 const wipe = new Wipe(byId("wipe"), {
   start: () => send({ op: "wipe", action: "start" }),
   stop: () => send({ op: "wipe", action: "stop" }),
@@ -97,18 +106,18 @@ const wipe = new Wipe(byId("wipe"), {
 
 /** What a connection is worth shows at its first turn; until then what is shown stays old. */
 function connected() {
-  isAlive = false;
+  now.isAlive = false;
   sendLook();
 }
 
 function alive() {
-  isAlive = true;
+  now.isAlive = true;
   setHidden(byId("lost"), true);
   skin.cut(false);
 }
 
 function disconnected(reason, wait_ms) {
-  isAlive = false;
+  now.isAlive = false;
   const why = reason ? ` (${reason})` : "";
   setText(byId("lost"), `No connection to skin-view${why}. What is shown is old. Trying again in ${(wait_ms / 1000).toFixed(1)} s.`);
   setHidden(byId("lost"), false);
@@ -120,22 +129,21 @@ function disconnected(reason, wait_ms) {
 function turn(message) {
   const told = decode(message);
   const { header } = told;
-  if (!isAlive) alive();
-  if (header.skin?.protocol && header.skin.protocol !== PROTOCOL) return reload();
-  turnNumber = header.turn;
-  if (header.error) notify(header.error, NOTICE_MS);
+  if (!now.isAlive) alive();
+  if (header.skin?.protocol && header.skin.protocol !== PROTOCOL) return reload(header.skin.protocol);
+  now.turn = header.turn;
+  if (header.error) notify(header.error);
   if (skin.take(header, told.blob)) restructured();
-  if (header.names) skin.sheet(header.names.driver, header.names.type).names = header.names.of;
   if (header.state) takeState(header.state);
-  if (header.wipe) wipeTold = header.wipe;
-  contacts = touches.update(skin, { contacts: lastOf("contacts", header), regions: lastOf("regions", header) });
+  if (header.wipe) now.wipe = header.wipe;
+  now.contacts = touches.update(skin, { contacts: lastOf("contacts", header), regions: lastOf("regions", header) });
   probes.take(told, performance.now());
   wipe.update(header.wipe);
   if (!rewind.isPaused) {
     remember(header.pictures);
     if (header.pictures || header.state || header.skin) show();
   }
-  if (performance.now() - told_ms > TELL_EVERY_MS) tell();
+  if (performance.now() - now.told_ms > TELL_EVERY_MS) tell();
   afterFrame(() => link.next());
 }
 
@@ -151,31 +159,33 @@ function restructured() {
   past.keepOnly(skin.sheets());
   for (const id of states.keys()) if (!skin.drivers.has(id)) states.delete(id);
   for (const name of Object.keys(newest)) delete newest[name];
+  if (view.type && skin.types().length && !skin.types().includes(view.type)) {
+    view.type = null; // of another skin
+    sendLook();
+  }
   fillTypes();
   sheetsChanged();
-  probes.find(skin, turnNumber === 1 && !probes.keys.length ? wanted.pins : undefined);
+  probes.find(skin, wanted.pins ?? probes.keys);
+  wanted.pins = null;
   tree.update(skin, states);
-  if (tree.selected === null && wanted.selected) tree.select(wanted.selected);
+  if (wanted.selected) tree.select(wanted.selected);
   wanted.selected = null;
   dim();
-  fetchMeshes(skin.links, (text) => notify(text, NOTICE_MS)).then((meshes) => stage.setMeshes(meshes));
+  fetchMeshes(skin.links, (text) => notify(text)).then((meshes) => stage.setMeshes(meshes));
 }
 
 function takeState(state) {
   for (const told of state.drivers ?? []) states.set(told.id, told);
   const nameOf = (id) => skin.drivers.get(id)?.name;
-  problems = (state.problems ?? []).map((problem) => {
+  now.problems = (state.problems ?? []).map((problem) => {
     const name = nameOf(problem.driver) ?? problem.driver;
     return { ...problem, text: name === null || name === undefined ? problem.text : `${name}: ${problem.text}` };
   });
-  recording = state.recording ?? null;
+  now.recording = state.recording ?? null;
   tree.update(skin, states);
-  list.update(problems);
+  list.update(now.problems);
   replay.update(state.replay);
-  setPressed(byId("record"), Boolean(recording));
-  const lost = recording?.lost ? `, ${recording.lost} lost` : "";
-  setText(byId("record").lastElementChild, recording ? `${clock(recording.s)} · ${bytes(recording.bytes)}${lost}` : "Record");
-  byId("record").title = recording?.file ?? "Record (r)";
+  showRecording(byId("record"), now.recording);
 }
 
 function remember(pictures) {
@@ -197,10 +207,10 @@ function show() {
 
 /** Bring everything beside the picture up to date. */
 function tell() {
-  told_ms = performance.now();
+  now.told_ms = performance.now();
   const isPast = rewind.isPaused;
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
-  bar.update(skin, states, stage, recording);
+  bar.update(skin, states, stage, now.recording);
   const first = stage.sheets[0];
   const scale = first ? { low: first.shown.scale[0], high: first.shown.scale[1], unit: first.unit } : skin.scale;
   legend.update(scale, view.scale, stage.sheets);
@@ -220,29 +230,9 @@ function sheetsChanged() {
 function frameAll(isFirst = false) {
   const isIn = selection();
   const box = boxOf(stage.sheets, isIn ?? undefined);
-  if (box) stage.frame(grown(box), isFirst || isIn ? direction(isIn ?? undefined) : null);
-}
-
-/** From where most of some taxels are seen: against the mean of their normals. */
-function direction(isIn = () => true) {
-  const sum = [0, 0, 0];
-  let n = 0;
-  const placed = stage.sheets.filter((sheet) => sheet.placed);
-  for (const sheet of placed.length ? placed : stage.sheets) {
-    for (let i = 0; i < sheet.n; i++) {
-      if (!isIn(sheet, i)) continue;
-      for (let c = 0; c < 3; c++) sum[c] += sheet.normal[3 * i + c];
-      n++;
-    }
-  }
-  const mean = sum.map((x) => x / Math.max(n, 1));
-  if (Math.hypot(...mean) < 0.25) return FROM;
-  return Math.abs(mean[2]) > 0.999 * Math.hypot(...mean) ? [0, -1e-3, Math.sign(mean[2])] : mean;
-}
-
-function grown(box) {
-  const by = 1.2 * Math.max(...stage.sheets.map(({ radius }) => radius[0] ?? 0));
-  return box.map((x, c) => (c < 3 ? x - by : x + by));
+  if (!box) return;
+  const from = isFirst || isIn ? directionOf(stage.sheets, isIn ?? undefined) : null;
+  stage.frame(withRoom(box, stage.sheets), from);
 }
 
 /** Whether a taxel is selected: (sheet, i) => bool; null if nothing is. */
@@ -280,12 +270,9 @@ function sendLook() {
 /** Look otherwise: at another mode, type or scale. */
 function look() {
   sendLook();
-  for (const button of byId("modes").children) {
-    button.setAttribute("aria-checked", String(button.dataset.mode === view.mode));
-    button.tabIndex = button.dataset.mode === view.mode ? 0 : -1;
-  }
+  modes.show(view.mode);
   wipe.show(view.mode === "wipe");
-  if (view.mode !== "wipe") wipeTold = null;
+  if (view.mode !== "wipe") now.wipe = null;
   setHidden(byId("tare"), view.mode === "raw" || view.mode === "wipe");
   setHidden(byId("scale"), view.mode === "wipe");
   keep();
@@ -307,6 +294,13 @@ function setType(type) {
   look();
 }
 
+function nextType() {
+  const types = skin.types();
+  const at = types.indexOf(view.type ?? stage.sheets[0]?.type);
+  if (types.length > 1) setType(types[(at + 1) % types.length]);
+  fillTypes();
+}
+
 function fillTypes() {
   const types = skin.types();
   const select = byId("types").querySelector("select");
@@ -322,7 +316,7 @@ function setTheme(theme, isChosen) {
   setText(byId("theme"), theme === "dark" ? "Light" : "Dark");
   stage.setTheme(theme);
   legend.setTheme(theme);
-  if (isChosen) store(theme);
+  if (isChosen) storeTheme(theme);
   tell();
 }
 
@@ -353,28 +347,11 @@ function step(by) {
   cards.place(x, y, stage.width, stage.height);
 }
 
-function takePicture() {
-  stage.draw(); // the browser keeps no picture by WebGL after it was shown
-  const both = h("canvas", { width: stage.view.canvas.width, height: stage.view.canvas.height });
-  const context = both.getContext("2d");
-  for (const canvas of [stage.view.canvas, overlay.canvas]) context.drawImage(canvas, 0, 0, both.width, both.height);
-  both.toBlob((blob) => save(blob, `skin-${stamp()}.png`));
-}
-
 function release() {
   probes.clear();
   probes.hover(null);
   choose(null);
   tell();
-}
-
-let noticeTimer = 0;
-
-function notify(text, for_ms) {
-  setText(byId("notice"), text);
-  setHidden(byId("notice"), !text);
-  clearTimeout(noticeTimer);
-  noticeTimer = setTimeout(() => setHidden(byId("notice"), true), for_ms);
 }
 
 let keepTimer = 0;
@@ -385,6 +362,8 @@ function keep() {
   keepTimer = setTimeout(() => {
     if (!stage.sheets.length) return;
     const hash = address.toHash({
+      flat: wanted.flat,
+      sharp: wanted.sharp,
       ...view,
       camera: { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() },
       selected: tree.selected,
@@ -395,79 +374,22 @@ function keep() {
   }, 250);
 }
 
-/** A page of another version than the server is loaded anew, but not for ever. */
-function reload() {
-  if (sessionStorage.getItem("reloaded") === PROTOCOL) return notify("This page and skin-view are of different versions.", 1e9);
-  sessionStorage.setItem("reloaded", PROTOCOL);
-  location.reload();
-}
-
-/** Go on when the next frame is drawn; of a page that nobody sees, none is. */
-function afterFrame(go) {
-  let isDone = false;
-  const once = () => {
-    if (!isDone) go();
-    isDone = true;
-  };
-  requestAnimationFrame(once);
-  setTimeout(once, HIDDEN_MS);
-}
-
-/** The theme that was chosen in this browser before; some let no page keep anything. */
-function stored() {
-  try {
-    return localStorage.getItem("theme") ?? undefined;
-  } catch {
-    return undefined;
-  }
-}
-
-function store(theme) {
-  try {
-    localStorage.setItem("theme", theme);
-  } catch {
-    // it is chosen for this page alone
-  }
-}
-
 // -- mouse, keys, buttons -----------------------------------------------------------------------------------------
 
-const host = byId("stage");
-let pressed = null;
-host.addEventListener("pointermove", (event) => {
-  const pointer = [event.offsetX, event.offsetY];
-  if (event.pointerType === "touch" || event.buttons) return;
-  hover(pick(stage, stage.sheets, ...pointer));
-  cards.place(...pointer, stage.width, stage.height);
+onPointer(byId("stage"), {
+  over: (x, y) => {
+    hover(x === null ? null : pick(stage, stage.sheets, x, y));
+    cards.place(x, y, stage.width, stage.height);
+  },
+  click: (x, y) => {
+    const found = pick(stage, stage.sheets, x, y);
+    if (found) pin(found);
+  },
 });
-host.addEventListener("pointerleave", () => hover(null));
-host.addEventListener("pointerdown", (event) => (pressed = [event.clientX, event.clientY]));
-host.addEventListener("pointerup", (event) => {
-  if (!pressed || event.button !== 0) return;
-  if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > CLICK_PX) return;
-  const box = host.getBoundingClientRect();
-  const found = pick(stage, stage.sheets, event.clientX - box.left, event.clientY - box.top);
-  if (found) pin(found);
-});
-
-byId("modes").append(
-  ...Object.entries(MODES).map(([mode, name]) =>
-    h("button", { type: "button", role: "radio", "data-role": "mode", "data-mode": mode, onclick: () => setMode(mode) }, name),
-  ),
-);
-byId("modes").addEventListener("keydown", (event) => {
-  const by = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
-  if (!by) return;
-  const names = Object.keys(MODES);
-  setMode(names[(names.indexOf(view.mode) + by + names.length) % names.length]);
-  byId("modes").querySelector("[aria-checked=true]").focus();
-  event.preventDefault();
-});
-byId("types").addEventListener("change", (event) => setType(event.target.value));
 const clicks = {
   tare: () => send({ op: "tare" }),
-  record: () => send({ op: "record", action: recording ? "stop" : "start" }),
-  picture: takePicture,
+  record: () => send({ op: "record", action: now.recording ? "stop" : "start" }),
+  picture: () => savePicture(stage, overlay),
   theme: () => setTheme(view.theme === "dark" ? "light" : "dark", true),
   help: () => {
     fillHelp(byId("keys"), view.theme);
@@ -475,39 +397,29 @@ const clicks = {
   },
 };
 for (const [id, action] of Object.entries(clicks)) byId(id).addEventListener("click", action);
-for (const tab of byId("tabs").children) {
-  tab.addEventListener("click", () => {
-    for (const other of byId("tabs").children) setPressed(other, other === tab);
-    document.body.dataset.panel = tab.dataset.panel;
-  });
-}
+byId("types").addEventListener("change", (event) => setType(event.target.value));
 system.addEventListener("change", () => view.isThemeChosen || setTheme(system.matches ? "light" : "dark", false));
-
-const nextType = () => {
-  const types = skin.types();
-  const now = types.indexOf(view.type ?? stage.sheets[0]?.type);
-  if (types.length > 1) setType(types[(now + 1) % types.length]);
-  fillTypes();
-};
-const modeKeys = Object.keys(MODES).map((mode, i) => [String(i + 1), () => setMode(mode)]);
-listen({
-  ...Object.fromEntries(modeKeys),
+useTabs(byId("tabs"));
+onKeys({
+  ...Object.fromEntries(Object.keys(MODES).map((mode, i) => [String(i + 1), () => setMode(mode)])),
   t: nextType,
   b: clicks.tare,
   w: () => (view.mode === "wipe" ? wipe.toggle() : setMode("wipe")),
   l: () => view.mode === "wipe" && wipe.save(),
   " ": () => rewind.toggle(),
-  "[": () => rewind.scroll(rewind.at_s - 0.2),
-  "]": () => rewind.isPaused && rewind.scroll(rewind.at_s + 0.2),
+  ",": () => replay.step(-1),
+  ".": () => replay.step(1),
+  "[": () => rewind.scroll(rewind.at_s - SCROLL_S),
+  "]": () => rewind.isPaused && rewind.scroll(rewind.at_s + SCROLL_S),
   r: clicks.record,
-  s: takePicture,
+  s: clicks.picture,
   f: () => frameAll(),
   ArrowLeft: () => stage.orbit(-TURN, 0),
   ArrowRight: () => stage.orbit(TURN, 0),
   ArrowUp: () => stage.orbit(0, -TURN),
   ArrowDown: () => stage.orbit(0, TURN),
-  "+": () => stage.orbit(0, 0, 0.85),
-  "-": () => stage.orbit(0, 0, 1 / 0.85),
+  "+": () => stage.orbit(0, 0, NEARER),
+  "-": () => stage.orbit(0, 0, 1 / NEARER),
   j: () => step(1),
   k: () => step(-1),
   p: () => probes.hovered && pin(probes.hovered),
@@ -525,58 +437,8 @@ listen({
   "?": clicks.help,
 });
 
-// -- what tests and scripts read ------------------------------------------------------------------------------------
-
-const pairOf = ({ sheet, i }) => [sheet.driver.id, sheet.index[i]];
-window.skin = {
-  get turn() { return turnNumber; },
-  get connected() { return isAlive; },
-  get drivers() { return [...skin.drivers.values()].map(({ id, name, state, generation }) => ({ id, name, state, generation })); },
-  get camera() { return { position: stage.camera.position.toArray(), target: stage.controls.target.toArray() }; },
-  get selected() { return tree.selected; },
-  get hovered() { return probes.hovered && pairOf(probes.hovered); },
-  get pins() { return probes.pins.map(pairOf); },
-  get mode() { return view.mode; },
-  get type() { return view.type ?? stage.sheets[0]?.type ?? null; },
-  get scale() { return skin.scale; },
-  get theme() { return view.theme; },
-  get flat() { return !stage.isSolid; },
-  get fps() { return stage.fps; },
-  get drawn() { return stage.drawn; },
-  get ratio() { return stage.ratio; },
-  get paused() { return rewind.isPaused; },
-  get at_s() { return rewind.at_s; },
-  get problems() { return problems.map(({ text }) => text); },
-  get wipe() { return wipeTold; },
-  get untouched() { return untouched(stage.sheets).map(pairOf); },
-  get recording() { return recording; },
-  get contacts() { return contacts; },
-  get meshes() { return stage.meshes.length; },
-  get kept_bytes() { return past.bytes; },
-  /** The colour of a level, [r, g, b]. */
-  colourOf: (level) => [...ramp(view.theme).slice(4 * level, 4 * level + 3)],
-  ground: () => GROUND[view.theme],
-  /** Where a taxel is in the window, CSS pixels; null if it is not drawn. */
-  pixelOf(driver, position) {
-    const found = skin.find(driver, position);
-    if (!found || !stage.sheets.includes(found.sheet)) return null;
-    const box = host.getBoundingClientRect();
-    const [x, y] = stage.project(...found.sheet.place(found.i));
-    return [box.left + x, box.top + y];
-  },
-  /** What is shown of a taxel; null if there is none. */
-  stateOf(driver, position) {
-    const found = skin.find(driver, position);
-    if (!found) return null;
-    const { sheet, i } = found;
-    const { levels, status, marks } = sheet.shown;
-    const mark = MARKS[marks[i] & ~DIMMED].name;
-    return { level: levels[i], status: status[i], mark, dimmed: Boolean(marks[i] & DIMMED), value: sheet.valueOf(i), name: sheet.names?.[i] ?? null };
-  },
-};
-
+window.skin = hooks({ skin, stage, tree, probes, rewind, past, view, now });
 setTheme(view.theme, false);
 look();
-setPressed(byId("pause"), false);
-document.body.dataset.panel = "left";
+addEventListener("hashchange", () => location.reload()); // another address was typed
 link.connect();

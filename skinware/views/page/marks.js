@@ -10,21 +10,21 @@ export const MASKED = 6;
 export const NEVER_SEEN = 7;
 export const NOT_CONNECTED = 8;
 export const UNTOUCHED = 9;
-export const WITHOUT_VALUE = 10;
+const WITHOUT_VALUE = 10;
 
 export const DIMMED = 0x80; // beside the mark: not part of what is selected
 
 export const MARKS = [
   { name: "fresh", sign: "" },
   { name: "stale", sign: "small and faded, in a rim" },
-  { name: "out of range", sign: "double rim" },
-  { name: "suspect", sign: "dot" },
-  { name: "unhealthy", sign: "plus" },
+  { name: "out of range", sign: "a second rim" },
+  { name: "suspect", sign: "a target" },
+  { name: "unhealthy", sign: "a plus" },
   { name: "no answer", sign: "hatched" },
-  { name: "switched off", sign: "bar" },
+  { name: "switched off", sign: "a bar" },
   { name: "never seen", sign: "hollow, with a dot" },
   { name: "not connected", sign: "crossed" },
-  { name: "not touched", sign: "bold rim" },
+  { name: "not touched", sign: "a bold rim" },
   { name: "no value", sign: "hollow" },
 ];
 

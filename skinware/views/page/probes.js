@@ -1,11 +1,11 @@
 // The taxels that somebody looks at: one under the pointer, some pinned; and what the server tells of each of them.
 
 const LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ";
-export const MOST_PINS = 12;
+const MOST_PINS = 12;
 const SERIES_EVERY_MS = 300;
 
 /** One taxel, known again after a restart by its driver, type and uid. */
-export class Probe {
+class Probe {
   constructor(sheet, i) {
     this.letter = "";
     this.exact = null; // {value, raw, age_ms, noise, status} of the server
@@ -24,12 +24,12 @@ export class Probe {
   }
 }
 
-export function keyOf(sheet, i) {
+function keyOf(sheet, i) {
   return `${sheet.driver.key}:${sheet.type}:${sheet.uid ? sheet.uid[i].toString(16) : sheet.index[i]}`;
 }
 
 /** The taxel of a key: {sheet, i}; null if there is no such one now. */
-export function resolve(skin, key) {
+function resolve(skin, key) {
   const [driver, type, id] = key.split(":");
   const sheet = skin.sheets(type).find((one) => one.driver.key === driver);
   if (!sheet || !/^[0-9a-f]+$/.test(id ?? "")) return null;

@@ -7,7 +7,7 @@ const NOTHING = 255;
 const DRAWN_PART = 0.44; // radius of a disc, of the distance to its neighbour
 
 /** n taxels of one type of a driver. */
-export class Sheet {
+class Sheet {
   constructor(driver, told, blob) {
     this.driver = driver;
     this.type = told.name;
@@ -77,7 +77,7 @@ export class Sheet {
 }
 
 /** A driver of a generation. */
-export class Driver {
+class Driver {
   constructor(told, blob) {
     this.id = told.id;
     this.name = told.name;
@@ -104,7 +104,7 @@ export class Skin {
   scale = { low: 0, high: 1, unit: "", mode: "raw" };
 
   /**
-   * Take what a turn tells of the skin itself and of values.
+   * Take what a turn tells of the skin itself, of names and of values.
    * @returns {boolean} the structure is another one.
    */
   take(header, blob) {
@@ -122,6 +122,8 @@ export class Skin {
       const sheet = this.sheet(picture.driver, picture.type);
       if (sheet && sheet.driver.generation === picture.generation) sheet.take(picture, this.scale.mode, blob);
     }
+    const named = header.names && this.sheet(header.names.driver, header.names.type);
+    if (named) named.names = header.names.of;
     return Boolean(header.skin);
   }
 
@@ -186,20 +188,4 @@ function smallestStep(position) {
     if (d > 0 && d < best) best = d;
   }
   return best === Infinity ? 0 : best;
-}
-
-/** Smallest and greatest coordinates of some taxels: [x, y, z, x, y, z], m; null of none. */
-export function boxOf(sheets, isIn = () => true) {
-  const box = [Infinity, Infinity, Infinity, -Infinity, -Infinity, -Infinity];
-  for (const sheet of sheets) {
-    for (let i = 0; i < sheet.n; i++) {
-      if (!isIn(sheet, i)) continue;
-      for (let c = 0; c < 3; c++) {
-        const x = sheet.position[3 * i + c];
-        if (x < box[c]) box[c] = x;
-        if (x > box[3 + c]) box[3 + c] = x;
-      }
-    }
-  }
-  return box[0] === Infinity ? null : box;
 }

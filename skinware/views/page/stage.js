@@ -17,8 +17,9 @@ export class Stage {
 
   /**
    * @param {HTMLElement} host what the canvases fill.
-   * @param {object} options `flat`: without WebGL; `sharp`: all pixels, however slow that is; `theme`; `drawOver(stage)`: draws over
-   *     each frame; `moved()`: the eye moved; `changed()`: taxels are drawn another way now.
+   * @param {object} options `flat`: without WebGL; `sharp`: in all pixels, however slow; `theme`; `drawOver(stage)`:
+   *     draws over each frame; `moved()`: the eye moved; `resized()`: nobody has turned the view, which has another size
+   *     now; `changed()`: taxels are drawn another way now.
    */
   constructor(host, options) {
     this.host = host;
@@ -36,8 +37,11 @@ export class Stage {
     this.controls.dampingFactor = 0.2;
     this.controls.zoomToCursor = true;
     this.isTurned = false; // by a person: the view is theirs
-    this.controls.addEventListener("start", () => (this.isTurned = true));
+    let isHeld = false;
+    this.controls.addEventListener("start", () => (isHeld = true));
+    this.controls.addEventListener("end", () => (isHeld = false));
     this.controls.addEventListener("change", () => {
+      this.isTurned ||= isHeld;
       options.moved?.();
       this.ask();
     });
@@ -101,6 +105,7 @@ export class Stage {
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.view.resize(width, height, this.ratio);
+    if (!this.isTurned) this.options.resized?.();
     this.ask();
   }
 

@@ -1,9 +1,9 @@
 // Contacts and regions, where services tell them: lists, and where contacts are drawn.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
-import { figure, measure } from "./format.js";
+import { measure, short } from "./format.js";
 
-const COLUMNS = ["", "", "load", "speed", "age"];
+const COLUMNS = ["", "", "load", "mm/s", "s"];
 
 export class Touches {
   constructor(contacts, regions) {
@@ -19,15 +19,15 @@ export class Touches {
   /** Take a turn; says where the contacts are: [{id, at, normal, area_m2}]. */
   update(skin, header) {
     const places = (header.contacts ?? []).map((contact) => ({ ...contact, at: placeOf(skin, contact) }));
-    setHidden(this.contacts, header.contacts === undefined);
+    setHidden(this.contacts, this.contacts.hidden && !places.length); // once there were some, it stays
     fill(
       this.contactRows,
       places.map((contact) => [
         `${contact.id}`,
         contact.kind ?? "",
-        measure(contact.load, contact.unit),
-        contact.speed === undefined || contact.speed === null ? "–" : `${figure(1000 * contact.speed)} mm/s`,
-        `${figure(contact.age_s)} s`,
+        short(contact.load),
+        short(1000 * contact.speed),
+        short(contact.age_s),
       ]),
     );
     setHidden(this.regions, !header.regions?.length);

@@ -63,20 +63,26 @@ export class ReplayControls {
     this.act = act;
     const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
     this.play = button("Pause", "Stop or go on with the replay", () => act(this.told.paused ? "resume" : "pause", null));
-    this.step = button("Step", "One frame", () => act("step", null));
+    this.back = button("Back", "One frame back (,)", () => this.step(-1));
+    this.on = button("Step", "One frame on (.)", () => this.step(1));
     this.slider = h("input", { type: "range", min: 0, step: 0.1, "aria-label": "Time in the recording, seconds" });
     this.slider.addEventListener("change", () => act("seek", Number(this.slider.value)));
     this.speed = h("select", { "aria-label": "Speed" }, ...SPEEDS.map((x) => h("option", { value: x }, `${x}×`)));
     this.speed.addEventListener("change", () => act("speed", Number(this.speed.value)));
     this.loop = button("Loop", "Begin anew at the end", () => act("loop", !this.told.loop));
     this.when = h("output");
-    host.append(h("span", { class: "name" }, "Replay"), this.play, this.step, this.slider, this.when, this.speed, this.loop);
+    host.append(h("span", { class: "name" }, "Replay"), this.play, this.back, this.on, this.slider, this.when, this.speed, this.loop);
+  }
+
+  /** Go so many frames on, or back. */
+  step(frames) {
+    if (this.told) this.act("step", frames);
   }
 
   update(told) {
     setHidden(this.host, !told);
-    if (!told) return;
     this.told = told;
+    if (!told) return;
     setText(this.play, told.paused ? "Play" : "Pause");
     setPressed(this.loop, Boolean(told.loop));
     this.slider.max = told.duration_s;

@@ -12,7 +12,7 @@ export function untouched(sheets) {
 }
 
 /** The list as a text: a line for each, with its place in a frame, its uid and its name. */
-export function listOf(sheets, told) {
+function listOf(sheets, told) {
   const found = untouched(sheets);
   const head = [`# ${told.touched} of ${told.of} touched; those that were not:`, "# driver, position in a frame, uid, name"];
   const rows = found.map(({ sheet, i }) =>
@@ -54,6 +54,8 @@ export class Wipe {
   update(told) {
     if (!told) return;
     this.told = told;
+    this.isRunning = told.running ?? this.isRunning;
+    setText(this.run, this.isRunning ? "Stop" : "Start anew");
     setText(this.text, `${count(told.touched)} of ${count(told.of)} touched`);
     this.meter.max = Math.max(told.of, 1);
     this.meter.value = told.touched;

@@ -21,8 +21,9 @@ from tests.browser.chromium import chromium
 PATIENCE_MS = 120_000
 SIZE = (1200, 700)
 EYE = "eye=0.02,-0.27,0.18,0.112,0.01,-0.004"
+ALONG = "eye=-0.2,-0.13,0.22,0.115,0,0"
 BELOW = "eye=0.02,-0.27,-0.18,0.112,0.01,-0.004"
-"""Of an emulated arm: from above the elbow, and from below it, where its boards 9 and 10 are."""
+"""Of an emulated arm: from above, along it from the elbow, and from below, where its boards 9 and 10 are."""
 
 
 def taxels(condition: str, at_least: int) -> str:
@@ -32,7 +33,7 @@ def taxels(condition: str, at_least: int) -> str:
 
 
 FRESH = taxels("taxel.mark === 'fresh'", 310)
-PRESSED = f"{FRESH} && " + taxels("taxel.level > 150", 8)
+PRESSED = f"{FRESH} && !skin.problems.length && " + taxels("taxel.level > 150", 8)
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Shown:
 PICTURES = {
     "view": Shown("torso", f"theme=dark&{EYE}", PRESSED, pins=(124, 200)),
     "view-light": Shown("torso", f"theme=light&{EYE}", PRESSED),
-    "view-phone": Shown("torso", "theme=dark", PRESSED, PHONE),
+    "view-phone": Shown("torso", f"theme=dark&{ALONG}", PRESSED, PHONE),
     "view-contacts": Shown(
         "arm",
         f"theme=light&{BELOW}",

@@ -20,7 +20,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Schema
+from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from skinware.errors import BadRecording
 from skinware.recording.mcap_writing import COMPRESSION, MAGIC
@@ -127,11 +127,16 @@ class McapSource:
         self._data = memoryview(self._map)
         self.channels: dict[int, Channel] = {}
         self.damaged: int = 0
+        self._compressions: set[str] = set()  # of chunks that are not where they should be
         try:
             self.chunks: list[ChunkPlace] = self._told_by_summary()
             self.is_whole: bool = True
         except Damaged:
             self.chunks, self.is_whole = list(self._whole_ones()), False
+        if not self.chunks and self._compressions - {COMPRESSION}:
+            self.close()
+            how = ", ".join(each or "nothing" for each in sorted(self._compressions))
+            raise BadRecording(f"{path}: compressed by {how}; recordings are by {COMPRESSION}")
         if not self.chunks and self._data[: len(MAGIC)] != MAGIC:
             self.close()
             raise BadRecording(f"{path}: not a recording (not an MCAP file)")
@@ -161,7 +166,7 @@ class McapSource:
             data = zstandard.ZstdDecompressor().decompress(compressed, max_output_size=place.size)
         except (zstandard.ZstdError, MemoryError) as error:
             raise Damaged(f"its contents cannot be decompressed ({error})") from None
-        if len(data) != place.size or (place.crc and zlib.crc32(data) != place.crc):
+        if len(data) != place.size or zlib.crc32(data) != place.crc:  # also 0, "none" in MCAP: ours always have one
             raise Damaged("its contents do not fit their checksum")
         return _parsed(data)
 
@@ -183,20 +188,26 @@ class McapSource:
         opcode, length, start, _, crc = _FOOTER.unpack_from(self._data, footer_at)
         if opcode != Opcode.FOOTER or length != _FOOTER.size - 9 or not len(MAGIC) <= start <= footer_at:
             raise Damaged("no footer")
-        if crc and zlib.crc32(self._data[start : end - 4]) != crc:
+        if zlib.crc32(self._data[start : end - 4]) != crc:
             raise Damaged("the summary does not fit its checksum")
-        places = []
+        places: list[ChunkPlace] = []
+        count = None
         for kind, record in _records(self._data[start:footer_at]):
             if kind == Opcode.CHUNK_INDEX:
                 start_ns, end_ns, offset, channel_ids = _chunk_index(record)
                 place = self._chunk_at(offset, channel_ids)
                 if place is None:
+                    self._compressions.add(_read(ChunkIndex, record).compression)
                     raise Damaged("a chunk is not where the summary says")
                 # times before a chunk have no checksum, those of the summary have
                 places.append(replace(place, start_ns=start_ns, end_ns=end_ns))
             elif kind == Opcode.CHANNEL:
                 channel = _read(Channel, record)
                 self.channels[channel.id] = channel
+            elif kind == Opcode.STATISTICS:
+                count = _read(Statistics, record).chunk_count
+        if count != len(places):
+            raise Damaged("the summary does not say where all chunks are")
         return places
 
     def _whole_ones(self) -> Iterator[ChunkPlace]:

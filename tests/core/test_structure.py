@@ -93,6 +93,18 @@ def test_physical_values_use_scale_and_offset() -> None:
         structure.physical(raw, "shear_x")
 
 
+def test_some_of_the_sensors_keep_what_they_belong_to() -> None:
+    whole = Structure(**tables())
+    for positions in (slice(1, 3), np.array([0, 3]), np.array([2])):
+        some = whole.only(positions)
+        assert some.sensor_uid.tolist() == whole.sensor_uid[positions].tolist()
+        assert some.sensor_type.tolist() == whole.sensor_type[positions].tolist()
+        assert some.sensor_module.tolist() == whole.sensor_module[positions].tolist()
+        assert (some.n_patches, some.n_modules, some.types) == (whole.n_patches, whole.n_modules, whole.types)
+    with pytest.raises(StructureError, match="at least one sensor"):
+        whole.only(slice(0))
+
+
 def test_tables_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         Structure(**tables()).sensor_uid[0] = 1

@@ -98,6 +98,23 @@ def test_damaged_times_before_a_chunk_change_nothing(original: Original, tmp_pat
                 assert opened.is_whole is not is_cut
 
 
+def test_a_chunk_that_lost_its_checksum_is_not_believed(original: Original, tmp_path: Path) -> None:
+    file = tmp_path / "damaged.mcap"
+    with McapSource(tmp_path / "original.mcap") as source:
+        place = source.chunks[len(source.chunks) // 2]
+    for data in (bytearray(original.data), bytearray(original.data[:-1])):
+        data[place.offset + 33 : place.offset + 37] = bytes(4)
+        for at in (place.compressed_at + place.compressed_size * part // 8 for part in range(1, 8)):
+            damaged = data.copy()
+            damaged[at] ^= 1
+            file.write_bytes(damaged)
+            found = frames_of(file)
+            assert all(original.frames[position] == contents for position, contents in found.items())
+            with skinware.recording.open(file) as opened:
+                list(opened["torso"].frames())
+                assert opened.problems == ["1 chunk damaged and left out"]
+
+
 def test_frames_without_their_generation_are_left_out_and_told(original: Original, tmp_path: Path) -> None:
     file = tmp_path / "damaged.mcap"
     data = bytearray(original.data)

@@ -6,11 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 import skinware.recording
 from skinware.errors import BadRecording, ConfigurationError, StructureError
@@ -177,6 +178,39 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
             writer.add_message(channel, 1, b"{}", 1)
             writer.finish()  # type: ignore[no-untyped-call]
         refused(None, words)
+
+
+def again(path: Path, target: Path, **options: Any) -> None:
+    """The same messages in a file that mcap's own writer makes."""
+    with path.open("rb") as old, target.open("wb") as new:
+        writer = Writer(new, **options)
+        writer.start("skinware")
+        known: dict[int, int] = {}
+        for schema, channel, message in make_reader(old).iter_messages(log_time_order=False):
+            assert schema is not None
+            if channel.id not in known:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            writer.add_message(
+                known[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def test_a_file_without_the_index_of_its_chunks_is_read_too(path: Path, tmp_path: Path) -> None:
+    for index_types, is_whole in ((IndexType.ALL, True), (IndexType.NONE, False), (IndexType.MESSAGE, False)):
+        again(path, tmp_path / "x.mcap", compression=CompressionType.ZSTD, index_types=index_types)
+        with skinware.recording.open(tmp_path / "x.mcap") as opened, skinware.recording.open(path) as original:
+            assert opened.is_whole is is_whole
+            assert len(opened["torso"].read(["status"])) == len(original["torso"].read(["status"]))
+            assert opened.problems == []
+
+
+def test_a_file_that_was_compressed_otherwise_is_refused_by_name(path: Path, tmp_path: Path) -> None:
+    for compression, words in ((CompressionType.LZ4, "by lz4"), (CompressionType.NONE, "by nothing")):
+        again(path, tmp_path / "x.mcap", compression=compression)
+        with pytest.raises(BadRecording, match=rf"x.mcap: compressed {words}; recordings are by zstd"):
+            skinware.recording.open(tmp_path / "x.mcap")
 
 
 def test_an_interrupted_writer_of_nothing_is_an_empty_recording(tmp_path: Path) -> None:

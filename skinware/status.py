@@ -99,6 +99,12 @@ class DataPath(enum.IntEnum):
     MIXED = 3
     """Through compiled code, from some of the buses; the others are read in Python. Of a driver, never of a bus."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> DataPath:
+        """A way that only later versions know."""
+        del value
+        return cls.NOT_TOLD
+
 
 LOAD_UNKNOWN, LOAD_FILTERED = 0, 0xFFFF
 """In place of a bus' load: its bit rate is not known; or its filters drop frames without counting them."""

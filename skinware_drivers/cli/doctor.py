@@ -119,14 +119,15 @@ def _recorded(file: Path, tell: Callable[[float], None]) -> Evidence:
     """Evidence of a recording.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is none, or cannot be read here.
     """
-    from skinware.errors import BadRecording, ConfigurationError
-    from skinware_drivers.doctor.recorded import look_at
+    from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 
     try:
+        from skinware_drivers.doctor.recorded import look_at
+
         return look_at(file, tell)
-    except BadRecording as error:
+    except (BadRecording, MissingExtra) as error:
         raise ConfigurationError(str(error)) from None
     except OSError as error:
         raise ConfigurationError(f"{file}: {error.strerror or error}") from None

@@ -19,11 +19,17 @@ _FORGOTTEN_S = 600.0
 
 def check(evidence: Evidence) -> Iterator[Note]:
     """What is to be said of files."""
+    others = [one for one in evidence.namespaces if not one.is_ours and not one.problem]
     for namespace in evidence.namespaces:
-        if not namespace.problem:
+        if namespace.is_ours and not namespace.problem:
             told = f"{plural(len(namespace.living), 'service')} alive, {len(namespace.dead)} dead"
             yield Looked(AREA, f"namespace {namespace.name}", told)
-        yield from _damaged(namespace)
+        if namespace.is_ours:
+            yield from _damaged(namespace)
+    if others:
+        living, dead = sum(len(one.living) for one in others), sum(len(one.dead) for one in others)
+        told = f"{plural(living, 'service')} alive, {dead} dead"
+        yield Looked(AREA, plural(len(others), "other namespace"), told)
     yield from _left(evidence)
     yield from _forgotten(evidence)
     if evidence.recording is not None:

@@ -45,15 +45,17 @@ class TaxelJudge:
             return
         self._first_ns = self._first_ns or frame.acquired_ns
         self._last_ns, self._due_ns = frame.acquired_ns, frame.acquired_ns + _PERIOD_NS
-        self._chain.step(frame, self._values, self._status)
-        self._health.update(frame.acquired_ns)
+        with np.errstate(all="ignore"):  # values may be any that a file or a device gives
+            self._chain.step(frame, self._values, self._status)
+            self._health.update(frame.acquired_ns)
 
     def seen(self) -> HealthSeen:
         """What is known now."""
         if self._why_not or not self._health:
             return HealthSeen("", 0, (), {"health": self._why_not or "it has no such sensors"})
         faults: list[TaxelFault] = []
-        reports = self._health.reports()
+        with np.errstate(all="ignore"):
+            reports = self._health.reports()
         known_noise = untouched = judged = 0
         for name, report in reports.items():
             positions = np.arange(self._structure.n_sensors)[self._structure.index(name)]

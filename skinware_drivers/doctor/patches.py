@@ -195,7 +195,10 @@ def _twice(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
             )
         return
     of_period = evidence.seconds * 1e9 / driver.timing.period_ns if driver.timing.period_ns else None
-    usual = median(enough.values()) if len(enough) > 2 else of_period
+    if len(enough) > 2:
+        usual = median(enough.values())
+    else:  # after it was held up, a driver gets more than its period's from all
+        usual = max(of_period or 0.0, min(enough.values()) if len(enough) > 1 else 0.0)
     for patch in driver.patches:
         count, only = enough.get(patch.name, 0.0), shlex.quote(f"patch={patch.name}")
         if usual and count > _TWICE * usual and _collides(patch):

@@ -34,7 +34,6 @@ from tests.sdk.driving import follow, read_until
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
 TIOCSETD, N_SLCAN, SIOCGIFNAME = 0x5423, 17, 0x8910
-NETEM = "netem delay 200s limit 5"
 FIRST, SECOND = slice(0, 8), slice(8, 16)
 
 
@@ -261,20 +260,6 @@ def iter_until_now(reader: DriverReader, start: DriverFrame) -> Iterator[DriverF
             return
         if frame.published_ns > start.published_ns:
             yield frame
-
-
-@pytest.fixture
-def full_queue() -> Iterator[Callable[[str], None]]:
-    """Makes the send queue of an interface hold five frames, each for a long time."""
-    made: list[str] = []
-
-    def make(name: str) -> None:
-        subprocess.run(["tc", "qdisc", "add", "dev", name, "root", *NETEM.split()], check=True)
-        made.append(name)
-
-    yield make
-    for name in made:
-        subprocess.run(["tc", "qdisc", "del", "dev", name, "root"], capture_output=True)
 
 
 def test_a_full_send_queue_is_an_error_of_that_frame_only(

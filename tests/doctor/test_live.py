@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skinware import BusReason, BusState, DriverWriter, Namespace, PatchState, Status
+from skinware import BusReason, BusState, DriverWriter, Namespace, Status
 from skinware.realtime import now_ns
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.finding import Severity
@@ -27,7 +27,7 @@ from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, pu
 from tests.cli.test_regions import placed_structure
 from tests.cli.test_sensor_health import looked_after
 from tests.doctor.rig import found, found_until, looked, of
-from tests.sdk.driving import driving
+from tests.sdk.driving import driving, emulated
 
 Skins = Callable[..., EmulatedSkin]
 DRIVERS = sorted(entry_points(group="skinware.emulators").names)
@@ -76,13 +76,10 @@ def test_a_board_that_dies(skins: Skins) -> None:
 
 
 def test_a_board_that_never_answered() -> None:
-    skin = FakeSkin()
-    skin.patch_state[2] = PatchState.EXPECTED
-    skin.status[skin.structure.patch_index(2)] = Status.NEVER_SEEN
-    with publishing(skin):
-        finding = found_until(of("patches", "board 9 never answered"))
+    with driving(emulated(boards=(7,)), boards=(7, 8)):
+        finding = found_until(of("patches", "board 8 never answered"))
     assert finding.severity == Severity.ERROR
-    assert "3 of 4 patches are live" in finding.evidence
+    assert finding.evidence == "state expected, no data of its 192 sensors; 1 of 2 patches are live"
 
 
 class _TwoWithOneAddress:

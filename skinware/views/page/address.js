@@ -4,7 +4,8 @@ const NUMBERS = /^-?[\d.]+(e-?\d+)?(,-?[\d.]+(e-?\d+)?)*$/;
 
 /**
  * @param {object} view `camera` ({position, target}, of 3 numbers each), `mode`, `type`, `scale` ([low, high] or
- *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`, `flat`, `sharp`; what is missing is left out.
+ *     null), `selected` (key of a row or null), `pins` (texts), `normals`, `theme`, `flat`, `sharp`; what is missing is
+ *     left out.
  */
 export function toHash(view) {
   const parts = new URLSearchParams();

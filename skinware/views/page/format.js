@@ -1,7 +1,7 @@
 // Figures as people read them.
 
 const NONE = "–";
-const isKnown = (x) => x !== null && x !== undefined && !Number.isNaN(x);
+export const isKnown = (x) => x !== null && x !== undefined && !Number.isNaN(x);
 
 /** Milliseconds as an age: "4 ms", "1.2 s", "3 min". */
 export function age(ms) {

@@ -34,10 +34,14 @@ export function fillHelp(dialog, theme) {
   const marks = MARKS.flatMap(({ name, sign }, mark) =>
     mark === FRESH ? [] : [h("dt", {}, picture(mark, theme)), h("dd", {}, `${name}: ${sign}`)],
   );
+  const close = { type: "button", class: "plain", "aria-label": "Close", onclick: () => dialog.close() };
+  const pointing =
+    "The mouse turns, the right button or shift moves, the wheel zooms; " +
+    "on a touch screen one finger turns, two move and zoom.";
   dialog.replaceChildren(
-    h("header", {}, h("h2", {}, "Keys and marks"), h("button", { type: "button", class: "plain", "aria-label": "Close", onclick: () => dialog.close() }, "✕")),
+    h("header", {}, h("h2", {}, "Keys and marks"), h("button", close, "✕")),
     h("div", { class: "columns" }, h("dl", {}, ...keys), h("dl", {}, ...marks)),
-    h("p", { class: "hint" }, "The mouse turns, the right button or shift moves, the wheel zooms; on a touch screen one finger turns, two move and zoom."),
+    h("p", { class: "hint" }, pointing),
   );
 }
 
@@ -50,9 +54,9 @@ export function onKeys(actions) {
     if (event.altKey || event.ctrlKey || event.metaKey || event.defaultPrevented) return;
     if (event.target.closest("input:not([type=range]), select, dialog")) return;
     const isSpaceOfButton = event.key === " " && event.target.closest("button, [role=treeitem]");
-    const isArrowOfOther = event.key.startsWith("Arrow") && event.target.closest("input, [role=treeitem], [role=radio]");
+    const hasArrows = event.target.closest("input, [role=treeitem], [role=radio]");
     const action = actions[event.key];
-    if (!action || isSpaceOfButton || isArrowOfOther) return;
+    if (!action || isSpaceOfButton || (hasArrows && event.key.startsWith("Arrow"))) return;
     event.preventDefault();
     action(event);
   });

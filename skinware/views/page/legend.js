@@ -40,7 +40,8 @@ export class Legend {
     for (const [input, end] of [[this.low, ends[0]], [this.high, ends[1]]]) {
       if (document.activeElement !== input) input.value = figure(end);
     }
-    byId("gradient").setAttribute("aria-label", `colours from ${figure(scale.low)} to ${figure(scale.high)} ${scale.unit}`);
+    const [low, high] = ends.map(figure);
+    byId("gradient").setAttribute("aria-label", `colours from ${low} to ${high} ${scale.unit}`);
     setText(byId("unit"), scale.unit || "");
     setPressed(byId("auto"), fixed === null);
     const versions = sheets.map(({ driver, marksVersion }) => `${driver.key}:${marksVersion}`).join();
@@ -53,8 +54,8 @@ export class Legend {
   }
 
   #item(mark, n) {
-    if (!this.#items.has(mark)) this.#items.set(mark, h("span", { class: "mark" }, picture(mark, this.theme), h("span")));
-    const item = this.#items.get(mark);
+    const item = this.#items.get(mark) ?? h("span", { class: "mark" }, picture(mark, this.theme), h("span"));
+    this.#items.set(mark, item);
     setText(item.lastChild, `${MARKS[mark].name} ${count(n)}`);
     return item;
   }

@@ -119,7 +119,8 @@ function alive() {
 function disconnected(reason, wait_ms) {
   now.isAlive = false;
   const why = reason ? ` (${reason})` : "";
-  setText(byId("lost"), `No connection to skin-view${why}. What is shown is old. Trying again in ${(wait_ms / 1000).toFixed(1)} s.`);
+  const again = `Trying again in ${(wait_ms / 1000).toFixed(1)} s.`;
+  setText(byId("lost"), `No connection to skin-view${why}. What is shown is old. ${again}`);
   setHidden(byId("lost"), false);
   skin.cut(true);
   show();
@@ -214,7 +215,8 @@ function tell() {
   const first = stage.sheets[0];
   const scale = first ? { low: first.shown.scale[0], high: first.shown.scale[1], unit: first.unit } : skin.scale;
   legend.update(scale, view.scale, stage.sheets);
-  setHidden(byId("view").querySelector(".legend"), !stage.sheets.length);
+  setHidden(byId("legend"), !stage.sheets.length);
+  setHidden(byId("empty"), stage.sheets.length > 0 || !now.isAlive);
 }
 
 function sheetsChanged() {
@@ -336,7 +338,9 @@ function hover(found) {
 /** Point at the taxel after the one that is pointed at, among those selected; for those without a mouse. */
 function step(by) {
   const isIn = selection() ?? (() => true);
-  const all = stage.sheets.flatMap((sheet) => Array.from({ length: sheet.n }, (_, i) => ({ sheet, i })).filter(({ i }) => isIn(sheet, i)));
+  const all = stage.sheets
+    .flatMap((sheet) => Array.from({ length: sheet.n }, (_, i) => ({ sheet, i })))
+    .filter(({ sheet, i }) => isIn(sheet, i));
   if (!all.length) return;
   const at = all.findIndex(({ sheet, i }) => sheet === probes.hovered?.sheet && i === probes.hovered?.i);
   const found = all[at < 0 ? 0 : (at + by + all.length) % all.length];

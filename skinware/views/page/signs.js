@@ -68,4 +68,8 @@ export function signOf(mark, u, v, r, size, level, { ground, ink, soft, hollow, 
 }
 
 const apart = (one, other) => Math.hypot(...[0, 1, 2].map((c) => one[c] - other[c]));
-const packed = (rgb) => ((255 << 24) | (Math.round(rgb[2]) << 16) | (Math.round(rgb[1]) << 8) | Math.round(rgb[0])) >>> 0;
+
+function packed(rgb) {
+  const [r, g, b] = rgb.map(Math.round);
+  return ((255 << 24) | (b << 16) | (g << 8) | r) >>> 0;
+}

@@ -5,7 +5,8 @@ const MARGIN = 3; // above and below
 /**
  * @param {Float32Array} time_s rising; the last is now.
  * @param {Float32Array} value NaN: left out.
- * @returns {{points: string, low: ?number, high: ?number}} of each column of the picture the lowest and the highest value.
+ * @returns {{points: string, low: ?number, high: ?number}} of each column the lowest and the highest
+ *     value.
  */
 export function polyline(time_s, value, width, height, shown_s) {
   const end = time_s.at(-1);

@@ -18,8 +18,8 @@ export class Stage {
   /**
    * @param {HTMLElement} host what the canvases fill.
    * @param {object} options `flat`: without WebGL; `sharp`: in all pixels, however slow; `theme`; `drawOver(stage)`:
-   *     draws over each frame; `moved()`: the eye moved; `resized()`: nobody has turned the view, which has another size
-   *     now; `changed()`: taxels are drawn another way now.
+   *     draws over each frame; `moved()`: the eye moved; `resized()`: nobody has turned the view, which has another
+   *     size now; `changed()`: taxels are drawn another way now.
    */
   constructor(host, options) {
     this.host = host;

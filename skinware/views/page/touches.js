@@ -33,7 +33,9 @@ export class Touches {
     setHidden(this.regions, !header.regions?.length);
     fill(
       this.regionRows,
-      (header.regions ?? []).map(({ name, value, unit, touched }) => [name, measure(value, unit), touched ? "◉ touched" : ""]),
+      (header.regions ?? []).map(({ name, value, unit, touched }) => {
+        return [name, measure(value, unit), touched ? "◉ touched" : ""];
+      }),
     );
     return places.filter(({ at }) => at);
   }

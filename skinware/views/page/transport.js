@@ -62,7 +62,8 @@ export class ReplayControls {
     this.host = host;
     this.act = act;
     const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
-    this.play = button("Pause", "Stop or go on with the replay", () => act(this.told.paused ? "resume" : "pause", null));
+    const toggle = () => act(this.told.paused ? "resume" : "pause", null);
+    this.play = button("Pause", "Stop or go on with the replay", toggle);
     this.back = button("Back", "One frame back (,)", () => this.step(-1));
     this.on = button("Step", "One frame on (.)", () => this.step(1));
     this.slider = h("input", { type: "range", min: 0, step: 0.1, "aria-label": "Time in the recording, seconds" });
@@ -71,7 +72,8 @@ export class ReplayControls {
     this.speed.addEventListener("change", () => act("speed", Number(this.speed.value)));
     this.loop = button("Loop", "Begin anew at the end", () => act("loop", !this.told.loop));
     this.when = h("output");
-    host.append(h("span", { class: "name" }, "Replay"), this.play, this.back, this.on, this.slider, this.when, this.speed, this.loop);
+    const { play, back, on, slider, when, speed, loop } = this;
+    host.append(h("span", { class: "name" }, "Replay"), play, back, on, slider, when, speed, loop);
   }
 
   /** Go so many frames on, or back. */
@@ -87,7 +89,7 @@ export class ReplayControls {
     setPressed(this.loop, Boolean(told.loop));
     this.slider.max = told.duration_s;
     if (!this.slider.matches(":active")) this.slider.value = told.time_s;
-    if (!SPEEDS.includes(told.speed) && ![...this.speed.options].some(({ value }) => Number(value) === told.speed)) {
+    if (![...this.speed.options].some(({ value }) => Number(value) === told.speed)) {
       this.speed.append(h("option", { value: told.speed }, `${told.speed}×`));
     }
     if (document.activeElement !== this.speed) this.speed.value = String(told.speed);

@@ -1,7 +1,7 @@
 // The tree of drivers, buses and patches: what has a problem first; a row selects what it stands for.
 
 import { h, setChildren, setText } from "./dom.js";
-import { age, percent, rate } from "./format.js";
+import { age, isKnown, percent, rate } from "./format.js";
 
 const COLLAPSED_FROM = 40; // patches of a driver: more are folded, but for those with problems
 const GOOD = new Set(["live", ""]);
@@ -22,8 +22,10 @@ const SIGNS = ["●", "◔", "◑", "✕"]; // by badness: told apart without co
  * @param {Map<number, object>} states what the newest state says of each driver.
  */
 export function rowsOf(drivers, states) {
-  const worst = (rows) => rows.map((row, i) => [row, i]).sort(([a, i], [b, j]) => b.bad - a.bad || i - j).map(([row]) => row);
-  const rowOf = (level, key, name, told, more = {}) => ({ level, key, name, told: told ?? {}, bad: badness(told?.state), ...more });
+  const worst = (rows) => rows.toSorted((one, other) => other.bad - one.bad); // stable
+  const rowOf = (level, key, name, told, more) => {
+    return { level, key, name, told: told ?? {}, bad: badness(told?.state), ...more };
+  };
   const branches = [...drivers].map((driver) => {
     const state = states.get(driver.id);
     const buses = driver.buses.map((bus, b) => {
@@ -77,12 +79,13 @@ export class Tree {
     const open = (rows) =>
       rows.flatMap((row) => {
         if (!row.children?.length) return [row];
-        return [row, ...open(this.#isFolded(row) ? row.children.filter(({ bad }) => row.level > 1 && bad) : row.children)];
+        const seen = this.#isFolded(row) ? row.children.filter(({ bad }) => row.level > 1 && bad) : row.children;
+        return [row, ...open(seen)];
       });
     this.#shown = open(this.branches);
     const focused = document.activeElement?.closest?.("[role=treeitem]");
     const elements = this.#shown.map((row) => this.#element(row));
-    if (!elements.length) elements.push((this.empty ??= h("p", { class: "hint" }, "No driver runs. It appears here as soon as one does.")));
+    if (!elements.length) elements.push((this.empty ??= h("p", { class: "hint" }, "No driver runs.")));
     setChildren(this.host, elements);
     for (const [key, element] of this.#rows) if (!element.isConnected) this.#rows.delete(key);
     if (focused?.isConnected && document.activeElement !== focused) focused.focus();
@@ -99,7 +102,8 @@ export class Tree {
     let element = this.#rows.get(row.key);
     if (!element) {
       const cells = ["fold", "sign", "name", "state", "figures"].map((part) => h("span", { class: part }));
-      element = h("div", { role: "treeitem", class: "row", "data-role": "row", "data-key": row.key, "aria-level": row.level }, ...cells);
+      const attributes = { role: "treeitem", class: "row", "data-role": "row", "data-key": row.key };
+      element = h("div", { ...attributes, "aria-level": row.level }, ...cells);
       element.dataset.driver = row.driver.key;
       if (row.level > 1) element.dataset.bus = row.driver.buses[row.bus];
       if (row.level > 2) element.dataset.patch = row.name;
@@ -114,7 +118,9 @@ export class Tree {
     element.dataset.bad = own;
     setText(name, row.level === 1 && this.severalNamespaces ? `${row.name} · ${row.driver.namespace}` : row.name);
     setText(state, own ? [row.told.state, row.told.reason].filter(Boolean).join(": ") : "");
-    setText(figures, figuresOf(row));
+    const texts = figuresOf(row);
+    while (figures.children.length < texts.length) figures.append(h("span"));
+    texts.forEach((text, i) => setText(figures.children[i], text));
     element.setAttribute("aria-selected", String(row.key === this.selected));
     return element;
   }
@@ -156,8 +162,8 @@ export class Tree {
   }
 }
 
+/** Texts of a row's figures; always as many for a row of a level. */
 function figuresOf({ level, told }) {
-  if (level === 2) return told.load === undefined || told.load === null ? "" : percent(told.load);
-  const parts = [rate(told.rate_hz), age(told.age_ms)];
-  return told.rate_hz === undefined && told.age_ms === undefined ? "" : parts.join("  ");
+  if (level === 2) return [isKnown(told.load) ? percent(told.load) : ""];
+  return [isKnown(told.rate_hz) ? rate(told.rate_hz) : "", isKnown(told.age_ms) ? age(told.age_ms) : ""];
 }

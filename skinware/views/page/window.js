@@ -17,7 +17,8 @@ export function notify(text) {
 
 /** Load the page anew, since it is of another version than the server; but not for ever. */
 export function reload(version) {
-  if (sessionStorage.getItem("reloaded") === version) return notify("This page and skin-view are of different versions.");
+  const isDone = sessionStorage.getItem("reloaded") === version;
+  if (isDone) return notify("This page and skin-view are of different versions.");
   sessionStorage.setItem("reloaded", version);
   location.reload();
 }

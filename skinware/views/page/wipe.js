@@ -14,7 +14,8 @@ export function untouched(sheets) {
 /** The list as a text: a line for each, with its place in a frame, its uid and its name. */
 function listOf(sheets, told) {
   const found = untouched(sheets);
-  const head = [`# ${told.touched} of ${told.of} touched; those that were not:`, "# driver, position in a frame, uid, name"];
+  const title = `# ${told.touched} of ${told.of} touched; those that were not:`;
+  const head = [title, "# driver, position in a frame, uid, name"];
   const rows = found.map(({ sheet, i }) =>
     [sheet.driver.name, sheet.index[i], `0x${sheet.uid[i].toString(16)}`, sheet.names?.[i] ?? ""].join("\t"),
   );

@@ -12,6 +12,7 @@ import pytest
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.sensor_types import PRESSURE
+from skinware.wire import read_pieces
 from skinware_drivers import Byte, Frame, Layout, Module, NoOptions, Patch, SequenceNumber, Values, taxels
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
@@ -57,6 +58,17 @@ def test_names() -> None:
 def test_names_that_are_none(name: str, told: str) -> None:
     with pytest.raises(ConfigurationError, match=told):
         make_bus(name)
+
+
+def test_what_goes_over_the_wire_is_kept_datagram_by_datagram() -> None:
+    with sender() as device, opened("udp://:0", Unframed(64)) as bus:
+        bus.tap.open()
+        for payload in (b"one", b"two"):
+            device.sendto(payload, (LOCAL, port_of(bus)))
+        assert take(bus, 2) == [b"one", b"two"]
+        bus.send(0, b"three")
+        pieces = [piece for batch in bus.tap.fetch() for piece in read_pieces(bytes(batch))[0]]
+        assert [(piece.is_sent, piece.data) for piece in pieces] == [(False, b"one"), (False, b"two"), (True, b"three")]
 
 
 def test_each_datagram_is_a_frame_and_an_empty_one_is_none() -> None:

@@ -187,7 +187,7 @@ class UdpBus(SerialBus):
     def _read(self, port: Port) -> None:
         """One datagram: never two as one."""
         if datagram := port.read(CHUNK):
-            self._stream.add(datagram, now_ns())
+            self._hear(datagram, now_ns())
         if self._udp is not None:
             self.counters.refused += self._udp.foreign
             self._udp.foreign = 0

@@ -14,14 +14,18 @@ from msgspec import Meta
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
+from skinware_drivers import native
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.master import Listener, Master, Talk, Timing
+from skinware_drivers.modbus.native_master import NativeMaster
 from skinware_drivers.modbus.registers import Order, Wanted
+from skinware_drivers.native.kernel_bus import KernelBus
+from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
-from skinware_drivers.serial.ports import Port
+from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.address import Address, parse_address
 from skinware_drivers.streams.tcp import TcpOptions, TcpPort, TcpServerBus, connect
@@ -59,7 +63,7 @@ def device_end(channel: str, options: dict[str, str] | None = None, **more: Any)
     return SerialBus(channel, options, **more)
 
 
-class ModbusBus(Bus):
+class ModbusBus(KernelBus):
     """Its name is ``modbus:tcp://HOST[:PORT]`` or ``modbus:/dev/ttyUSB0``, with ``?key=value``.
 
     As master, it asks for the registers of :meth:`use` by itself, one question at a time. With ``listen``, or opened to
@@ -111,7 +115,10 @@ class ModbusBus(Bus):
         self._baudrate = DEFAULT_BAUDRATE
         self._port: Port | None = None
         self._talk: Talk | None = None
+        self._timer: Timer | None = None
+        self._epoll: select.epoll | None = None
         self._unsent = b""
+        self._left = b""  # by C, to be understood
 
     @property
     def name(self) -> str:
@@ -154,14 +161,15 @@ class ModbusBus(Bus):
             BusNotAvailable: not there, not permitted or taken; the message says what to do.
             ConfigurationError: no such kind of port, or it has no such baud rate.
         """
-        if self._port is not None:
+        if self._epoll is not None:
             return
         self._port = self._open_port()
         self._timer = self._make_timer()
-        self._epoll = select.epoll()
-        self._epoll.register(self._port.fileno(), select.EPOLLIN)
-        self._epoll.register(self._timer.fileno(), select.EPOLLIN)
+        epoll = select.epoll()
+        epoll.register(self._port.fileno(), select.EPOLLIN)
+        epoll.register(self._timer.fileno(), select.EPOLLIN)
         self._begin_anew()
+        self._epoll = epoll  # last: the driver looks at it while a thread opens the bus
 
     def _open_port(self) -> Port:
         if self._address is not None:
@@ -169,19 +177,21 @@ class ModbusBus(Bus):
         return open_port(find_port(self.channel, self._serial_options), self._serial_options, self._baudrate)
 
     def _begin_anew(self) -> None:
-        self._unsent = b""
+        self._unsent = self._left = b""
         if self.listen_only:
             self._talk = Listener(self._wanted, self.counters)
         else:
             over_tcp = self._address is not None
-            self._talk = Master(
+            kind = Master if native.library() is None else NativeMaster
+            self._talk = kind(
                 self._wanted, self._timing, self.counters, over_tcp=over_tcp, name=self.name, begun_ns=now_ns()
             )
         self._wake()
 
     def fileno(self) -> int:
         """A descriptor that is readable when ``receive`` has something to do; -1 while the bus is closed."""
-        return -1 if self._port is None else self._epoll.fileno()
+        epoll = self._epoll
+        return -1 if epoll is None else epoll.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
         """Take replies, ask what is due, and append the frames that are whole.
@@ -192,7 +202,10 @@ class ModbusBus(Bus):
         port, talk = self._port, self._talk
         if port is None or talk is None:
             raise BusNotAvailable(f"{self!r} is not open")
-        if chunk := port.read(CHUNK):
+        left, self._left = self._left, b""
+        come = port.read(CHUNK)
+        self.tap.keep_bytes(now_ns(), come)
+        if chunk := left + come:
             damaged = self.counters.framing.checksum_errors
             try:
                 talk.heard(chunk, now_ns())
@@ -212,6 +225,38 @@ class ModbusBus(Bus):
         self.counters.frames += taken
         self._wake()
         return taken
+
+    @property
+    def reads_natively(self) -> bool:
+        """Whether C asks and takes the replies, as long as all is well."""
+        is_there = native.library() is not None and not self.listen_only
+        return is_there and isinstance(self._port, DescriptorPort | None)
+
+    def hand_over(self, batch: FrameBatch, source: Source) -> bool:  # noqa: ARG002
+        """Have C ask; see :class:`skinware_drivers.native.kernel_bus.KernelBus`."""
+        talk, port = self._talk, self._port
+        if not isinstance(talk, NativeMaster) or not isinstance(port, DescriptorPort):
+            return False
+        if self._epoll is None or self._timer is None:  # a thread is opening it
+            return False
+        if self._unsent or self._left or self.tap.is_open:  # C would keep nothing of what it sends
+            return False
+        address = talk.hand_over(port.fileno())
+        if address is None:
+            return False
+        self._timer.wake_at(None)  # C looks at the time itself
+        source.fd, source.asker = self.fileno(), address
+        return True
+
+    def take_back(self, source: Source) -> None:  # noqa: ARG002
+        """Go on from where C is."""
+        if isinstance(self._talk, NativeMaster):
+            self._left = self._talk.take_back()
+            self._wake()
+
+    def nothing_received(self, number: int) -> int:  # noqa: ARG002
+        """Nothing: Python reads again what C could not."""
+        return 0
 
     def send(self, identifier: int, payload: bytes) -> None:
         """Have a message sent to a unit between two reads.
@@ -234,11 +279,11 @@ class ModbusBus(Bus):
 
     def close(self) -> None:
         """Let go of the port. Idempotent."""
-        if self._port is not None:
-            self._epoll.close()
-            self._timer.close()
-            self._port.close()
-            self._port = self._talk = None
+        epoll, port, timer = self._epoll, self._port, self._timer
+        self._epoll = self._port = self._timer = self._talk = None  # first: a thread may close it, too
+        for each in (epoll, timer, port):
+            if each is not None:
+                each.close()
 
     @property
     def note(self) -> str:
@@ -250,15 +295,17 @@ class ModbusBus(Bus):
         if said or self._unsent:
             self._unsent += said
             try:
-                self._unsent = self._unsent[port.write(self._unsent) :]
+                written = port.write(self._unsent)
             except OSError as error:
                 raise BusNotAvailable(f"{self.name}: {os.strerror(error.errno or 0)}") from None
+            self.tap.keep_bytes(now_ns(), self._unsent[:written], is_sent=True)
+            self._unsent = self._unsent[written:]
 
     def _wake(self) -> None:
         """Be readable when something is due, or is still to be handed out."""
-        talk = self._talk
-        if talk is not None:
-            self._timer.wake_at(0 if talk.rows or self._unsent else talk.due_ns)
+        talk, timer = self._talk, self._timer
+        if talk is not None and timer is not None:
+            timer.wake_at(0 if talk.rows or self._unsent or self._left else talk.due_ns)
 
 
 __all__ = ["DEFAULT_PORT", "ModbusBus", "ModbusOptions", "device_end"]

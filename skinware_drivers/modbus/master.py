@@ -68,7 +68,7 @@ class Talk(ABC):
         """When ``say`` has something to do; None: not before something is heard."""
 
 
-class _Open(NamedTuple):
+class Open(NamedTuple):
     """A question that waits for its reply."""
 
     message: Message
@@ -122,9 +122,9 @@ class Master(Talk):
         self._rtu = None if over_tcp else wire.RtuMessages(counters.framing)
         self._commands: deque[Message] = deque()
         self._troubles: dict[Hashable, _Trouble] = {}
-        self._open: _Open | None = None
+        self._open: Open | None = None
         self._late: Message | None = None
-        self._again: _Open | None = None
+        self._again: Open | None = None
         self._number = 0
         self._free_ns = self._cycle_ns = begun_ns
         self._deadline_ns = begun_ns
@@ -137,6 +137,12 @@ class Master(Talk):
             self._commands.append(message)
             return True
         return False
+
+    @property
+    def _holds_back(self) -> bool:
+        """Whether something has come that is no whole message."""
+        found = self._tcp if self._rtu is None else self._rtu
+        return found is not None and found.pending > 0
 
     @property
     def due_ns(self) -> int | None:
@@ -214,13 +220,13 @@ class Master(Talk):
             read = self._reads[asked.read]
             self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._cycle_ns)
 
-    def _take_damaged(self, asked: _Open, time_ns: int) -> None:
+    def _take_damaged(self, asked: Open, time_ns: int) -> None:
         """What came is as long as the reply, and is none: ask again once the line is silent."""
         self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
         if asked.tries < _MOST_TRIES:
             self._again = asked
 
-    def _take_exception(self, asked: _Open, code: int, time_ns: int) -> None:
+    def _take_exception(self, asked: Open, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
@@ -232,7 +238,7 @@ class Master(Talk):
             log.warning("%s: %s: %s", self._name, what, wire.exception_text(code))
         trouble.again(time_ns)
 
-    def _give_up(self, asked: _Open, time_ns: int) -> None:
+    def _give_up(self, asked: Open, time_ns: int) -> None:
         self._open = None
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
@@ -254,7 +260,7 @@ class Master(Talk):
             message = message._replace(number=self._number)
         elif self._rtu is not None:
             self._rtu.drop()
-        self._open = _Open(message, read, until_ns, tries + 1)
+        self._open = Open(message, read, until_ns, tries + 1)
         self._counters.sent += 1
         return wire.rtu_frame(message) if self._tcp is None else wire.tcp_frame(message)
 
@@ -318,4 +324,4 @@ class Listener(Talk):
                 self.rows += self._image.overhear(asked.unit, asked.data, message.data[2:], time_ns, since_ns)
 
 
-__all__ = ["ANSWERS", "Listener", "Master", "Talk", "Timing"]
+__all__ = ["ANSWERS", "Listener", "Master", "Open", "Talk", "Timing"]

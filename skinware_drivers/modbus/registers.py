@@ -151,12 +151,21 @@ class Row(NamedTuple):
     payload: bytes
 
 
-class _Area:
+class Area:
+    """Registers without a gap between them.
+
+    Attributes:
+        where: they are.
+        registers: (n, 2) uint8, as they came.
+        heard_ns: (n,) int64, when.
+        blocks: identifier and first register of the blocks in it.
+    """
+
     def __init__(self, where: Registers) -> None:
-        self.where = where
+        self.where: Registers = where
         self.registers: npt.NDArray[np.uint8] = np.zeros((where.count, 2), np.uint8)
         self.heard_ns: npt.NDArray[np.int64] = np.zeros(where.count, np.int64)
-        self.blocks: list[tuple[int, int, Registers]] = []  # identifier, first register
+        self.blocks: list[tuple[int, int, Registers]] = []
 
 
 class Image:
@@ -164,14 +173,20 @@ class Image:
 
     Args:
         wanted: the blocks; the identifier of a frame is the number of its block.
+
+    Attributes:
+        areas: the registers.
+        told_ns: (n_blocks,) int64, when the frame of each was last whole.
+        is_plain: frames are the registers as they come.
     """
 
     def __init__(self, wanted: Wanted) -> None:
         self._wanted = wanted
-        self._areas = [_Area(area) for area in wanted.areas()]
-        self._told_ns = [0] * len(wanted.blocks)
+        self.is_plain = (wanted.byte_order, wanted.word_order) == ("big", "big")
+        self.areas: list[Area] = [Area(area) for area in wanted.areas()]
+        self.told_ns: npt.NDArray[np.int64] = np.zeros(len(wanted.blocks), np.int64)
         for number, block in enumerate(wanted.blocks):
-            area, first = next(found for found in map(self._place, self._areas, [block] * len(self._areas)) if found)
+            area, first = next(found for found in map(self._place, self.areas, [block] * len(self.areas)) if found)
             area.blocks.append((number, first, block))
 
     def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
@@ -187,7 +202,7 @@ class Image:
         Returns:
             The frames that are whole now.
         """
-        place = self._areas[area]
+        place = self.areas[area]
         end = first + len(data) // 2
         place.registers[first:end] = np.frombuffer(data, np.uint8).reshape(-1, 2)
         place.heard_ns[first:end] = time_ns
@@ -196,8 +211,8 @@ class Image:
             if begin + block.count <= first or begin >= end:
                 continue
             oldest_ns = int(place.heard_ns[begin : begin + block.count].min())
-            if oldest_ns > self._told_ns[number] and oldest_ns >= since_ns:
-                self._told_ns[number] = time_ns
+            if oldest_ns > self.told_ns[number] and oldest_ns >= since_ns:
+                self.told_ns[number] = time_ns
                 rows.append(Row(oldest_ns, number, self._bytes(place.registers[begin : begin + block.count], block)))
         return rows
 
@@ -205,7 +220,7 @@ class Image:
         """Take registers that another master has read, as far as they are wanted; see :meth:`put`."""
         address, count = int.from_bytes(question[1:3], "big"), int.from_bytes(question[3:5], "big")
         rows: list[Row] = []
-        for number, area in enumerate(self._areas):
+        for number, area in enumerate(self.areas):
             where, step = area.where, self._wanted.step
             if (where.unit, where.function) != (unit, question[0]) or (address - where.address) % step:
                 continue
@@ -215,7 +230,7 @@ class Image:
                 rows += self.put(number, place + begin, data[2 * begin : 2 * end], time_ns, since_ns)
         return rows
 
-    def _place(self, area: _Area, block: Registers) -> tuple[_Area, int] | None:
+    def _place(self, area: Area, block: Registers) -> tuple[Area, int] | None:
         where = area.where
         first, odd = divmod(block.address - where.address, self._wanted.step)
         is_in = _key(where) == _key(block) and not odd and 0 <= first <= where.count - block.count

@@ -132,6 +132,11 @@ class TcpMessages:
             self._counters.frames += 1
             yield Message(unit, data, number)
 
+    @property
+    def pending(self) -> int:
+        """Bytes that may still become part of a message."""
+        return len(self._rest)
+
     def drop(self) -> None:
         """Forget what was left over."""
         self._counters.skipped_bytes += len(self._rest)
@@ -161,6 +166,11 @@ class RtuMessages:
     def next_of(self, asked: Message | None) -> Message | None:
         """The next message on a line on which others speak: the reply to what was asked before, or a question."""
         return self._first([] if asked is None else [(asked.unit, asked.data)], also_questions=True)
+
+    @property
+    def pending(self) -> int:
+        """Bytes that may still become part of a message."""
+        return len(self._rest)
 
     def drop(self) -> None:
         """Forget what was left over."""

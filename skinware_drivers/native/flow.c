@@ -26,6 +26,11 @@ static struct source *source_of(const struct flow *flow, int fd)
     return NULL;
 }
 
+static bool receive_from(struct path *path, struct source *source)
+{
+    return source->asker ? receive_asked(path, source) : (source->stream ? receive_line : receive)(path, source);
+}
+
 /* Fill the batch from buses, each with its share; how many of them had something, and whether one has more. */
 static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t time_ns, bool *is_behind)
 {
@@ -39,7 +44,7 @@ static int64_t fill(struct path *path, struct source **ready, int64_t n, int64_t
     for (int64_t i = 0; i < n; i++) {
         batch->limit = batch->stop + (least(batch->capacity, batch->headroom + most) - batch->stop) / (n - i);
         int64_t first = batch->stop;
-        if (ready[i]->fd < 0 || !(ready[i]->stream ? receive_line : receive)(path, ready[i]))
+        if (ready[i]->fd < 0 || !receive_from(path, ready[i]))
             continue;
         n_taken++;
         if (batch->stop == first)
@@ -67,6 +72,9 @@ static bool is_among(struct source **ready, int64_t n, const struct source *sour
 static int64_t find_ready(struct flow *flow, struct source **ready)
 {
     struct epoll_event events[MOST_EVENTS];
+    for (struct source *source = flow->sources; source < flow->sources + flow->n_sources; source++)
+        if (source->asker && source->asker->is_stuck)
+            return -1;
     if (!flow->has_others && flow->n_sources <= FEW) {
         for (int64_t i = 0; i < flow->n_sources; i++)
             ready[i] = &flow->sources[i];
@@ -79,7 +87,7 @@ static int64_t find_ready(struct flow *flow, struct source **ready)
             return -1;
     }
     for (struct source *source = flow->sources; source < flow->sources + flow->n_sources && n < MOST_EVENTS; source++)
-        if (source->stream && source->stream->is_behind && !is_among(ready, n, source))
+        if ((source->asker || (source->stream && source->stream->is_behind)) && !is_among(ready, n, source))
             ready[n++] = source;
     return n;
 }
@@ -132,6 +140,15 @@ static bool sleep_until(struct flow *flow, int64_t until_ns, int64_t time_ns, bo
     return n < 0 || fds[0].revents;
 }
 
+/* When the first of those that ask has something to do. */
+static int64_t first_question_ns(const struct flow *flow, int64_t until_ns)
+{
+    for (const struct source *source = flow->sources; source < flow->sources + flow->n_sources; source++)
+        if (source->fd >= 0 && source->asker)
+            until_ns = least(until_ns, asker_due_ns(source->asker));
+    return until_ns;
+}
+
 /* Until there is a reason to come back. */
 SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
 {
@@ -166,6 +183,7 @@ SKINWARE_EXPORT int64_t skinware_flow_run(struct path *path, struct flow *flow)
         int64_t until_ns = least(flow->until_ns, due_ns);
         if (is_any_silent(flow, time_ns, &until_ns))
             return NEWS;
+        until_ns = first_question_ns(flow, until_ns);
         if (is_resting)
             until_ns = least(until_ns, flow->rest_until_ns);
         if (sleep_until(flow, until_ns, time_ns, is_resting))

@@ -9,9 +9,37 @@ struct tap { /* wire_tap.py: what goes over a wire, kept until Python fetches it
     int64_t room, size, lost;
 };
 
+struct asked_block { /* registers that make one frame */
+    const uint8_t *registers;
+    const int64_t *heard_ns;
+    int64_t *told_ns; /* when the frame was last whole */
+    int64_t count, identifier;
+};
+
+struct asked_read { /* one question, and the beginning of its reply, both with room for a number in front over TCP */
+    uint8_t *question, *reply, *registers;
+    int64_t question_bytes, reply_head, reply_bytes, count, n_blocks;
+    int64_t *heard_ns;
+    const struct asked_block *blocks;
+};
+
+struct asker { /* a Modbus master */
+    int64_t fd, is_tcp, is_stuck; /* is_stuck: Python has to go on */
+    int64_t n_reads, most_blocks; /* of a cycle; blocks that a reply can complete */
+    struct asked_read *reads;
+    int64_t open, next, number, cycle; /* open: the read whose reply is awaited, -1: none */
+    int64_t until_ns, free_ns, cycle_ns, deadline_ns; /* timeout; earliest next question; of the cycle: begun, next */
+    int64_t timeout_ns, turnaround_ns, period_ns;
+    int64_t sent, polls_missed, frames, bytes_in, frame_bytes, found;
+    uint8_t *buffer; /* what has come of the reply */
+    int64_t size;
+    const uint32_t *crc_table;
+};
+
 struct source { /* a serial line, or a socket whose datagrams are struct can_frame or canfd_frame, with stamps */
     int64_t fd, bus;                           /* fd: as it is known in `epoll_fd`, -1: it is gone */
-    struct stream *stream;                     /* of a line; NULL: what follows tap is of a socket */
+    struct stream *stream;                     /* of a line */
+    struct asker *asker;                       /* of one on which we ask; neither: what follows tap is of a socket */
     struct tap *tap;                           /* NULL: nobody wants what comes */
     int64_t headers, control;                  /* addresses of a mmsghdr and of 8 words for every row of the batch */
     int64_t offset_ns, last_poll_ns;           /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
@@ -33,5 +61,7 @@ bool receive(struct path *path, struct source *source);
 bool receive_line(struct path *path, struct source *source);
 void keep_frames(const struct path *path, const struct source *source, int64_t first, int64_t n);
 void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns);
+bool receive_asked(struct path *path, struct source *source);
+int64_t asker_due_ns(const struct asker *asker);
 
 #endif

@@ -297,17 +297,18 @@ SKINWARE_EXPORT void skinware_stream_add(struct stream *stream, const uint8_t *c
     end_chunk(stream, n, time_ns);
 }
 
-static void append(struct batch *batch, int64_t bus, const struct found *found, int64_t time_ns)
+void append_row(struct batch *batch, int64_t bus, int64_t identifier, const uint8_t *body, int64_t size,
+                int64_t time_ns)
 {
     uint8_t *row = batch->wire + batch->stop * batch->row_bytes;
-    uint32_t identifier = (uint32_t)found->identifier, length = (uint32_t)found->size;
-    memcpy(row, &identifier, sizeof identifier);
+    uint32_t name = (uint32_t)identifier, length = (uint32_t)size;
+    memcpy(row, &name, sizeof name);
     if (batch->payload_size <= SHORT_PAYLOAD)
         row[4] = (uint8_t)length;
     else
         memcpy(row + 4, &length, sizeof length);
-    memcpy(row + 8, found->body, (size_t)found->size);
-    memset(row + 8 + found->size, 0, (size_t)(batch->payload_size - found->size));
+    memcpy(row + 8, body, (size_t)size);
+    memset(row + 8 + size, 0, (size_t)(batch->payload_size - size));
     batch->time_ns[batch->stop] = time_ns;
     batch->bus[batch->stop++] = (uint16_t)bus;
 }
@@ -329,7 +330,7 @@ SKINWARE_EXPORT int64_t skinware_stream_fill(struct stream *stream, struct batch
         if (found.size > stream->payload_size)
             stream->too_long++;
         else
-            append(batch, bus, &found, stream->reads->time_ns);
+            append_row(batch, bus, found.identifier, found.body, found.size, stream->reads->time_ns);
     }
     stream->is_damaged |= stream->checksum_errors + stream->bad_form > damaged;
     stream->frames += batch->stop - first;

@@ -56,6 +56,8 @@ struct stream {
 
 uint8_t *begin_chunk(struct stream *stream);
 void end_chunk(struct stream *stream, int64_t n, int64_t time_ns);
+void append_row(struct batch *batch, int64_t bus, int64_t identifier, const uint8_t *body, int64_t size,
+                int64_t time_ns);
 SKINWARE_EXPORT int64_t skinware_stream_fill(struct stream *stream, struct batch *batch, int64_t bus);
 
 #endif

@@ -16,7 +16,9 @@ SKINWARE_EXPORT int64_t skinware_path_size(int64_t which)
     const size_t sizes[] = {sizeof(struct plan),   sizeof(struct words),  sizeof(struct batch), sizeof(struct kind),
                             sizeof(struct flag),   sizeof(struct run),    sizeof(struct form),  sizeof(struct cycle),
                             sizeof(struct number), sizeof(struct assembly), sizeof(struct flow),
-                            sizeof(struct source), sizeof(struct framing),  sizeof(struct stream), sizeof(struct tap),
+                            sizeof(struct source), sizeof(struct framing),  sizeof(struct stream),
+                            sizeof(struct asker),  sizeof(struct asked_read), sizeof(struct asked_block),
+                            sizeof(struct tap),
                             sizeof(struct update)};
     return which >= 0 && which < (int64_t)(sizeof sizes / sizeof *sizes) ? (int64_t)sizes[which] : -1;
 }

@@ -250,12 +250,42 @@ class Stream(ctypes.Structure):
     ]
 
 
+class AskedBlock(ctypes.Structure):
+    """Registers that make one frame."""
+
+    _fields_ = [*_fields("registers heard_ns told_ns", _POINTER), *_fields("count identifier")]
+
+
+class AskedRead(ctypes.Structure):
+    """One question for registers, and the beginning of its reply."""
+
+    _fields_ = [
+        *_fields("question reply registers", _POINTER),
+        *_fields("question_bytes reply_head reply_bytes count n_blocks"),
+        *_fields("heard_ns blocks", _POINTER),
+    ]
+
+
+class Asker(ctypes.Structure):
+    """A Modbus master."""
+
+    _fields_ = [
+        *_fields("fd is_tcp is_stuck n_reads most_blocks"),
+        *_fields("reads", _POINTER),
+        *_fields("open next number cycle until_ns free_ns cycle_ns deadline_ns timeout_ns turnaround_ns period_ns"),
+        *_fields("sent polls_missed frames bytes_in frame_bytes found"),
+        *_fields("buffer", _POINTER),
+        *_fields("size"),
+        *_fields("crc_table", _POINTER),
+    ]
+
+
 class Source(ctypes.Structure):
-    """A socket or a serial line that C reads."""
+    """A socket, a serial line or a line on which we ask, that C reads."""
 
     _fields_ = [
         *_fields("fd bus"),
-        *_fields("stream tap", _POINTER),
+        *_fields("stream asker tap", _POINTER),
         *_fields("headers control offset_ns last_poll_ns lost_before lost frames heard_ns"),
         *_fields("is_counted is_watched is_small"),
         *_fields("speed_up wire_bits fullest", _REAL),
@@ -277,7 +307,10 @@ UPDATE = np.dtype([(name, np.int64) for name in ["module", "row", "whole", "is_f
 SIZES = (
     *(
         ctypes.sizeof(each)
-        for each in (Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source, Framing, Stream)
+        for each in (
+            *(Plan, Words, Batch, Kind, Flag, Run, Form, Cycle, Number, Assembly, Flow, Source, Framing, Stream),
+            *(Asker, AskedRead, AskedBlock),
+        )
     ),
     ctypes.sizeof(Kept),
     UPDATE.itemsize,

@@ -131,7 +131,9 @@ class Flow:
 
     def _rest_s(self) -> float:
         links = [line.link for line in self._lines]
-        if any(link.expects_data for link in links) or any(line.bus.asks for line in self._lines):
+        if any(line.bus.asks for line in self._lines):
+            return 0.0
+        if any(link.expects_data for link in links):
             return min(self._latency_s, _LATENCY_IN_STEP_S)
         if any(link.is_awaiting for link in links):
             return min(self._latency_s, _LATENCY_WHILE_ASKING_S)
@@ -144,6 +146,7 @@ class Flow:
         self._handed = []
         for line in self._lines:
             source = self._sources[len(self._handed)]
+            source.stream = source.asker = None
             if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
                 source.bus = line.ordinal
                 source.heard_ns = line.heard_ns

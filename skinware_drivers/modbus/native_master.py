@@ -1,0 +1,120 @@
+"""A master whose questions C asks, also while the event loop rests, as long as all replies come as they should.
+
+``asking.c`` does what :meth:`Master.say` and :meth:`Master.heard` do with a good reply, on the same image. Timeouts,
+exceptions, damage, and questions of the driver's own are Python's: C stops there, and Python goes on from its state.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+
+from skinware_drivers.modbus import wire
+from skinware_drivers.modbus.master import Master, Open
+from skinware_drivers.modbus.registers import Read
+from skinware_drivers.modbus.wire import Message
+from skinware_drivers.native import structs
+from skinware_drivers.serial.checksums import CRC16_MODBUS
+
+_MOST_BLOCKS = 32
+"""Frames that one reply may complete: a batch has room for them."""
+_ROOM = 1024
+
+
+class NativeMaster(Master):
+    """See :class:`skinware_drivers.modbus.master.Master`."""
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._arrays = structs.Arrays()
+        self._buffer = np.zeros(_ROOM, np.uint8)
+        rows = [self._compile(read) for read in self._reads]
+        self._asker = structs.Asker(
+            is_tcp=self._tcp is not None,
+            n_reads=len(rows),
+            reads=self._arrays.structs(structs.AskedRead, rows)[1],
+            most_blocks=max((row.n_blocks for row in rows), default=0),
+            timeout_ns=self._timing.timeout_ns,
+            turnaround_ns=self._timing.turnaround_ns,
+            period_ns=self._timing.period_ns,
+            buffer=self._arrays.at(self._buffer),
+            crc_table=self._arrays.of(CRC16_MODBUS.table, np.uint32),
+        )
+        is_plain = self._image.is_plain and all(read.every == 1 for read in self._reads)
+        self._can = is_plain and 0 < self._asker.most_blocks <= _MOST_BLOCKS
+
+    def hand_over(self, fd: int) -> int | None:
+        """Have C go on, until ``take_back`` is called.
+
+        Returns:
+            The address of its state; None: there is something that only Python can do.
+        """
+        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows
+        if not self._can or asks_otherwise or self._holds_back or (self._open is not None and self._open.read < 0):
+            return None
+        asker, counters = self._asker, self._counters
+        asker.fd, asker.is_stuck, asker.size = fd, 0, 0
+        asker.open, asker.next = -1, self._next
+        if self._open is not None:
+            asker.open, asker.until_ns = self._open.read, self._open.until_ns
+            if self._tcp is not None:
+                row = ctypes.cast(asker.reads, ctypes.POINTER(structs.AskedRead))[self._open.read]
+                ctypes.memmove(row.reply, self._number.to_bytes(2, "big"), 2)
+        asker.number, asker.cycle = self._number, self._cycle
+        asker.free_ns, asker.cycle_ns, asker.deadline_ns = self._free_ns, self._cycle_ns, self._deadline_ns
+        asker.sent, asker.polls_missed, asker.frames = counters.sent, counters.polls_missed, counters.frames
+        framing = counters.framing
+        asker.bytes_in, asker.frame_bytes, asker.found = framing.bytes_in, framing.frame_bytes, framing.frames
+        return ctypes.addressof(asker)
+
+    def take_back(self) -> bytes:
+        """Go on from where C is; gives what it has read and not understood."""
+        asker, counters = self._asker, self._counters
+        self._number, self._cycle, self._next = asker.number, asker.cycle, asker.next
+        self._free_ns, self._cycle_ns, self._deadline_ns = asker.free_ns, asker.cycle_ns, asker.deadline_ns
+        counters.sent, counters.polls_missed, counters.frames = asker.sent, asker.polls_missed, asker.frames
+        framing = counters.framing
+        framing.bytes_in, framing.frame_bytes, framing.frames = asker.bytes_in, asker.frame_bytes, asker.found
+        number = self._number if self._tcp is not None else 0
+        self._open = None
+        if asker.open >= 0:
+            message = self._questions[asker.open]._replace(number=number)
+            self._open = Open(message, asker.open, asker.until_ns, 1)
+        return self._buffer[: asker.size].tobytes()
+
+    def _compile(self, read: Read) -> structs.AskedRead:
+        message = Message(read.unit, read.question)
+        question = wire.rtu_frame(message) if self._tcp is None else wire.tcp_frame(message)
+        reply = Message(read.unit, bytes([read.function, 2 * read.count]) + bytes(2 * read.count))
+        whole = wire.rtu_frame(reply) if self._tcp is None else wire.tcp_frame(reply)
+        head = len(whole) - 2 * read.count - (2 if self._tcp is None else 0)
+        area = self._image.areas[read.area]
+        blocks = [
+            structs.AskedBlock(
+                registers=self._arrays.at(area.registers[begin:]),
+                heard_ns=self._arrays.at(area.heard_ns[begin:]),
+                told_ns=self._arrays.at(self._image.told_ns[number:]),
+                count=block.count,
+                identifier=number,
+            )
+            for number, begin, block in area.blocks
+            if begin < read.first + read.count and begin + block.count > read.first
+        ]
+        n_blocks, address = self._arrays.structs(structs.AskedBlock, blocks)
+        return structs.AskedRead(
+            question=self._arrays.of(list(question), np.uint8),
+            question_bytes=len(question),
+            reply=self._arrays.of(list(whole[:head]), np.uint8),
+            reply_head=head,
+            reply_bytes=len(whole),
+            registers=self._arrays.at(area.registers[read.first :]),
+            heard_ns=self._arrays.at(area.heard_ns[read.first :]),
+            count=read.count,
+            n_blocks=n_blocks,
+            blocks=address,
+        )
+
+
+__all__ = ["NativeMaster"]

@@ -63,14 +63,15 @@ class RecordedWire:
         self._first_ns = first_ns
         self._begun_ns = self._given_ns = 0
         self._has_begun = self._is_over = False
-        self._asked: dict[int, deque[int]] = {}
+        self._asked: dict[int, deque[tuple[int, bytes]]] = {}
+        self._answered: dict[int, bytes] = {}
         self._unasked: set[int] = set()
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
 
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:  # noqa: ARG002 - the answers are known
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """Take a question."""
         self._counts["commands"] += 1
-        self._asked.setdefault(identifier, deque(maxlen=1000)).append(now_ns)
+        self._asked.setdefault(identifier, deque(maxlen=1000)).append((now_ns, payload))
         self._unasked.discard(identifier)
 
     def next_due_ns(self) -> int | None:
@@ -80,7 +81,7 @@ class RecordedWire:
             return None
         due_ns = self._due_ns(item)
         if self._is_waited_for(item):
-            return self._asked[_kind(item)][0] if self._asked.get(_kind(item)) else due_ns + _PATIENCE_NS
+            return self._asked[_kind(item)][0][0] if self._asked.get(_kind(item)) else due_ns + _PATIENCE_NS
         return due_ns
 
     def emit(self, now_ns: int) -> list[WireFrame]:
@@ -121,16 +122,21 @@ class RecordedWire:
     def _is_asked(self, item: WireItem, now_ns: int) -> bool:
         """Whether the question was asked, or is waited for no more; if it was asked late, all that follows is late."""
         due_ns, asked = self._due_ns(item), self._asked.get(_kind(item), deque())
-        while asked and asked[0] < due_ns - _EARLIEST_NS:
+        while asked and (asked[0][0] < due_ns - _EARLIEST_NS or self._is_repeated(item, asked[0][1])):
             asked.popleft()
         if asked:
-            self._begun_ns += max(0, asked.popleft() - due_ns)
+            asked_ns, self._answered[_kind(item)] = asked.popleft()
+            self._begun_ns += max(0, asked_ns - due_ns)
             return True
         if now_ns < due_ns + _PATIENCE_NS:
             return False
         self._begun_ns += _PATIENCE_NS
         self._unasked.add(_kind(item))
         return True
+
+    def _is_repeated(self, item: WireItem, question: bytes) -> bool:
+        """Whether it was asked again before its answer came, and this is not where it was so when it was recorded."""
+        return question == self._answered.get(_kind(item)) and question != item.data
 
     def _take_next(self) -> None:
         self._next = next(self._items, None)

@@ -116,18 +116,23 @@ def test_what_hdf5_readers_read(placed: tuple[Path, MadeTable], tmp_path: Path) 
         check_sensors(structure, {name: np.array(array) for name, array in torso["sensors"].items()})
 
 
+def read_parquet(file: Path) -> pyarrow.Table:
+    with file.open("rb") as stream:  # given a path, pyarrow may close it later
+        return pyarrow.parquet.read_table(stream)
+
+
 def test_what_parquet_readers_read(placed: tuple[Path, MadeTable], tmp_path: Path) -> None:
     file, table = placed
     convert(file, tmp_path / "x", "parquet")
     structure = table.structure
     assert structure is not None
-    rows = pyarrow.parquet.read_table(tmp_path / "x" / "torso.parquet")
+    rows = read_parquet(tmp_path / "x" / "torso.parquet")
     assert np.array_equal(rows["columns/values"].to_pylist(), table.columns["values"])
     assert np.array_equal(
         rows["physical/pressure"].to_pylist(), structure.physical(table.columns["values"], "pressure")
     )
     assert rows.schema.field("physical/pressure").metadata == {b"unit": b"counts"}
-    sensors = pyarrow.parquet.read_table(tmp_path / "x" / "torso.sensors.parquet")
+    sensors = read_parquet(tmp_path / "x" / "torso.sensors.parquet")
     check_sensors(structure, {name: sensors[name].to_numpy() for name in sensors.column_names})
 
 

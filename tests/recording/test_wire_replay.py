@@ -183,6 +183,17 @@ def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
     assert [frame.time_ns for frame in wire.emit(100 * MS)] == [92 * MS]
 
 
+def test_a_question_that_is_repeated_is_not_taken_for_the_next_one() -> None:
+    items = [item(0, 0x10, b"a", is_sent=True), item(2, 1), item(10, 0x10, b"b", is_sent=True), item(12, 2)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
+    wire.skip(0)
+    wire.receive(0x10, b"a", 1 * MS)
+    wire.receive(0x10, b"a", 2 * MS)  # its answer was not here yet
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(40 * MS)] == [(3 * MS, 1)]
+    wire.receive(0x10, b"b", 50 * MS)
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(60 * MS)] == [(52 * MS, 2)]
+
+
 def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
     items = [item(0, 0x10, is_sent=True), item(1, 1), item(10, 0x10, is_sent=True), item(11, 2)]
     wire = RecordedWire(iter(items), 7_000 * MS)

@@ -7,10 +7,10 @@ import errno
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from skinware.conversion.csv_text import csv_without, write_csv
 from skinware.conversion.hdf5 import Hdf5Source, write_hdf5
@@ -18,7 +18,7 @@ from skinware.conversion.npz import NpzSource, write_npz
 from skinware.conversion.parquet import DESCRIPTION, ParquetSource, write_parquet
 from skinware.conversion.recorded import RecordedSource
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import TIME, Block, Source, Table
+from skinware.conversion.tables import TIME, Block, DerivedSource, Source, Table
 from skinware.conversion.to_recording import write_recording
 from skinware.conversion.to_viewers import ros2_without, viewers_without, write_foxglove, write_ros2
 from skinware.errors import BadRecording, ConfigurationError
@@ -159,34 +159,12 @@ def begun_beside(target: Path) -> Iterator[Path]:
         raise
 
 
-class _Watched:
+class _Watched(DerivedSource):
     """A source whose frames are counted as they are written, until somebody stops that."""
 
     def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:
-        self._source = source
-        self.path: Path = source.path
-        self.start_ns: int = source.start_ns
         self.frames: Counter[str] = Counter()
-        self.tables: Sequence[Table] = [_WatchedTable(table, self.frames, is_stopped) for table in source.tables]
-
-    @property
-    def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.Source`."""
-        return self._source.events
-
-    @property
-    def clock(self) -> list[dict[str, Any]]:
-        """Likewise."""
-        return self._source.clock
-
-    @property
-    def problems(self) -> list[str]:
-        """Likewise."""
-        return self._source.problems
-
-    def close(self) -> None:
-        """Likewise."""
-        self._source.close()
+        super().__init__(source, [_WatchedTable(table, self.frames, is_stopped) for table in source.tables])
 
 
 class _WatchedTable(Table):

@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import h5py
-from skinware.conversion.description import described, description_of, generations_of, heads_of
-from skinware.conversion.stored import StoredTable
+from skinware.conversion.description import described, heads_of
+from skinware.conversion.stored import StoredArrays, StoredSource
 from skinware.conversion.tables import (
     ArrayFormat,
     Output,
     Source,
-    Span,
     Table,
     cannot_hold,
     outputs,
@@ -158,21 +157,14 @@ def _dataset(group: Any, output: Output) -> Any:
     return dataset
 
 
-class Hdf5Source:
-    """An HDF5 file as a source.
-
-    Args:
-        path: of the file.
-        start_s, end_s: what part of its time, s since the recording began; None: to its end.
+class Hdf5Source(StoredSource):
+    """An HDF5 file as a source; see :class:`skinware.conversion.stored.StoredSource`.
 
     Raises:
-        BadRecording: it is none that this package wrote, or of a newer version.
-        MissingExtra: h5py is not installed.
-        OSError: it cannot be read.
+        MissingExtra: h5py is not installed; besides what is said there.
     """
 
     def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
-        self.path = path
         package = h5py()
         try:
             self._file = package.File(path, "r")
@@ -180,34 +172,20 @@ class Hdf5Source:
             if error.errno is not None:
                 raise
             raise BadRecording(f"{path}: not an HDF5 file, or cut off") from None
-        try:
-            description = description_of(self._array(_DESCRIPTION).tobytes(), str(path))
-            self.start_ns: int = description.start_ns
-            self.events, self.clock = description.events, description.clock
-            span = Span.of(self.start_ns, start_s, end_s)
-            self.tables: Sequence[Table] = [
-                StoredTable(
-                    told.name,
-                    told.service,
-                    generations_of(self._array(f"{told.name}/generations"), told.service, str(path)),
-                    _Arrays(self._file, told.name, path),
-                    span,
-                    str(path),
-                )
-                for told in description.tables
-            ]
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def problems(self) -> list[str]:
-        """See :class:`skinware.conversion.tables.Source`: such a file is whole, or refused."""
-        return []
+        super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
         """Likewise."""
         self._file.close()
+
+    def _description(self) -> bytes:
+        return self._array(_DESCRIPTION).tobytes()
+
+    def _heads(self, table: str) -> npt.NDArray[Any]:
+        return self._array(f"{table}/generations")
+
+    def _arrays(self, table: str) -> StoredArrays:
+        return _Arrays(self._file, table, self.path)
 
     def _array(self, name: str) -> npt.NDArray[Any]:
         try:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.description import described, description_of, generations_of, heads_of
-from skinware.conversion.stored import StoredTable
-from skinware.conversion.tables import ArrayFormat, Output, Source, Span, Table, outputs, sensor_table
+from skinware.conversion.description import described, heads_of
+from skinware.conversion.stored import StoredArrays, StoredSource
+from skinware.conversion.tables import ArrayFormat, Output, Source, Table, outputs, sensor_table
 from skinware.errors import BadRecording
 
 _DESCRIPTION = "recording"
@@ -59,53 +59,28 @@ def _write_streamed(archive: zipfile.ZipFile, table: Table, output: Output, rows
             file.write(np.ascontiguousarray(output.of(block)).tobytes())
 
 
-class NpzSource:
-    """An NPZ file as a source.
-
-    Args:
-        path: of the file.
-        start_s, end_s: what part of its time, s since the recording began; None: to its end.
-
-    Raises:
-        BadRecording: it is none that this package wrote, or of a newer version.
-        OSError: it cannot be read.
-    """
+class NpzSource(StoredSource):
+    """An NPZ file as a source; see :class:`skinware.conversion.stored.StoredSource`."""
 
     def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
-        self.path = path
         try:
             self._archive = zipfile.ZipFile(path)
         except _BAD as error:
             raise BadRecording(f"{path}: not an NPZ file, or cut off ({error})") from None
-        try:
-            text = str(self._whole(_DESCRIPTION)[()])
-            description = description_of(text.encode(), str(path))
-            self.start_ns: int = description.start_ns
-            self.events, self.clock = description.events, description.clock
-            span = Span.of(self.start_ns, start_s, end_s)
-            self.tables: Sequence[Table] = [
-                StoredTable(
-                    told.name,
-                    told.service,
-                    generations_of(self._whole(f"{told.name}/generations"), told.service, str(path)),
-                    _Arrays(self._archive, told.name, path),
-                    span,
-                    str(path),
-                )
-                for told in description.tables
-            ]
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def problems(self) -> list[str]:
-        """See :class:`skinware.conversion.tables.Source`: such a file is whole, or refused."""
-        return []
+        super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
         """Likewise."""
         self._archive.close()
+
+    def _description(self) -> bytes:
+        return str(self._whole(_DESCRIPTION)[()]).encode()
+
+    def _heads(self, table: str) -> npt.NDArray[Any]:
+        return self._whole(f"{table}/generations")
+
+    def _arrays(self, table: str) -> StoredArrays:
+        return _Arrays(self._archive, table, self.path)
 
     def _whole(self, name: str) -> npt.NDArray[Any]:
         try:

@@ -10,14 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion._packages import pyarrow
-from skinware.conversion.description import TableText, described, description_of, generations_of, heads_of
+from skinware.conversion.description import described, heads_of
 from skinware.conversion.leaves import Leaf, leaves
-from skinware.conversion.stored import StoredTable
+from skinware.conversion.stored import StoredArrays, StoredSource
 from skinware.conversion.tables import (
     ArrayFormat,
     Output,
     Source,
-    Span,
     Table,
     check_distinct,
     outputs,
@@ -97,52 +96,37 @@ def _column(arrow: Any, leaf: Leaf, rows: npt.NDArray[Any]) -> Any:
     return arrow.FixedSizeListArray.from_arrays(items, type=_type(arrow, leaf)) if leaf.shape else items
 
 
-class ParquetSource:
-    """A folder that :func:`write_parquet` wrote, as a source.
-
-    Args:
-        path: of the folder.
-        start_s, end_s: what part of its time, s since the recording began; None: to its end.
+class ParquetSource(StoredSource):
+    """A folder that :func:`write_parquet` wrote, as a source; see :class:`skinware.conversion.stored.StoredSource`.
 
     Raises:
-        BadRecording: it is none, or of a newer version.
-        MissingExtra: pyarrow is not installed.
-        OSError: it cannot be read.
+        MissingExtra: pyarrow is not installed; besides what is said there.
     """
 
     def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
-        self.path = path
         pyarrow()
-        try:
-            text = (path / DESCRIPTION).read_bytes()
-        except FileNotFoundError:
-            raise BadRecording(f"{path}: not arrays of a recording (no {DESCRIPTION})") from None
-        description = description_of(text, str(path))
-        self.start_ns: int = description.start_ns
-        self.events, self.clock = description.events, description.clock
-        span = Span.of(self.start_ns, start_s, end_s)
         self._files: list[Any] = []
-        try:
-            self.tables: Sequence[Table] = [self._table(told, span) for told in description.tables]
-        except BaseException:
-            self.close()
-            raise
-
-    @property
-    def problems(self) -> list[str]:
-        """See :class:`skinware.conversion.tables.Source`: such a folder is whole, or refused."""
-        return []
+        super().__init__(path, start_s, end_s)
 
     def close(self) -> None:
         """Likewise."""
         for file in self._files:
             file.close()
 
-    def _table(self, told: TableText, span: Span) -> Table:
-        heads = _heads(self._opened(f"{told.name}.generations.parquet"))
-        arrays = _Arrays(self._opened(f"{told.name}.parquet"), self.path)
-        generations = generations_of(heads, told.service, str(self.path))
-        return StoredTable(told.name, told.service, generations, arrays, span, str(self.path))
+    def _description(self) -> bytes:
+        try:
+            return (self.path / DESCRIPTION).read_bytes()
+        except FileNotFoundError:
+            raise BadRecording(f"{self.path}: not arrays of a recording (no {DESCRIPTION})") from None
+
+    def _heads(self, table: str) -> npt.NDArray[Any]:
+        rows = self._opened(f"{table}.generations.parquet").read().column("head").to_pylist()
+        return (
+            np.array([np.frombuffer(row, np.uint8) for row in rows]) if len(set(map(len, rows))) == 1 else np.zeros(0)
+        )
+
+    def _arrays(self, table: str) -> StoredArrays:
+        return _Arrays(self._opened(f"{table}.parquet"), self.path)
 
     def _opened(self, name: str) -> Any:
         arrow = pyarrow()
@@ -196,12 +180,6 @@ def _rows(batch: Any, name: str, each: ArrayFormat) -> npt.NDArray[Any]:
             numbers = np.frombuffer(items.buffers()[1], leaf.dtype)[items.offset : items.offset + len(items)]
         leaf.put(numbers, rows)
     return rows
-
-
-def _heads(file: Any) -> npt.NDArray[Any]:
-    """(generations, bytes)."""
-    rows = file.read().column("head").to_pylist()
-    return np.array([np.frombuffer(row, np.uint8) for row in rows]) if len(set(map(len, rows))) == 1 else np.zeros(0)
 
 
 def _line(error: Exception) -> str:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import as_index
-from skinware.conversion.tables import COLUMNS, Block, Source, Table
+from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
 from skinware.errors import ConfigurationError
 from skinware.recording.generation import PER_SENSOR
 from skinware.skin_layout import SkinLayout
@@ -117,31 +116,11 @@ class NarrowedTable(Table):
             yield block
 
 
-class SelectedSource:
+class SelectedSource(DerivedSource):
     """Some tables of a source, and what happened to their services."""
-
-    def __init__(self, source: Source, tables: Sequence[Table]) -> None:
-        self._source = source
-        self.path: Path = source.path
-        self.start_ns: int = source.start_ns
-        self.tables: Sequence[Table] = tables
 
     @property
     def events(self) -> list[dict[str, Any]]:
         """See :class:`skinware.conversion.tables.Source`."""
         left_out = {table.service for table in self._source.tables} - {table.service for table in self.tables}
         return [event for event in self._source.events if event.get("service") not in left_out]
-
-    @property
-    def clock(self) -> list[dict[str, Any]]:
-        """Likewise."""
-        return self._source.clock
-
-    @property
-    def problems(self) -> list[str]:
-        """Likewise."""
-        return self._source.problems
-
-    def close(self) -> None:
-        """Likewise."""
-        self._source.close()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware.conversion.description import description_of, generations_of
 from skinware.conversion.tables import TIME, ArrayFormat, Block, Span, Table
 from skinware.errors import BadRecording
 from skinware.recording.generation import Generation
@@ -74,3 +77,60 @@ class StoredTable(Table):
             block = self._span.rows_of(dict(piece))
             if len(block[TIME]):
                 yield block
+
+
+class StoredSource(ABC):
+    """A file of arrays as a source; a subclass opens it first, and knows where what stands in it.
+
+    Args:
+        path: of the file.
+        start_s, end_s: what part of its time, s since the recording began; None: to its end.
+
+    Raises:
+        BadRecording: it is none that this package wrote, or of a newer version.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path, start_s: float, end_s: float | None) -> None:
+        self.path = path
+        where = str(path)
+        try:
+            description = description_of(self._description(), where)
+            self.start_ns: int = description.start_ns
+            self.events, self.clock = description.events, description.clock
+            span = Span.of(self.start_ns, start_s, end_s)
+            self.tables: Sequence[Table] = [
+                StoredTable(
+                    told.name,
+                    told.service,
+                    generations_of(self._heads(told.name), told.service, where),
+                    self._arrays(told.name),
+                    span,
+                    where,
+                )
+                for told in description.tables
+            ]
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def problems(self) -> list[str]:
+        """See :class:`skinware.conversion.tables.Source`: what is made of arrays is whole, or refused."""
+        return []
+
+    @abstractmethod
+    def close(self) -> None:
+        """Likewise."""
+
+    @abstractmethod
+    def _description(self) -> bytes:
+        """JSON, for :func:`description_of`."""
+
+    @abstractmethod
+    def _heads(self, table: str) -> npt.NDArray[Any]:
+        """The generations of a table, for :func:`generations_of`."""
+
+    @abstractmethod
+    def _arrays(self, table: str) -> StoredArrays:
+        """The arrays of a table."""

@@ -159,6 +159,40 @@ class Source(Protocol):
         """Let go of the file. Idempotent."""
 
 
+class DerivedSource:
+    """A source whose tables are made of those of another; everything else is that one's.
+
+    Args:
+        source: the other one.
+        tables: of this one.
+    """
+
+    def __init__(self, source: Source, tables: Sequence[Table]) -> None:
+        self._source = source
+        self.path: Path = source.path
+        self.start_ns: int = source.start_ns
+        self.tables: Sequence[Table] = tables
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """See :class:`Source`."""
+        return self._source.events
+
+    @property
+    def clock(self) -> list[dict[str, Any]]:
+        """Likewise."""
+        return self._source.clock
+
+    @property
+    def problems(self) -> list[str]:
+        """Likewise."""
+        return self._source.problems
+
+    def close(self) -> None:
+        """Likewise."""
+        self._source.close()
+
+
 @dataclass(frozen=True)
 class Output:
     """An array as it is written: one of the table's, or made of them.

@@ -20,9 +20,9 @@ from msgspec import Meta
 from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import DescriptorPort, Port
-from skinware_drivers.streams.address import Address, parse_address, unknown_name
+from skinware_drivers.streams.address import Address, unknown_name
+from skinware_drivers.streams.bus import NetworkBus
 
 _CONNECTING_S = 5.0
 _WAITING_CALLERS = 4
@@ -146,7 +146,7 @@ class ListeningPort(Port):
             self._caller = None
 
 
-class TcpServerBus(SerialBus):
+class TcpServerBus(NetworkBus):
     """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
 
     ``note`` tells where it listens.
@@ -155,28 +155,19 @@ class TcpServerBus(SerialBus):
         ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
 
+    scheme: ClassVar[str] = "tcp"
+
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._address = parse_address("tcp", channel, needs_host=False)
         self._options = options_from_strings(TcpOptions, options or {})
-
-    @property
-    def name(self) -> str:
-        """As a user writes it."""
-        return f"bus tcp://{self.channel}"
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has none."""
-        return 0
 
     def _open_port(self) -> Port:
         return ListeningPort(self._address, self._options.patience_s)
 
 
-class TcpBus(SerialBus):
+class TcpBus(NetworkBus):
     """A connection to a device, or to a converter of serial lines. Its name is ``tcp://HOST:PORT?key=value``.
 
     Args:
@@ -189,24 +180,15 @@ class TcpBus(SerialBus):
         ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
 
+    scheme: ClassVar[str] = "tcp"
+    needs_host: ClassVar[bool] = True
     device_end: ClassVar[Callable[..., Bus] | None] = TcpServerBus
 
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._address = parse_address("tcp", channel)
         self._options = options_from_strings(TcpOptions, options or {})
-
-    @property
-    def name(self) -> str:
-        """As a user writes it."""
-        return f"bus tcp://{self.channel}"
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has none."""
-        return 0
 
     def _open_port(self) -> Port:
         return TcpPort(f"tcp://{self._address}", connect(self._address), self._options.patience_s)

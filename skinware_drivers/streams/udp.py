@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import socket
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import msgspec
 from msgspec import Meta
@@ -17,10 +17,10 @@ from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.address import Address, parse_address
+from skinware_drivers.streams.address import Address
+from skinware_drivers.streams.bus import NetworkBus
 
 _RECEIVE_BUFFER = 1 << 20
 _MOST_DATAGRAMS = 512
@@ -122,7 +122,7 @@ class UdpPort(Port):
         return sender == self.peer
 
 
-class UdpBus(SerialBus):
+class UdpBus(NetworkBus):
     """Datagrams to and from one other end. Its name is ``udp://HOST:PORT`` or ``udp://:PORT``, with ``?key=value``.
 
     With a host: what is sent goes there, and only what comes from there (that host and port) is received. Without one,
@@ -141,25 +141,16 @@ class UdpBus(SerialBus):
         ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
 
+    scheme: ClassVar[str] = "udp"
+
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._address = parse_address("udp", channel, needs_host=False)
         self._options = options_from_strings(UdpOptions, options or {})
         if self._options.local and not self._address.host:
             raise ConfigurationError(f"{self.name}: its port is that of this computer already; leave local out")
         self._udp: UdpPort | None = None
-
-    @property
-    def name(self) -> str:
-        """As a user writes it."""
-        return f"bus udp://{self.channel}"
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has none."""
-        return 0
 
     @property
     def reads_natively(self) -> bool:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.bus import EXTENDED_FLAG
+from skinware_drivers.bus import EXTENDED_FLAG, Bus
 from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
@@ -266,46 +266,38 @@ class _Line:
         self._present = True
 
 
-class EmulatedSerialBus(SerialBus):
-    """A serial line with emulated devices, in a clock's time."""
+class _OnLine(Bus):
+    """A bus at the end of a line."""
 
-    opens_slowly: ClassVar[bool] = False  # a thread would know nothing of that time
+    opens_slowly: ClassVar[bool] = False  # a thread would know nothing of the clock's time
+    _line: _Line
+
+    def _open_port(self) -> Port:
+        return self._line.open()
+
+    def vanish(self) -> None:
+        """Go away, as if unplugged."""
+        self._line.vanish()
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`."""
+        self._line.come_back()
+
+
+class EmulatedSerialBus(_OnLine, SerialBus):
+    """A serial line with emulated devices, in a clock's time."""
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only)
         self._line = _Line(hardware, clock)
 
-    def _open_port(self) -> Port:
-        return self._line.open()
 
-    def vanish(self) -> None:
-        """Go away, as if unplugged."""
-        self._line.vanish()
-
-    def come_back(self) -> None:
-        """End :meth:`vanish`."""
-        self._line.come_back()
-
-
-class EmulatedModbusBus(ModbusBus):
+class EmulatedModbusBus(_OnLine, ModbusBus):
     """A Modbus line with emulated devices, in a clock's time."""
-
-    opens_slowly: ClassVar[bool] = False
 
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only, make_timer=clock.timer)
         self._line = _Line(hardware, clock)
-
-    def _open_port(self) -> Port:
-        return self._line.open()
-
-    def vanish(self) -> None:
-        """Go away, as if unplugged."""
-        self._line.vanish()
-
-    def come_back(self) -> None:
-        """End :meth:`vanish`."""
-        self._line.come_back()
 
 
 EmulatedBus = VirtualCanBus | EmulatedSerialBus | EmulatedModbusBus

@@ -27,8 +27,8 @@ _LONGEST_BACKLOG_NS = 1_000_000_000
 """What nobody fetched for longer is lost, as in a kernel's buffer that is full."""
 
 
-class VirtualSerialBus(SerialBus):
-    """Emulated serial devices as a bus. Its name is ``virtual:NAME?key=value``, as that of ``VirtualCanBus``.
+class _EmulatedLine(Bus):
+    """What emulated devices on a line make of a bus of that kind of line.
 
     Args:
         channel: name of the emulator.
@@ -65,31 +65,12 @@ class VirtualSerialBus(SerialBus):
         return _EmulatedPort(self.hardware)
 
 
-class VirtualModbusBus(ModbusBus):
-    """Emulated Modbus devices as a bus; its name is as that of :class:`VirtualSerialBus`.
+class VirtualSerialBus(_EmulatedLine, SerialBus):
+    """Emulated serial devices as a bus. Its name is ``virtual:NAME?key=value``, as that of ``VirtualCanBus``."""
 
-    Raises:
-        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
-    """
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        emulator = load_emulator(channel)
-        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
-
-    @property
-    def name(self) -> str:
-        """As a user writes it."""
-        return f"bus virtual:{self.channel}"
-
-    def instead(self, medium: str) -> str:
-        """Emulators of devices on that medium."""
-        return emulators_instead(medium) or super().instead(medium)
-
-    def _open_port(self) -> Port:
-        return _EmulatedPort(self.hardware)
+class VirtualModbusBus(_EmulatedLine, ModbusBus):
+    """Emulated Modbus devices as a bus; its name is as that of :class:`VirtualSerialBus`."""
 
 
 class _EmulatedPort(Port):

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, StructureError
+from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware_drivers.bus import Bus, kind_of_bus
 from skinware_drivers.description import Patch, SkinTables, assemble
@@ -39,9 +40,9 @@ class Adapter(HasOptions[OptionsT], ABC):
 
     Operations that programs may call while it runs are marked with :func:`skinware_drivers.operations.operation`.
 
-    An object of the class can set its own ``types``, ``dtype``, ``layout`` and ``period_s``, in ``__init__`` or,
-    for hardware that describes itself, in ``describe``. The types of all buses are joined, and the values of all
-    buses have the smallest dtype that holds those of each.
+    An object of the class can set its own ``types``, ``dtype``, ``layout``, ``geometry`` and ``period_s``, in
+    ``__init__`` or, for hardware that describes itself, in ``describe``. The types of all buses are joined, and the
+    values of all buses have the smallest dtype that holds those of each.
 
     Attributes:
         medium: kind of bus: ``can``, ``serial`` or ``virtual``.
@@ -50,6 +51,8 @@ class Adapter(HasOptions[OptionsT], ABC):
         dtype: dtype of the values.
         layout: what frames mean.
         patches: what is attached to each bus, unless ``describe`` finds out.
+        geometry: where their sensors are, by the uids that they have on their bus; None: nobody knows. What the bus
+            knows, or a person gives, comes first. For hands: :mod:`skinware_drivers.hand`.
         period_s: nominal time between two updates of a module, 0.02 unless the class says another; an option
             ``period_ms`` sets it. Ages and silence are judged by it.
         by_cycle: publish when every live patch has delivered (True), or at the rate of ``period_s``.
@@ -63,6 +66,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     dtype: npt.DTypeLike = np.uint8
     layout: Layout
     patches: Sequence[Patch] = ()
+    geometry: Geometry | None = None
     by_cycle: bool = True
     pace_per_ms: float = DEFAULT_PACE_PER_MS
     heard_by: Callable[[Patch, Notice], None] | None = None

@@ -17,6 +17,7 @@ from skinware_drivers.testing.leaks import files_left
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
 os.environ.setdefault("SKINWARE_TEST_PATIENCE", "5")  # read when the first test module asks for it
+os.environ.setdefault("PYTHONFAULTHANDLER", "1")  # a command that dies of a signal says where it was
 
 # what a shell runs in the background ignores Ctrl-C, and so would all that the tests start and interrupt
 signal.signal(signal.SIGINT, signal.default_int_handler)

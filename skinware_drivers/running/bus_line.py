@@ -9,6 +9,7 @@ import select
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 
 from skinware.errors import BusError, BusNotAvailable, ConfigurationError, DriverError, PlatformError
+from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState
 from skinware_drivers.adapter import AnyAdapter
@@ -199,6 +200,12 @@ class BusLine:
     def is_in_order(self) -> bool:
         """Whether it delivered frames, and had nothing wrong, when it was last looked at."""
         return self.state is BusState.LIVE and not self.reason
+
+    @property
+    def geometry(self) -> Geometry | None:
+        """Where the sensors on it are: what the bus knows, or else its driver."""
+        of_bus = self.bus.geometry
+        return self.adapter.geometry if of_bus is None else of_bus
 
     @property
     def losses(self) -> tuple[int, ...]:

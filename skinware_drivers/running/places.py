@@ -1,4 +1,4 @@
-"""Where a driver's sensors are: what a person gave, or else what the buses know."""
+"""Where a driver's sensors are: what a person gave, or else what the buses or their drivers know."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def put_in_place(tables: SkinTables, given: Geometry | None, of_buses: Sequence[
 
     Args:
         tables: of the driver.
-        given: by a person; what buses know does not count then.
+        given: by a person; nothing else counts then.
         of_buses: by the uids that sensors have on their bus, in the order of the driver's buses.
     """
     if given is not None:

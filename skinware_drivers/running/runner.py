@@ -268,7 +268,7 @@ class Runner:
                 join_types([adapter.types for adapter in adapters]),
                 np.result_type(*(adapter.dtype for adapter in adapters)),
             )
-            tables = put_in_place(tables, self._geometry, [line.bus.geometry for line in self.lines])
+            tables = put_in_place(tables, self._geometry, [line.geometry for line in self.lines])
         except StructureError as error:
             log.error("the devices that were found do not form a valid skin: %s", str(error))
             return

@@ -18,6 +18,7 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import SimDevice
 
+import skinware.recording
 from skinware import DriverReader
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.sensor_types import PRESSURE
@@ -35,6 +36,7 @@ from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import running
 from tests.modbus.hands import FINGER_AT, Array
 from tests.modbus.peers import Action, device, line, rtu_server, rtu_server_on, tcp_server
+from tests.recording.rig import recording
 from tests.streams.peers import LOCAL, free_port, server
 
 N = 300
@@ -162,6 +164,23 @@ def test_values_follow_in_the_order_of_the_device(over: Any) -> None:
             frame = read_until(reader, lambda frame, before=before: frame.values[0] > before)  # type: ignore[misc]
             assert (frame.values == frame.values[0]).all()
             newest = int(frame.values[0])
+
+
+def test_questions_and_replies_are_recorded(over: Any, tmp_path: Path) -> None:
+    """Also what C would ask: a wire that is wanted is asked in Python, and in C again when nobody wants it."""
+    file = tmp_path / "palm.mcap"
+    with over(palm()) as name, driven(name) as (driving, reader):
+        with recording(file, with_wires=True) as recorder:
+            wait_until(lambda: any(channel.startswith("/wire/palm/") for channel in recorder.messages))
+        until_right(reader)
+        with skinware.recording.open(file) as opened:
+            [wire] = opened.wires
+            items = list(wire.items())
+        question = struct.pack(">BBHH", 1, 3, FINGER_AT, 125)  # unit, function, first register, count
+        reply = struct.pack(">BBB125H", 1, 3, 250, *range(1000, 1125))
+        assert any(question in item.data for item in items if item.is_sent)
+        assert reply in b"".join(item.data for item in items if not item.is_sent)
+        assert counted(driving)["state"] == "live"
 
 
 def test_several_units_on_one_line_one_of_them_dead() -> None:

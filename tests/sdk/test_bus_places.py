@@ -69,6 +69,21 @@ def test_what_a_person_gave_comes_first_and_places_of_other_sensors_are_none() -
     assert by_hand.known.sum() == 5
 
 
+def test_a_driver_knows_places_where_its_bus_knows_none() -> None:
+    class Known(RoboskinDriver):
+        geometry = EmulatedRoboskin(EmulatorOptions(boards=(9,))).geometry()[:4]
+
+    def known(board: int) -> Known:
+        return Known(RoboskinOptions(boards=(board,)))
+
+    lines = [(known(9), nowhere(9)), (known(9), on_arm(9)), (known(8), nowhere(8))]
+    with driving_lines(lines, "arms"), DriverReader("arms") as reader:
+        geometry = reader.structure.geometry
+        assert geometry is not None
+        of_bus = reader.structure.patch_bus[reader.structure.sensor_patch]
+        assert [int(geometry.known[of_bus == bus].sum()) for bus in range(3)] == [4, int((of_bus == 1).sum()), 0]
+
+
 def test_foreign_places_that_a_person_gave_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     put_in_place(tables([8]), EmulatedRoboskin(EmulatorOptions(boards=(7,))).geometry(), [None])
     assert "no place for any of the sensors" in caplog.text

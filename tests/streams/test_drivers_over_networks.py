@@ -74,7 +74,7 @@ def test_who_is_behind_a_connection_is_asked_only_on_request(namespace: object) 
     device = make_bus(f"tcp://{LOCAL}:{(port := free_port())}", payload_size=4096, for_devices=True)
     with emulated_on(device, load_emulator("weiss_wts")):
         looked = run("skin-find", f"tcp://{LOCAL}:{port}")
-        assert (looked.returncode, "not listened to" in looked.stdout) == (0, True)
+        assert (looked.returncode, "not listened to" in looked.stdout) == (0, True), looked.stderr
         assert device.counters.framing.bytes_in == 0
         asked = run("skin-find", f"tcp://{LOCAL}:{port}", "--probe", "--driver", "weiss_wts")
         assert "answers: WTS with" in asked.stdout

@@ -18,6 +18,7 @@ from typing import Any, NoReturn, TypeVar
 
 import click
 
+from skinware.cli._output import patient_output
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
@@ -98,13 +99,19 @@ def signals_end(
             signal.signal(number, handler)
 
 
-def run(command: click.Command) -> NoReturn:
+def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     """Run a command with the arguments of this process, and exit as :func:`exit_status` says.
 
     SIGTERM ends a command as Ctrl-C does.
+
+    Args:
+        command: which.
+        goes_on: its work goes on while nobody reads its output; by default it waits for who reads, as ``| less`` wants.
     """
     signal.signal(signal.SIGTERM, _interrupt)
-    sys.exit(exit_status(command, sys.argv[1:]))
+    with patient_output() if goes_on else contextlib.nullcontext():
+        status = exit_status(command, sys.argv[1:])
+    sys.exit(status)
 
 
 def exit_status(command: click.Command, arguments: Sequence[str]) -> int:

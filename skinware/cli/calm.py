@@ -184,4 +184,4 @@ def _tell_status(service: CalmService) -> None:
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)

@@ -214,4 +214,4 @@ class _Report:
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)

@@ -184,4 +184,4 @@ def _has_screen() -> bool:
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)

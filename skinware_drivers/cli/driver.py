@@ -378,4 +378,4 @@ def _read(path: Path | None) -> ConfigFile:
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)

@@ -150,7 +150,7 @@ def _write_geometry(path: Path, hardware: PlacedHardware, driver: str) -> None:
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)
 
 
 if __name__ == "__main__":

@@ -233,4 +233,4 @@ command: click.Command = click.Command(
 
 def main() -> None:
     """Entry point."""
-    run(command)
+    run(command, goes_on=True)

@@ -93,6 +93,10 @@ class BadRecording(SkinwareError):
     """A file is not a recording that this version can read, or so damaged that nothing of it can be used."""
 
 
+class BridgeError(SkinwareError):
+    """Two machines cannot be connected, or do not understand each other."""
+
+
 class MissingExtra(SkinwareError, ImportError):
     """Packages that only some need are not installed; the message says how to install them."""
 

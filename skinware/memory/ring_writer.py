@@ -69,7 +69,9 @@ class RingWriter:
         """Sequence of the newest frame, 0 before the first."""
         return self._words[LATEST]
 
-    def begin(self, *, from_last: bool = False, skip: int = 0) -> dict[str, npt.NDArray[Any]]:
+    def begin(
+        self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
         """The columns of the next slot, to be filled; they hold an old frame.
 
         Until ``commit``, readers of that old frame are told that it is gone.
@@ -78,6 +80,7 @@ class RingWriter:
             from_last: copy the newest frame into it first, for writers that change parts only.
             skip: sequences before its own that are left out; readers count them as lost. It is one more where the slot
                 would be that of the newest frame, which stays readable meanwhile.
+            contents: a whole slot of the same layout, to be copied into it first.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
@@ -87,6 +90,8 @@ class RingWriter:
         self._take_next()
         if from_last and latest:
             self._contents[slot][:] = self._contents[latest % self._count]
+        elif contents is not None:
+            self._contents[slot][:] = contents[file_layout.SLOT.itemsize :]
         return self._columns[slot]
 
     @property

@@ -9,7 +9,7 @@
         ...
 """
 
-from skinware.realtime._clock import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, period_ns
+from skinware.realtime._clock import NS_PER_S, WAIT_SLICE_NS, Periodic, boot, now_ns, period_ns
 from skinware.realtime._cpus import cpus_from_text
 from skinware.realtime._kernel import Refusal
 from skinware.realtime._profile import Profile
@@ -22,6 +22,7 @@ __all__ = [
     "Periodic",
     "Profile",
     "Refusal",
+    "boot",
     "cpus_from_text",
     "now_ns",
     "period_ns",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from skinware.errors import ConfigurationError
 
@@ -16,6 +17,11 @@ WAIT_SLICE_NS = 50_000_000
 def now_ns() -> int:
     """CLOCK_MONOTONIC in ns: the time base of every frame."""
     return time.monotonic_ns()
+
+
+def boot() -> str:
+    """Which start of the machine CLOCK_MONOTONIC counts from: a number that no other start has."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
 
 
 def period_ns(rate_hz: float) -> int:

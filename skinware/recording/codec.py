@@ -219,6 +219,45 @@ class Run:
         return slots
 
 
+class Decoder:
+    """Decodes the frames of one generation as they come.
+
+    Args:
+        columns: of its slots.
+        stride: bytes of a slot.
+    """
+
+    def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:
+        self._columns, self._stride = columns, stride
+        self._before: npt.NDArray[np.uint8] | None = None
+
+    @property
+    def sequence(self) -> int:
+        """Of the frame that was decoded last; 0: none."""
+        return 0 if self._before is None else int(self._before[: SLOT.itemsize].view(SLOT)[0]["sequence"])
+
+    def decode(self, message: bytes | memoryview) -> npt.NDArray[np.uint8]:
+        """(stride,) the slot of a frame, which is kept until the next one: not to be changed.
+
+        Raises:
+            BadRecording: it is no such message, or the difference to another frame than the last one.
+        """
+        run = Run([message], self._columns)
+        after = int(run.headers["after"][0])
+        if after not in (0, self.sequence):
+            raise BadRecording(f"a frame tells its difference to frame {after}, which is not the last one")
+        slot: npt.NDArray[np.uint8] = run.decode_slots(self._stride)[0]
+        if after and self._before is not None:
+            for column in self._columns:
+                words, before = column.words_of(slot.data), column.words_of(self._before.data)
+                if column.is_integer:
+                    words += before
+                else:
+                    words ^= before
+        self._before = slot
+        return slot
+
+
 def _decode(code: int, data: bytes | memoryview, into: Words) -> None:
     """The differences of one column of one frame, written into zeros.
 

@@ -162,6 +162,8 @@ class Collector:
 
     def _frames(self, name: str, source: _Source) -> Iterator[Frame]:
         for _ in range(_MOST_AT_ONCE):
+            if not (self._has_more(source) or source.reader.moved_on or source.reader.structure_changed):
+                return
             try:
                 frame = source.reader.next_in_order()
             except Overrun:

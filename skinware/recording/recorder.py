@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 from mcap.records import Schema
@@ -22,7 +21,7 @@ from skinware.errors import BadRecording
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
 from skinware.recording.codec import CodedColumn, Encoder
 from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
@@ -317,7 +316,7 @@ class _Coder(threading.Thread):
         self._next_clock_ns = now_ns() + _CLOCK_NS
         monotonic_ns, realtime_ns = now_ns(), time.time_ns()
         self._offset_ns = realtime_ns - monotonic_ns
-        self._add_json(CLOCK, {"monotonic_ns": monotonic_ns, "realtime_ns": realtime_ns, "boot": _boot()})
+        self._add_json(CLOCK, {"monotonic_ns": monotonic_ns, "realtime_ns": realtime_ns, "boot": boot()})
 
     def _close_chunk(self) -> None:
         if self._chunk.is_empty:
@@ -335,7 +334,3 @@ def _wires_of(segment: segments.Segment) -> _WireStream | None:
     tables = segment.static_columns()
     texts = [bytes(text).decode(errors="replace") for name in ("driver", "bus_name") for text in tables.get(name, ())]
     return _WireStream(texts[0], texts[1:]) if texts else None
-
-
-def _boot() -> str:
-    return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

@@ -26,8 +26,8 @@ _OTHERS = "this is a recording"
 
 
 @dataclass
-class _Service:
-    """One that is published.
+class Published:
+    """A service that is published.
 
     Attributes:
         writer: of it.
@@ -47,7 +47,7 @@ class _Service:
 
 
 class Republisher:
-    """Publishes frames of a recording.
+    """Publishes frames that were published before: of a recording, or of another machine.
 
     Times are moved to now, unless they are to be kept: a frame and all times in it by as much as lies between its
     publication then and now, so that ages stay as they were, whatever the speed.
@@ -70,15 +70,24 @@ class Republisher:
         keeps_times: bool = False,
     ) -> None:
         self._namespace, self._operations, self._keeps_times = namespace, operations, keeps_times
-        self._services: dict[str, _Service] = {}
+        self._services: dict[str, Published] = {}
         self._deserted: dict[str, Generation] = {}
         self._surplus: list[str] = []
         self._counts: dict[str, int] = {}
+        self._ahead: Counter[str] = Counter()  # losses that a writer told more than there were, for want of a slot
         self._paused = False
         self._epoll = select.epoll()
         self._calls: dict[int, Callable[[], object]] = {}
         self.frames: Counter[str] = Counter()
         self.speed: float = 1.0
+
+    def shift_ns(self, frame: RecordedFrame) -> int:
+        """By how much times of a frame that is published now are moved."""
+        return now_ns() - frame.published_ns
+
+    def operations_of(self, name: str) -> Mapping[str, Callable[..., object]]:  # noqa: ARG002
+        """What a service offers."""
+        return self._operations
 
     def publish(self, name: str, frame: RecordedFrame, generation: Generation, *, follows: bool = True) -> None:
         """Publish a frame now.
@@ -101,15 +110,15 @@ class Republisher:
         service.was_paused = False
         if writer.paused:
             writer.resume()
-        columns = writer.begin(skip=self._lost_before(name, frame, generation, follows))
-        for column, into in columns.items():
-            into[...] = frame.column(column)
-        shift_ns = now_ns() - frame.published_ns  # last, so that filling the columns makes no frame older
+        before, lost = writer.sequence, self._lost_before(name, frame, generation, follows)
+        columns = writer.begin(skip=max(0, lost - self._ahead[name]), contents=frame.slot)
+        shift_ns = self.shift_ns(frame)  # last, so that filling the columns makes no frame older
         if generation.is_driver and not self._keeps_times:
             for into in (columns[column] for column in _TIMES_OF_DRIVERS if column in columns):
                 into[into != 0] += shift_ns
         acquired_ns = frame.acquired_ns + shift_ns if frame.acquired_ns else 0
-        writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
+        sequence = writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
+        self._ahead[name] += sequence - before - 1 - lost
         self.frames[name] += 1
         self._reply(service, acquired_ns)
         if self._paused:
@@ -177,9 +186,11 @@ class Republisher:
                 self._new_writer(name, generation).close()
         self._epoll.close()
 
-    def _service(self, name: str, generation: Generation, follows: bool) -> _Service:
+    def _service(self, name: str, generation: Generation, follows: bool) -> Published:
         """The service, with the generation of a frame."""
         service = self._services.get(name)
+        if service is not None and service.generation is generation and service.speed == self.speed:
+            return service
         if service is not None and _kind_of(service.generation) != _kind_of(generation):
             self._remove(name)
             service = None
@@ -193,13 +204,13 @@ class Republisher:
             service.speed = self.speed
         return service
 
-    def _begin(self, name: str, generation: Generation) -> _Service:
+    def _begin(self, name: str, generation: Generation) -> Published:
         writer = self._new_writer(name, generation)
         self._deserted.pop(name, None)
         server = writer.request_server()
         server.while_paused, server.why_no_others = frozenset(self._operations), _OTHERS
-        service = self._services[name] = _Service(writer, server.fileno(), generation, self.speed)
-        self.watch(service.fd, lambda: self._take_requests(name))
+        service = self._services[name] = Published(writer, server.fileno(), generation, self.speed)
+        self.watch(service.fd, lambda: self.take_requests(name, service))
         return service
 
     def _new_writer(self, name: str, generation: Generation) -> ServiceWriter:
@@ -212,13 +223,13 @@ class Republisher:
             slots=generation.slot_count,
             rate_hz=self._rate_hz(generation),
             description=generation.schema.description,
-            operations=self._operations,
+            operations=self.operations_of(name),
         )
 
     def _rate_hz(self, generation: Generation) -> float | None:
         return NS_PER_S / generation.period_ns * self.speed if generation.period_ns else None
 
-    def _apply_pause(self, service: _Service) -> None:
+    def _apply_pause(self, service: Published) -> None:
         paused = self._paused or service.was_paused
         if paused != service.writer.paused:
             (service.writer.pause if paused else service.writer.resume)()
@@ -227,8 +238,8 @@ class Republisher:
                 request.fail("the service is paused", "paused")
             service.waiting.clear()
 
-    def _take_requests(self, name: str) -> None:
-        service = self._services[name]
+    def take_requests(self, name: str, service: Published) -> None:  # noqa: ARG002
+        """Carry out what was asked of a service."""
         service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
 
     def _lost_before(self, name: str, frame: RecordedFrame, generation: Generation, follows: bool) -> int:
@@ -238,7 +249,7 @@ class Republisher:
         return max(0, count - before - 1) if follows and before is not None else 0
 
     @staticmethod
-    def _reply(service: _Service, acquired_ns: int) -> None:
+    def _reply(service: Published, acquired_ns: int) -> None:
         """Answer those whose frame this is."""
         answered = [request for time_ns, request in service.waiting if time_ns <= acquired_ns]
         service.waiting = [(t, r) for t, r in service.waiting if t > acquired_ns and not r.cancelled]

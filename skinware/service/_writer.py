@@ -71,7 +71,9 @@ class ServiceWriter(Ownership):
         self.missed_periods: int = 0
         self._stopping = False
 
-    def begin(self, *, from_last: bool = False, skip: int = 0) -> dict[str, npt.NDArray[Any]]:
+    def begin(
+        self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
         """Arrays of the next frame, to be filled in place; then ``commit``.
 
         Args:
@@ -79,6 +81,7 @@ class ServiceWriter(Ownership):
                 hold something old.
             skip: sequences before this frame that are left out, for who passes frames on of which some did not arrive:
                 readers count them as lost. It may become one more: the newest frame stays readable meanwhile.
+            contents: a slot of a service with the same columns (``Frame.slot``), to begin with.
 
         Raises:
             Closed: this writer was closed, or belongs to the process before a fork.
@@ -89,7 +92,7 @@ class ServiceWriter(Ownership):
         if self._paused:
             self._require_open()
             raise Paused(f"service {self.name!r} is paused; call resume() first")
-        return self._ring.begin(from_last=from_last, skip=skip)
+        return self._ring.begin(from_last=from_last, skip=skip, contents=contents)
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
         """Publish the frame: one system call wakes every reader.

@@ -1,0 +1,17 @@
+"""A namespace on another machine: served there, joined here, over zenoh."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from skinware.errors import MissingExtra
+
+if find_spec("zenoh") is None or find_spec("mcap") is None:
+    raise MissingExtra("bridges need packages that are not installed: pip install 'skinware[zenoh]'")
+
+from skinware.bridge.endpoints import DEFAULT_LISTEN, Endpoints, endpoints
+from skinware.bridge.joining import Joiner
+from skinware.bridge.link import Link
+from skinware.bridge.serving import Server
+
+__all__ = ["DEFAULT_LISTEN", "Endpoints", "Joiner", "Link", "Server", "endpoints"]

@@ -1,0 +1,158 @@
+"""Where a bridge listens and connects, and who may do what there."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from skinware.errors import ConfigurationError
+
+_ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.%\w]+\]|[^\s/:\[\]]+):(\d{1,5})")
+DEFAULT_LISTEN = "tcp/127.0.0.1:7448"
+CALLS = "skinware/*/*/*/call/**"
+"""Keys of all calls."""
+
+_ALL = "skinware/**"
+_QUESTIONS = ["skinware/*/*/clock", "skinware/*/*/services", "skinware/*/*/*/generation", "skinware/*/*/*/newest"]
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """What a session of zenoh is told.
+
+    Attributes:
+        listen: its endpoints there, ``tcp/HOST:PORT`` or ``tls/HOST:PORT``.
+        connect: those of others.
+        mode: ``peer``, or ``router`` that passes on what peers say.
+        patience_us: how long a frame may wait for a receiver that is too slow before it is left out for that one.
+        security: settings of zenoh.
+    """
+
+    listen: Sequence[str] = ()
+    connect: Sequence[str] = ()
+    mode: str = "peer"
+    patience_us: float = 1000.0
+    security: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return " and ".join(
+            f"{verb} {', '.join(places)}"
+            for verb, places in (("listening at", self.listen), ("connecting to", self.connect))
+            if places
+        )
+
+
+def endpoints(
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    tls: Path | None = None,
+    serves: bool = False,
+    callers: Sequence[str] = (),
+    insecure: bool = False,
+    mode: str = "peer",
+    patience_us: float = 1000.0,
+) -> Endpoints:
+    """Endpoints from what a person wrote.
+
+    Args:
+        listen: where to listen.
+        connect: where to connect.
+        tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``; both ends show a certificate of that authority.
+        serves: it speaks for a robot, and others only listen, ask and call.
+        callers: names in the certificates of those who may call operations, with ``tls``; none: all may.
+        insecure: listen beyond this machine without TLS.
+        mode: of the session.
+        patience_us: likewise.
+
+    Raises:
+        ConfigurationError: something cannot be, or listens to strangers.
+    """
+    security = {} if tls is None else _tls(tls)
+    protocol = None if tls is None else "tls"
+    places = [_endpoint(text, protocol) for text in listen]
+    if callers and tls is None:
+        raise ConfigurationError("who may call is told by the names in certificates: give --tls, too")
+    if serves:
+        security["access_control"] = _rules(callers)
+    for place in places:
+        if place.startswith("tcp/") and not insecure and not _is_of_this_machine(place):
+            raise ConfigurationError(
+                f"{place} is beyond this machine, and everybody there could read the skin and call its operations:"
+                " give --tls DIR, or --insecure where the network itself is trusted"
+            )
+    return Endpoints(places, [_endpoint(text, protocol) for text in connect], mode, patience_us, security)
+
+
+def _endpoint(text: str, protocol: str | None) -> str:
+    found = _ENDPOINT.fullmatch(text)
+    if not found or not 0 < int(found[3]) < 65536:
+        raise ConfigurationError(f"{text!r} is no endpoint: give tcp/HOST:PORT, as in tcp/192.168.1.10:7448")
+    if found[1] == "tls" and protocol is None:
+        raise ConfigurationError(f"{text}: give --tls DIR with the certificates")
+    return f"{protocol or found[1]}/{found[2]}:{found[3]}"
+
+
+def _is_of_this_machine(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _tls(folder: Path) -> dict[str, str]:
+    files = {name: folder / f"{name}.pem" for name in ("ca", "cert", "key")}
+    for path in files.values():
+        try:
+            with path.open("rb"):
+                pass
+        except OSError as error:
+            raise ConfigurationError(
+                f"{path}: {error.strerror}; docs/how-to/two-machines.md says how to make it"
+            ) from None
+    settings = {
+        "root_ca_certificate": files["ca"],
+        "listen_certificate": files["cert"],
+        "listen_private_key": files["key"],
+        "connect_certificate": files["cert"],
+        "connect_private_key": files["key"],
+    }
+    told = {f"transport/link/tls/{name}": json.dumps(str(path.resolve())) for name, path in settings.items()}
+    return {**told, "transport/link/tls/enable_mtls": "true"}
+
+
+def _rules(callers: Sequence[str]) -> str:
+    """What zenoh lets others do: see and ask; call only who may; and nobody else speaks for the robot."""
+    listening = ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
+    speaking = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
+    rule = {"permission": "allow", "flows": ["ingress"], "messages": ["query"]}
+    subject: dict[str, object] = {"id": "callers"}
+    if callers:
+        subject["cert_common_names"] = list(callers)
+    return json.dumps(
+        {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [
+                {**rule, "id": "see", "messages": listening, "key_exprs": [_ALL]},
+                {**rule, "id": "ask", "key_exprs": _QUESTIONS},
+                {**rule, "id": "call", "key_exprs": [CALLS]},
+                {**rule, "id": "tell", "messages": speaking, "flows": ["egress"], "key_exprs": [_ALL]},
+            ],
+            "subjects": [{"id": "all"}, subject],
+            "policies": [
+                {"rules": ["see", "ask", "tell"], "subjects": ["all"]},
+                {"rules": ["call"], "subjects": ["callers"]},
+            ],
+        }
+    )
+
+
+__all__ = ["DEFAULT_LISTEN", "Endpoints", "endpoints"]

@@ -1,0 +1,239 @@
+"""Zenoh as the bridge needs it: bytes under keys, questions with answers, and who is there. All of zenoh is here.
+
+Nothing is shared that was not asked for: no scouting, no gossip, no listening but where a person says so; shared memory
+of zenoh is off. What is called back is called in zenoh's threads, which must not wait.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import zenoh
+
+from skinware.bridge.endpoints import Endpoints
+from skinware.errors import BridgeError
+
+LEASE_MS = 2000
+"""A peer that says nothing for so long is gone."""
+_RETRY_MS = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+_FOREVER_MS = -1
+
+Payload = bytes
+
+
+class Question(Protocol):
+    """What somebody asks; exactly one of the answers is given, from any thread."""
+
+    @property
+    def key(self) -> str:
+        """Under which it was asked."""
+
+    @property
+    def parameters(self) -> Mapping[str, str]:
+        """Of it."""
+
+    @property
+    def payload(self) -> Payload:
+        """What came with it."""
+
+    def reply(self, payload: Payload) -> None:
+        """The answer."""
+
+    def fail(self, error: Payload) -> None:
+        """It cannot be answered."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What came back of a question.
+
+    Attributes:
+        payload: the answer; None if there is none.
+        error: what the other end says went wrong.
+    """
+
+    payload: Payload | None
+    error: Payload | None = None
+
+
+class Priority:
+    """What goes before what on a link that is full."""
+
+    CLOCK = zenoh.Priority.REAL_TIME
+    CALLS = zenoh.Priority.INTERACTIVE_HIGH
+    FRAMES = zenoh.Priority.DATA
+    PULLED = zenoh.Priority.DATA_LOW
+
+
+class _Question:
+    def __init__(self, query: zenoh.Query) -> None:
+        self._query = query
+        self.key = str(query.key_expr)
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+
+    @property
+    def parameters(self) -> Mapping[str, str]:
+        text = str(self._query.parameters)
+        return dict(part.partition("=")[::2] for part in text.split(";")) if text else {}
+
+    def reply(self, payload: Payload) -> None:
+        with contextlib.suppress(zenoh.ZError), self._query:
+            self._query.reply(self.key, payload)
+
+    def fail(self, error: Payload) -> None:
+        with contextlib.suppress(zenoh.ZError), self._query:
+            self._query.reply_err(error)
+
+
+class Link:
+    """A session of zenoh.
+
+    Args:
+        endpoints: where it listens and connects.
+
+    Raises:
+        BridgeError: it cannot be opened; the message says what to do.
+    """
+
+    def __init__(self, endpoints: Endpoints) -> None:
+        try:
+            self._session = zenoh.open(_configuration(endpoints))
+        except zenoh.ZError as error:
+            raise BridgeError(f"{endpoints}: {_reason(error)}") from None
+        self._declared: list[Any] = []
+
+    def sender(self, key: str) -> Callable[[Payload], None]:
+        """What sends bytes to all who listen to a key, and waits for nobody: a receiver that is too slow loses some."""
+        publisher = self._session.declare_publisher(
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+            priority=Priority.FRAMES,
+            express=True,
+        )
+        self._declared.append(publisher)
+
+        def send(payload: Payload) -> None:
+            with contextlib.suppress(zenoh.ZError):  # closed
+                publisher.put(payload)
+
+        return send
+
+    def tell(self, key: str, payload: Payload) -> None:
+        """Send something small, before any frames."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.put(key, payload, priority=Priority.CALLS, express=True)
+
+    def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
+        """Have (key, bytes) of what is sent under keys, in the thread that receives; what ends it."""
+
+        def hear(sample: zenoh.Sample) -> None:
+            heard(str(sample.key_expr), sample.payload.to_bytes())
+
+        return self._undeclaring(self._session.declare_subscriber(key, _directly(hear)))
+
+    def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
+        """Have the questions under keys; what ends it."""
+        return self._undeclaring(self._session.declare_queryable(key, _directly(lambda query: asked(_Question(query)))))
+
+    def ask(
+        self,
+        key: str,
+        answered: Callable[[Reply], None],
+        *,
+        timeout_s: float,
+        priority: zenoh.Priority,
+        parameters: Mapping[str, object] | None = None,
+        payload: Payload = b"",
+    ) -> None:
+        """Ask whoever answers under a key; ``answered`` is called for each answer, and once with none if none came."""
+        text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
+        got: list[bool] = []
+
+        def hear(reply: zenoh.Reply) -> None:
+            got.append(True)
+            if reply.ok is not None:
+                answered(Reply(reply.ok.payload.to_bytes()))
+            elif reply.err is not None:
+                answered(Reply(None, reply.err.payload.to_bytes()))
+
+        def over() -> None:
+            if not got:
+                answered(Reply(None))
+
+        try:
+            self._session.get(
+                f"{key}?{text}" if text else key,
+                _directly(hear, over),
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=priority,
+                express=True,
+                payload=payload or None,
+            )
+        except zenoh.ZError:
+            answered(Reply(None))
+
+    def be_there(self, key: str) -> None:
+        """Others see a key for as long as this is open."""
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
+        """Have (key, whether somebody is there) of all who are, come and go."""
+        self._declared.append(
+            self._session.liveliness().declare_subscriber(
+                key, lambda sample: changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT), history=True
+            )
+        )
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _undeclaring(self, declared: Any) -> Callable[[], None]:
+        self._declared.append(declared)
+
+        def undeclare() -> None:
+            if declared in self._declared:
+                self._declared.remove(declared)
+                with contextlib.suppress(zenoh.ZError):
+                    declared.undeclare()
+
+        return undeclare
+
+
+def _directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
+    """A callback in the thread that receives: every hand-over to another thread takes 0.1 ms."""
+    return zenoh.handlers.Callback(call, over, indirect=False)
+
+
+def _configuration(endpoints: Endpoints) -> zenoh.Config:
+    config: dict[str, object] = {
+        "mode": json.dumps(endpoints.mode),
+        "connect/endpoints": json.dumps(endpoints.connect),
+        "connect/timeout_ms": json.dumps(_FOREVER_MS),
+        "connect/exit_on_failure": "false",
+        "connect/retry": json.dumps(_RETRY_MS),
+        "listen/endpoints": json.dumps(endpoints.listen),
+        "listen/exit_on_failure": "true",
+        "scouting/multicast/enabled": "false",
+        "scouting/gossip/enabled": "false",
+        "transport/shared_memory/enabled": "false",
+        "transport/link/tx/lease": str(LEASE_MS),
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),
+        "adminspace/enabled": "false",
+    }
+    made = zenoh.Config()
+    for path, value in {**config, **endpoints.security}.items():
+        made.insert_json5(path, str(value))
+    return made
+
+
+def _reason(error: Exception) -> str:
+    """What zenoh says, without where in its sources."""
+    return str(error).partition(" at ")[0].partition(" - ")[0]

@@ -1,0 +1,200 @@
+"""What goes over a bridge, byte by byte, and under which keys.
+
+Keys of robot R: ``skinware/1/R/``...
+
+======================  ===============================================================================================
+``clock``               question; answer: two i64, CLOCK_MONOTONIC ns when it came and when it was answered
+``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes
+``S/generation``        question with ``number``; answer: u4 size of JSON, :class:`About` as JSON, the service's file in
+                        shared memory up to its slots
+``S/frame``             every frame: ``RAW`` below
+``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``: that
+                        frame's sequence if the asker still has it, else 0; answered with the newest frame as soon as
+                        there is one, with nothing after half a second: ``CODED`` below
+``S/call/OPERATION``    question with arguments as JSON; answer: :class:`Answered` as JSON
+======================  ===============================================================================================
+
+``skinware/live/R/1/INSTANCE`` is a token of who serves the robot: version and a number of its own.
+
+A frame begins with a byte that tells its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
+``CODED``: a message of :mod:`skinware.recording.codec`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BridgeError, ConfigurationError
+from skinware.memory.ring import Frame
+
+VERSION = 1
+RAW, CODED = 0, 1
+
+_HEAD = struct.Struct("<B7xQ")
+_CODED_HEAD = struct.pack("<B7x", CODED)
+CLOCK = struct.Struct("<qq")
+_SIZE = struct.Struct("<I")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
+
+
+class Service(msgspec.Struct, frozen=True):
+    """How a service is.
+
+    Attributes:
+        generation: its number; 0: not known yet.
+        state: ``live``, ``paused``, ``closed`` or ``dead``.
+    """
+
+    generation: int = 0
+    state: str = "live"
+
+
+class Services(msgspec.Struct, frozen=True):
+    """All services of a robot.
+
+    Attributes:
+        instance: number of the bridge that serves them.
+        start: which start of the machine times count from, and which namespace is served; another one has another clock
+            and other generations.
+        callers: who may call, by the names in their certificates; empty: whoever is let in.
+        services: by name.
+    """
+
+    instance: str
+    start: str = ""
+    callers: tuple[str, ...] = ()
+    services: dict[str, Service] = {}
+
+
+class About(msgspec.Struct, frozen=True):
+    """What a generation's file does not tell.
+
+    Attributes:
+        operations: of the service: descriptions by name.
+    """
+
+    operations: dict[str, str] = {}
+
+
+class Answered(msgspec.Struct, frozen=True):
+    """How a call ended.
+
+    Attributes:
+        generation, sequence: a frame that was published after it was carried out, by the robot's count; 0: none.
+        result: what the operation returned.
+        error: what went wrong; None if nothing did.
+        why: kind of error: ``refused``, ``failed``, ``paused``, ``cancelled``.
+    """
+
+    generation: int = 0
+    sequence: int = 0
+    result: msgspec.Raw = msgspec.Raw(b"null")
+    error: str | None = None
+    why: str = ""
+
+
+class Keys:
+    """The keys of a robot.
+
+    Args:
+        robot: its name.
+
+    Raises:
+        ConfigurationError: it is no name.
+    """
+
+    def __init__(self, robot: str) -> None:
+        if not _NAME.fullmatch(robot):
+            raise ConfigurationError(
+                f"robot {robot!r}: give 1 to 47 letters, digits, '_' or '-', the first a letter or digit"
+            )
+        self.robot = robot
+        self._root = f"skinware/{VERSION}/{robot}"
+        self.clock, self.services = f"{self._root}/clock", f"{self._root}/services"
+        self.tokens = f"skinware/live/{robot}/*/*"
+
+    def token(self, instance: str) -> str:
+        """Of a bridge that serves it."""
+        return f"skinware/live/{self.robot}/{VERSION}/{instance}"
+
+    def of(self, service: str, what: str) -> str:
+        """Of something of a service; either may be ``*``."""
+        return f"{self._root}/{service}/{what}"
+
+    def call(self, service: str, operation: str) -> str:
+        """Of an operation; likewise."""
+        return f"{self._root}/{service}/call/{operation}"
+
+
+def parts_of(key: str) -> tuple[str, str]:
+    """(service, operation or what else) of a key of a service."""
+    parts = key.split("/")
+    return parts[3], parts[-1]
+
+
+def token_parts(key: str) -> tuple[int, str]:
+    """(version, instance) of a token; version 0: not to be understood."""
+    version, instance = key.split("/")[3:5]
+    return (int(version) if version.isdigit() else 0), instance
+
+
+def raw_message(frame: Frame) -> bytes:
+    """A frame as it is in the ring."""
+    return b"".join((_HEAD.pack(RAW, frame.generation), frame.slot))
+
+
+def coded_message(coded: bytes) -> bytes:
+    """A message of :mod:`skinware.recording.codec`, for the link."""
+    return _CODED_HEAD + coded
+
+
+def form_of(message: bytes) -> int:
+    """Whether a frame is raw or coded.
+
+    Raises:
+        BridgeError: neither.
+    """
+    if len(message) < _HEAD.size or message[0] not in (RAW, CODED):
+        raise BridgeError("a frame of no known form")
+    return message[0]
+
+
+def generation_of(message: bytes) -> int:
+    """The generation of a frame; it stands at the same place in both forms."""
+    number: int = _HEAD.unpack_from(message)[1]
+    return number
+
+
+def slot_of(message: bytes) -> npt.NDArray[np.uint8]:
+    """(stride,) the slot of a raw frame."""
+    return np.frombuffer(message, np.uint8, offset=_HEAD.size)
+
+
+def coded_part(message: bytes) -> memoryview:
+    """What was coded, of a coded frame."""
+    return memoryview(message)[len(_CODED_HEAD) :]
+
+
+def generation_message(about: About, head: bytes) -> bytes:
+    """What a generation is, for the link."""
+    text = msgspec.json.encode(about)
+    return _SIZE.pack(len(text)) + text + head
+
+
+def split_generation(message: bytes) -> tuple[About, bytes]:
+    """(what its file does not tell, its file up to the slots).
+
+    Raises:
+        BridgeError: it is no such message.
+    """
+    try:
+        (size,) = _SIZE.unpack_from(message)
+        begin = _SIZE.size + size
+        return msgspec.json.decode(message[_SIZE.size : begin], type=About), message[begin:]
+    except (struct.error, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise BridgeError(f"what a generation is cannot be read ({error})") from None

@@ -1,0 +1,237 @@
+"""``skin-bridge``: a namespace of one machine on another."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    signals_end,
+    version_option,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from skinware.bridge import Joiner, Server
+
+_PORT = 7448
+_tls_option = click.option(
+    "--tls",
+    metavar="DIR",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
+)
+
+
+@click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
+@version_option
+def command() -> None:
+    """Have the drivers and services of one machine on another, as if they ran there.
+
+    On the robot: skin-bridge serve. Elsewhere: skin-bridge join.
+    """
+
+
+@command.command(
+    "serve",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-bridge serve --robot icub                                     for programs of this machine",
+        "skin-bridge serve --robot icub --listen tcp/0.0.0.0:7448 --insecure  for all in a network that is trusted",
+        "skin-bridge serve --robot icub --listen tls/0.0.0.0:7448 --tls certs  for all with a certificate",
+    ),
+)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option("--robot", required=True, metavar="R", help="What others call this robot.")
+@click.option(
+    "--listen",
+    multiple=True,
+    metavar="ENDPOINT",
+    help=f"Where others connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
+)
+@click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router to connect to, instead of being called.")
+@_tls_option
+@click.option(
+    "--caller",
+    "callers",
+    multiple=True,
+    metavar="NAME",
+    help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
+)
+@click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+@namespace_option
+@json_option
+def serve(
+    names: tuple[str, ...],
+    robot: str,
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    tls: Path | None,
+    callers: tuple[str, ...],
+    insecure: bool,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Let other machines join drivers and services NAME..., or all there are and come.
+
+    A receiver that is slow, stopped or gone costs neither the drivers nor other receivers anything.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage.
+    """
+    from skinware.bridge import DEFAULT_LISTEN, Link, Server, endpoints
+    from skinware.memory.namespace import Namespace, check_name
+
+    for name in names:
+        check_name(name, "service")
+    place = Namespace(namespace)
+    places = endpoints(
+        listen=listen or (() if connect else (DEFAULT_LISTEN,)),
+        connect=connect,
+        tls=tls,
+        serves=True,
+        callers=callers,
+        insecure=insecure,
+    )
+    with contextlib.closing(Link(places)) as link:
+        server = Server(robot, link, place, names or None, callers=callers)
+        with contextlib.closing(server), signals_end(server.stop):
+            if as_json:
+                told = {"robot": robot, "namespace": place.name}
+                print_json({"event": "ready", **told, "listen": list(places.listen), "connect": list(places.connect)})
+            else:
+                click.echo(f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
+            status = _Serving(server, as_json)
+            server.run(status.tell)
+
+
+class _Serving:
+    """Tells each second what was sent."""
+
+    def __init__(self, server: Server, as_json: bool) -> None:
+        self._server, self._as_json = server, as_json
+        self._before: dict[str, int] = {}
+        self._known: dict[str, str] = {}
+
+    def tell(self) -> None:
+        frames = self._server.frames()
+        if self._as_json:
+            services = {
+                name: {"state": state, "rate_hz": count - self._before.get(name, 0), "pulled_by": pullers}
+                for name, (state, count, pullers) in frames.items()
+            }
+            print_json({"event": "status", "lost": self._server.lost, "services": services})
+        for name, (state, count, _) in frames.items():
+            if not self._as_json and self._known.get(name) != state:
+                click.echo(f"{name}: {state}")
+            self._known[name], self._before[name] = state, count
+
+
+@command.command(
+    "join",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-bridge join icub --connect tcp/192.168.1.10:7448     then: skin-top --namespace icub",
+        "skin-bridge join icub --connect tls/icub.local:7448 --tls certs --into default",
+    ),
+)
+@click.argument("robot", metavar="R")
+@click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Where it is: tcp/HOST:PORT.")
+@click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
+@_tls_option
+@click.option(
+    "--mode",
+    type=click.Choice(["auto", "push", "pull"]),
+    default="auto",
+    show_default=True,
+    help="Every frame as it comes, or only the newest as fast as the link takes them.",
+)
+@json_option
+def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | None, mode: str, as_json: bool) -> None:
+    """Have the services of robot R here: same names, structures, states and operations, for all programs and readers.
+
+    Times are moved to the clock of this machine. What the link cannot take is left out, and counted as lost.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage.
+    """
+    from skinware.bridge import Joiner, Link, endpoints
+    from skinware.memory.namespace import Namespace
+
+    place = Namespace(into or robot)
+    places = endpoints(connect=connect, tls=tls)
+    with contextlib.closing(Link(places)) as link:
+        status = _Joined(as_json)
+        joiner = Joiner(robot, link, place, mode=None if mode == "auto" else mode, tell=status.happened)
+        with contextlib.closing(joiner), signals_end(joiner.stop):
+            if as_json:
+                print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
+            else:
+                click.echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
+            joiner.run(lambda: status.tell(joiner))
+
+
+class _Joined:
+    """Tells each second what came, and what happens at once."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._known: dict[str, tuple[str, str]] = {}
+
+    def happened(self, event: dict[str, Any]) -> None:
+        if self._as_json:
+            print_json(event)
+        elif event["event"] == "trouble":
+            warn(event["why"])
+        elif event["event"] == "mode":
+            click.echo(f"{event['service']}: {_MODES[event['mode']]}")
+        else:
+            click.echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
+
+    def tell(self, joiner: Joiner) -> None:
+        services = {}
+        for name, (state, mode, traffic) in joiner.traffic().items():
+            ages = sorted(traffic.ages_ns)
+            services[name] = {
+                "state": state,
+                "mode": mode,
+                "rate_hz": traffic.frames,
+                "lost": traffic.lost,
+                "bytes_per_s": traffic.bytes,
+                "age_ms": {
+                    "p50": ages[len(ages) // 2] / 1e6 if ages else None,
+                    "p99": ages[len(ages) * 99 // 100] / 1e6 if ages else None,
+                },
+            }
+            if not self._as_json and self._known.get(name) != (state, mode):
+                click.echo(f"{name}: {state}")
+            self._known[name] = state, mode
+        if self._as_json:
+            clock = joiner.clock
+            told = {"error_ms": clock.error_ns / 1e6, "round_trip_ms": clock.round_trip_ns / 1e6}
+            print_json(
+                {
+                    "event": "status",
+                    "connected": joiner.is_connected,
+                    "clock": told if clock.is_known else None,
+                    "services": services,
+                }
+            )
+
+
+_MODES = {
+    "push": "all frames come again",
+    "pull": "the link is too slow for all frames: only the newest come, as fast as it takes them",
+}
+
+
+def main() -> None:
+    """Entry point."""
+    run(command, goes_on=True)

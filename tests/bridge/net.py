@@ -1,0 +1,134 @@
+"""A network in this process, in the place of zenoh's: what goes over it can be held up, lost and cut."""
+
+from __future__ import annotations
+
+import fnmatch
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from skinware.bridge.link import Link, Payload, Reply
+
+
+class _Asked:
+    def __init__(self, net: Net, key: str, parameters: Mapping[str, str], payload: bytes, to: Callable[..., None]):
+        self.key, self.parameters, self.payload = key, parameters, payload
+        self._net, self._to, self._done = net, to, False
+
+    def reply(self, payload: Payload) -> None:
+        self._answer(Reply(payload))
+
+    def fail(self, error: Payload) -> None:
+        self._answer(Reply(None, error))
+
+    def _answer(self, reply: Reply) -> None:
+        assert not self._done
+        self._done = True
+        self._net.carry("reply", self.key, lambda: self._to(reply))
+
+
+class Net:
+    """Carries messages between links, in a thread of its own and in order.
+
+    Attributes:
+        loses: (kind, key) -> whether a message is lost; kinds: ``frame``, ``told``, ``question``, ``reply``.
+        is_cut: nothing goes over it.
+        offered: frames that were sent, whether they got lost or not.
+    """
+
+    def __init__(self) -> None:
+        self.loses: Callable[[str, str], bool] = lambda _kind, _key: False
+        self.is_cut = False
+        self.offered = 0
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self.listeners: list[tuple[str, Callable[[str, Payload], None]]] = []
+        self.answerers: list[tuple[str, Callable[[Any], None]]] = []
+        self.tokens: set[str] = set()
+        self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        self._thread = threading.Thread(target=self._run, name="net")
+        self._thread.start()
+
+    def carry(self, kind: str, key: str, job: Callable[[], None]) -> None:
+        """Have something arrive, unless it is lost."""
+        if not self.is_cut and not self.loses(kind, key):
+            self._jobs.put(job)
+        self.offered += kind == "frame"
+
+    def close(self) -> None:
+        """End it."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+
+class NetLink(Link):
+    """An end of a :class:`Net`."""
+
+    def __init__(self, net: Net) -> None:
+        self._net = net
+        self._own: list[str] = []
+
+    def sender(self, key: str) -> Callable[[Payload], None]:
+        def send(payload: Payload) -> None:
+            for pattern, heard in list(self._net.listeners):
+                if fnmatch.fnmatchcase(key, pattern):
+                    self._net.carry("frame", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]
+
+        return send
+
+    def tell(self, key: str, payload: Payload) -> None:
+        for pattern, heard in list(self._net.listeners):
+            if fnmatch.fnmatchcase(key, pattern):
+                self._net.carry("told", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]
+
+    def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
+        entry = (key, heard)
+        self._net.listeners.append(entry)
+        return lambda: self._net.listeners.remove(entry)
+
+    def answer(self, key: str, asked: Callable[[Any], None]) -> Callable[[], None]:
+        entry = (key, asked)
+        self._net.answerers.append(entry)
+        return lambda: self._net.answerers.remove(entry)
+
+    def ask(
+        self,
+        key: str,
+        answered: Callable[[Reply], None],
+        *,
+        timeout_s: float,
+        priority: object,
+        parameters: Mapping[str, object] | None = None,
+        payload: Payload = b"",
+    ) -> None:
+        texts = {name: str(value) for name, value in (parameters or {}).items()}
+        for pattern, asked in list(self._net.answerers):
+            if fnmatch.fnmatchcase(key, pattern):
+                question = _Asked(self._net, key, texts, payload, answered)
+                self._net.carry("question", key, lambda asked=asked, question=question: asked(question))  # type: ignore[misc]
+
+    def be_there(self, key: str) -> None:
+        self._own.append(key)
+        self._net.tokens.add(key)
+        self._tell_watchers(key, True)
+
+    def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
+        self._net.watchers.append((key, changed))
+        for token in self._net.tokens:
+            if fnmatch.fnmatchcase(token, key):
+                self._net.carry("token", token, lambda token=token: changed(token, True))  # type: ignore[misc]
+
+    def close(self) -> None:
+        for key in self._own:
+            self._net.tokens.discard(key)
+            self._tell_watchers(key, False)
+        self._own.clear()
+
+    def _tell_watchers(self, key: str, there: bool) -> None:
+        for pattern, changed in self._net.watchers:
+            if fnmatch.fnmatchcase(key, pattern):
+                self._net.carry("token", key, lambda changed=changed: changed(key, there))  # type: ignore[misc]

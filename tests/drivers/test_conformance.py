@@ -15,19 +15,23 @@ from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
+from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
@@ -174,6 +178,25 @@ class TestWujiGlove(DriverConformance):
 class TestAgni(DriverConformance):
     driver = AgniDriver
     emulator = EmulatedAgni
+
+
+class TestFlexiTac(DriverConformance):
+    driver = FlexiTacDriver
+    emulator = EmulatedFlexiTac
+
+
+class TestFlexiTacText(DriverConformance):
+    """The older firmware, in its own size."""
+
+    driver = FlexiTacDriver
+    emulator = EmulatedFlexiTac
+    driver_options: ClassVar[Mapping[str, Any]] = {"firmware": "text"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"firmware": "text", "rows": 16, "columns": 16, "period_ms": 31}
+
+
+class TestAbilityHand(DriverConformance):
+    driver = AbilityHandDriver
+    emulator = EmulatedAbilityHand
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -39,7 +39,10 @@ from tests.sdk.test_flow import EndOfCable
 MS = 1_000_000
 UNASKED = ("agni", "cyskin_cpm", "skintalk", "tactile_glove", "xela")
 """Devices that send by themselves: between their frames, nothing moves the time."""
-DRIVERS = (*UNASKED, "anyskin", "barrett", "canopen", "openpatch", "roboskin", "weiss_wts", "wuji_glove")
+DRIVERS = (
+    *UNASKED,
+    *("ability_hand", "anyskin", "barrett", "canopen", "flexitac", "openpatch", "roboskin", "weiss_wts", "wuji_glove"),
+)
 
 
 @pytest.fixture

@@ -21,10 +21,13 @@ from skinware_drivers.description import Patch, assemble
 from skinware_drivers.hand import FINGERS
 from skinware_drivers.link import Link, Match
 from skinware_drivers.registry import class_for, load_driver
+from skinware_drivers.testing.both_paths import why_python
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from tests.drivers.bench import Bench, BenchLoop, Case, play
+from tests.drivers.frame_fuzzing import fuzz
+from tests.drivers.fuzzed import FUZZED, allegro
 
 RIGHT = 0x27
 MS = 1_000_000
@@ -275,12 +278,6 @@ def test_the_serial_number_is_asked_for() -> None:
 # Allegro V5
 
 
-def allegro(model: str, **options: Any) -> AllegroV5Driver:
-    adapter = AllegroV5Driver(AllegroV5Options(model=model, learn_s=0.001, **options))  # type: ignore[arg-type]
-    asyncio.run(adapter.describe(Others()))
-    return adapter
-
-
 def pascals(decoder: Decoder) -> list[float]:
     told: list[float] = decoder.tables.structure.physical(decoder.state.values, "pressure").tolist()
     return told
@@ -403,3 +400,13 @@ def test_every_pad_has_a_place(model: str, side: str) -> None:
     assert tables.placed(adapter.geometry).structure.geometry is not None
     assert sorted(adapter.geometry.uid.tolist()) == tables.structure.sensor_uid.tolist()
     assert len({tuple(place) for place in adapter.geometry.position_m.tolist()}) == len(adapter.geometry)
+
+
+@pytest.mark.usefixtures("namespace")
+@pytest.mark.parametrize("name", FUZZED)
+def test_random_frames_raise_nothing_and_c_does_with_them_what_numpy_does(name: str) -> None:
+    if why_python():
+        pytest.skip(f"no data path in C: {why_python()}")
+    outcome = fuzz(FUZZED[name](), 100_000, seed=1)
+    assert outcome.updates
+    assert outcome.counted

@@ -46,6 +46,7 @@ class Adapter(HasOptions[OptionsT], ABC):
 
     Attributes:
         medium: kind of bus: ``can``, ``serial`` or ``virtual``.
+        elsewhere: classes with the same options for the same devices on other kinds of bus.
         Options: struct of the options, as named in the brackets; becomes command-line options and TOML keys.
         types: the sensor types, with this hardware's units and scales.
         dtype: dtype of the values.
@@ -61,6 +62,7 @@ class Adapter(HasOptions[OptionsT], ABC):
     """
 
     medium: ClassVar[str]
+    elsewhere: ClassVar[Sequence[type[AnyAdapter]]] = ()
     Options: ClassVar[type[msgspec.Struct]] = NoOptions
     types: Sequence[SensorType] = ()
     dtype: npt.DTypeLike = np.uint8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from skinware_drivers.bus import EXTENDED_FLAG, IDENTIFIER_MASK, LARGEST_STANDARD
@@ -33,6 +34,15 @@ class Identifier:
         every = EXTENDED_FLAG | IDENTIFIER_MASK if is_extended else LARGEST_STANDARD
         mask = every if self.mask == -1 else self.mask | (EXTENDED_FLAG if is_extended else 0)
         object.__setattr__(self, "mask", mask)
+
+    @classmethod
+    def covering(cls, identifiers: Sequence[int]) -> Identifier:
+        """What all these identifiers of 11 bits have in common, and as few others as one condition can have."""
+        differ = 0
+        for identifier in identifiers:
+            differ |= identifier ^ identifiers[0]
+        mask = LARGEST_STANDARD & ~((1 << differ.bit_length()) - 1)
+        return cls(identifiers[0] & mask, mask)
 
 
 @dataclass(frozen=True)

@@ -49,13 +49,14 @@ class Grid:
     columns: int
     pitch_m: float = PITCH_M
 
-    def at(self, centre_m: Triple, type_names: Sequence[str], uid: Sequence[int]) -> Geometry:
+    def at(self, centre_m: Triple, type_names: Sequence[str], uid: Sequence[int], frame: str = FRAME) -> Geometry:
         """The places of a grid's taxels.
 
         Args:
             centre_m: of the grid.
             type_names: types of the sensors that each taxel has (``["pressure"]``, or its axes).
             uid: of the taxels, row by row; the last ones may be missing.
+            frame: in which they are, if not that of a hand.
 
         Raises:
             ValueError: more taxels than the grid has places.
@@ -72,7 +73,7 @@ class Grid:
         return Geometry(
             type_name=np.repeat(np.array(type_names, object), n),
             uid=np.tile(np.array(uid, np.uint64), k),
-            frame=np.full(k * n, FRAME, object),
+            frame=np.full(k * n, frame, object),
             position_m=np.tile(place, (k, 1)),
             normal=np.tile([0.0, 0.0, 1.0], (k * n, 1)),
             radius_m=np.full(k * n, np.nan),

@@ -47,12 +47,14 @@ class Reply(NamedTuple):
 class Match(NamedTuple):
     """Which frames are an answer: ``identifier & mask == value``, and a payload that begins with ``prefix``.
 
-    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) counts whatever the mask.
+    Whether the identifier has 11 or 29 bits (``EXTENDED_FLAG`` in ``value``) counts whatever the mask. Where questions
+    of other programs begin as the answers do, ``shortest`` tells them apart: the bytes that an answer has at least.
     """
 
     value: int
     mask: int = IDENTIFIER_MASK
     prefix: bytes = b""
+    shortest: int = 0
 
     @property
     def filter(self) -> Filter:
@@ -62,7 +64,8 @@ class Match(NamedTuple):
     def fits(self, frame: Reply) -> bool:
         """Whether a frame is such an answer."""
         value, mask = self.filter
-        return frame.identifier & mask == value and frame.payload.startswith(self.prefix)
+        is_from_there = frame.identifier & mask == value
+        return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest
 
 
 class Heard(NamedTuple):

@@ -66,3 +66,20 @@ def load_driver(name: str) -> type[AnyAdapter]:
         ConfigurationError: there is none of that name, or it cannot be loaded.
     """
     return load(_DRIVER, name)
+
+
+def class_for(driver: type[AnyAdapter], bus_name: str, driver_name: str) -> type[AnyAdapter]:
+    """The class of a driver for a bus: of devices that are attached to several kinds of bus, that for this kind.
+
+    Args:
+        driver: as :func:`load_driver` gives it.
+        bus_name: of the bus, as for :func:`make_bus`.
+        driver_name: of the driver.
+
+    Raises:
+        ConfigurationError: no such bus.
+    """
+    if not driver.elsewhere:
+        return driver
+    bus = make_bus(bus_name, driver=driver_name)
+    return next((one for one in (driver, *driver.elsewhere) if bus.fits(one.medium)), driver)

@@ -56,7 +56,7 @@ class XelaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigurationError(f"{len(self.boards)} boards, but first_id has {len(self.first_id)}: give one each")
         known: set[int] = set()
         for board, first in zip(self.boards, self.first_id, strict=True):
-            block = _block(self.identifiers(first))
+            block = Identifier.covering(self.identifiers(first))
             taken = {i for i in range(0x800) if i & block.mask == block.value}
             if max(self.identifiers(first)) > 0x7FF:
                 raise ConfigurationError(f"board {board}: identifiers from {first:#x} on go beyond 0x7FF")
@@ -90,8 +90,8 @@ class XelaDriver(CanAdapter[XelaOptions]):
         axes = Values(offset=1, dtype=">u2", count=3)
         self.layout: Layout = Layout(
             tuple(
-                Frame(f"board {board}", (_block(identifiers),), (8,), axes, patch=board, module=Bits(0, 11))
-                for board, identifiers in ids.items()
+                Frame(f"board {board}", (Identifier.covering(own),), (8,), axes, patch=board, module=Bits(0, 11))
+                for board, own in ids.items()
             )
         )
 
@@ -117,12 +117,3 @@ def _patch(board: int, identifiers: Sequence[int]) -> Patch:
         for taxel, identifier in enumerate(identifiers)
     ]
     return Patch(f"board {board}", modules, key=board)
-
-
-def _block(identifiers: Sequence[int]) -> Identifier:
-    """What all these identifiers have in common."""
-    differ = 0
-    for identifier in identifiers:
-        differ |= identifier ^ identifiers[0]
-    mask = 0x7FF & ~((1 << differ.bit_length()) - 1)
-    return Identifier(identifiers[0] & mask, mask)

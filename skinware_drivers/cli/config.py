@@ -195,7 +195,7 @@ def _adapter(
 ) -> tuple[str, AnyAdapter]:
     """Name and object of the driver for a bus that has none running."""
     from skinware_drivers.options.file import ConfigFile
-    from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
+    from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver
 
     file = ConfigFile(config)
     driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
@@ -206,7 +206,8 @@ def _adapter(
         if not equals:
             raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
         given[key] = value
-    return driver_type, driver(file.options_of_bus(driver.Options, bus_name, given))
+    adapter_class = class_for(driver, bus_name, driver_type)
+    return driver_type, adapter_class(file.options_of_bus(driver.Options, bus_name, given))
 
 
 def _ask_back(what: str, description: str, yes: bool) -> None:

@@ -190,7 +190,7 @@ def command(
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.loading import short_name
-    from skinware_drivers.registry import DEFAULT_DRIVER, load_driver, make_bus
+    from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver, make_bus
     from skinware_drivers.running.flow import FlowLoop
     from skinware_drivers.running.guard import hook
     from skinware_drivers.running.runner import Runner
@@ -217,8 +217,9 @@ def command(
     def adapter_of(bus_name: str, file: ConfigFile) -> AnyAdapter:
         options = file.options_of_bus(driver.Options, bus_name, given)
         with file.blamed_for(bus_name):
+            adapter_class = class_for(driver, bus_name, driver_name)
             with hook("__init__", bus_name):
-                adapter = driver(options)
+                adapter = adapter_class(options)
             adapter.check()
         return adapter
 

@@ -18,7 +18,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus
 from skinware_drivers.description import Patch
 from skinware_drivers.finding.traffic import Traffic
-from skinware_drivers.layout import Bits, Frame, Identifier, Layout
+from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout
 from skinware_drivers.link import Heard, Link
 from skinware_drivers.loading import short_name
 from skinware_drivers.registry import DRIVERS, load_driver
@@ -142,6 +142,7 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
     if layout is None or not len(wire):
         return None
     members = set(layout.cycle.members) if layout.cycle else set()
+    without_values = {frame.name for frame in layout.frames if _has_no_values(frame)}
     heard: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
     bits = 0.0
     for frame in layout.frames:
@@ -150,7 +151,11 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
         keys = _patch_keys(frame, wire["identifier"])
         for key in np.unique(keys[rows]).tolist():
             heard.setdefault(key, {})[frame.name] = rows & (keys == key)
-    whole = {key: frames for key, frames in heard.items() if members <= set(frames) or (set(frames) - members)}
+    whole = {
+        key: frames
+        for key, frames in heard.items()
+        if members <= set(frames) or (set(frames) - members - without_values)
+    }
     if not whole:
         return None
     rows = np.zeros(len(wire), bool)
@@ -159,6 +164,11 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
             if name_of_frame not in members or members <= set(frames):
                 rows |= of_frame
     return _Match(name, adapter, rows, frozenset(whole), bits / len(wire))
+
+
+def _has_no_values(frame: Frame) -> bool:
+    """Whether it says nothing of a skin: such frames are known only beside those that do."""
+    return not isinstance(frame.values, Expand) and not any(values.count for values in frame.runs)
 
 
 def _patch_keys(frame: Frame, identifier: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:

@@ -21,7 +21,9 @@ from skinware_drivers.serial.checksums import (
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Unframed
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
+from skinware_drivers.serial.recurring import Recurring
 from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
+from skinware_drivers.serial.text_matrix import TextMatrix
 
 __all__ = [
     "COBS",
@@ -46,9 +48,11 @@ __all__ = [
     "Length",
     "LengthTable",
     "Packet",
+    "Recurring",
     "Refused",
     "SerialAdapter",
     "Sum",
+    "TextMatrix",
     "Unframed",
     "Xor",
 ]

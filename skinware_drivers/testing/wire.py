@@ -23,7 +23,7 @@ from skinware_drivers.testing.clock import HandClock, HandTimer
 from skinware_drivers.testing.defect import defect
 from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, next_read
 
 Fault = Literal["lost", "repeated", "truncated", "garbage", "noise"]
 """Of a frame: gone, twice, cut short, random bytes instead of its own, random bytes before it (serial lines)."""
@@ -127,6 +127,11 @@ class Interference:
     _next_ns: int = 0
     _next_foreign_ns: int = 0
 
+    @property
+    def datagrams(self) -> bool:
+        """Whether the devices send datagrams."""
+        return bool(getattr(self.hardware, "datagrams", False))
+
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """What the driver sends."""
         if self.remember:
@@ -207,7 +212,7 @@ class _EmulatedPort(Port):
         self._hardware = hardware
         self._clock = clock
         self._timer: HandTimer = clock.timer()
-        self._bytes = b""
+        self._unread: list[bytes] = []
         self.present = True
         hardware.skip(clock())
         self._wake()
@@ -218,8 +223,8 @@ class _EmulatedPort(Port):
     def read(self, size: int) -> bytes:
         if not self.present:
             raise BusNotAvailable("the emulated line went away, perhaps unplugged")
-        self._bytes += b"".join(frame.payload for frame in self._hardware.emit(self._clock()))
-        data, self._bytes = self._bytes[:size], self._bytes[size:]
+        self._unread += [frame.payload for frame in self._hardware.emit(self._clock())]
+        data = next_read(self._hardware, self._unread, size)
         self._wake()
         return data
 
@@ -238,7 +243,7 @@ class _EmulatedPort(Port):
         self._timer.wake_at(0)
 
     def _wake(self) -> None:
-        self._timer.wake_at(0 if self._bytes else self._hardware.next_due_ns())
+        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
 class _Line:

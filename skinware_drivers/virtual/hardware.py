@@ -153,6 +153,21 @@ def medium_of(emulator: HardwareFactory) -> str:
     return medium
 
 
+def next_read(hardware: EmulatedHardware, waiting: list[bytes], size: int) -> bytes:
+    """What a read at the other end of an emulated line gives: all that waits, or one datagram.
+
+    Args:
+        hardware: with an attribute ``datagrams`` that is true: what it sends are datagrams.
+        waiting: payloads that were sent and not read yet, which are taken out.
+        size: bytes that are read at the most.
+    """
+    if getattr(hardware, "datagrams", False):
+        return waiting.pop(0)[:size] if waiting else b""
+    data = b"".join(waiting)
+    waiting[:] = [data[size:]] if len(data) > size else []
+    return data[:size]
+
+
 def emulators_instead(medium: str) -> str:
     """The emulators that drivers of a medium can use instead, for people; empty if there are none."""
     fitting = []
@@ -184,4 +199,5 @@ __all__ = [
     "emulators_instead",
     "load_emulator",
     "medium_of",
+    "next_read",
 ]

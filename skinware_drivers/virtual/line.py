@@ -19,6 +19,7 @@ from skinware_drivers.virtual.hardware import (
     emulators_instead,
     load_emulator,
     medium_of,
+    next_read,
 )
 from skinware_drivers.virtual.placed import PlacedCanBus
 from skinware_drivers.virtual.timer import MonotonicTimer
@@ -79,7 +80,7 @@ class _EmulatedPort(Port):
     def __init__(self, hardware: EmulatedHardware) -> None:
         self._hardware = hardware
         self._timer = MonotonicTimer()
-        self._bytes = b""
+        self._unread: list[bytes] = []
         hardware.skip(time.monotonic_ns())
         self._wake_when_due()
 
@@ -91,8 +92,8 @@ class _EmulatedPort(Port):
         due_ns = self._hardware.next_due_ns()
         if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-        self._bytes += b"".join(frame.payload for frame in self._hardware.emit(now_ns))
-        data, self._bytes = self._bytes[:size], self._bytes[size:]
+        self._unread += [frame.payload for frame in self._hardware.emit(now_ns)]
+        data = next_read(self._hardware, self._unread, size)
         self._wake_when_due()
         return data
 
@@ -105,7 +106,7 @@ class _EmulatedPort(Port):
         self._timer.close()
 
     def _wake_when_due(self) -> None:
-        self._timer.wake_at(0 if self._bytes else self._hardware.next_due_ns())
+        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
 def virtual_bus(

@@ -31,6 +31,7 @@ class SerialEmulator(Emulator[OptionsT]):
 
     Attributes:
         speed_mbit_s: of the line.
+        datagrams: each message is a datagram of its own, as over UDP, and no part of a stream.
 
     Raises:
         ConfigurationError: the options want frames of other devices, of which a line has none.
@@ -40,6 +41,7 @@ class SerialEmulator(Emulator[OptionsT]):
     least_options = SerialEmulatorOptions
     numbers: Sequence[int] = (1,)
     speed_mbit_s: ClassVar[int] = 1
+    datagrams: ClassVar[bool] = False
 
     def __init__(self, options: OptionsT, **more: Any) -> None:
         if options.foreign_hz:

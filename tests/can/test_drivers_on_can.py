@@ -75,6 +75,7 @@ def emulating(driver: str, bus: str, **options: Any) -> Iterator[Events]:
         ("barrett", 96, {"period_ms": 200}, {}),
         ("canopen", 32, {"nodes": (5, 6), "period_ms": 100, "heartbeat_ms": 1000}, {}),
         ("cyskin_cpm", 16, {"period_ms": 100}, {"period_ms": 100}),
+        ("linkerhand", 360, {"ask": True, "period_ms": 200}, {"program_ms": 0}),
         ("xela", 48, {"period_ms": 100}, {"period_ms": 100}),
     ],
 )

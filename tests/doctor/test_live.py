@@ -30,7 +30,7 @@ from tests.doctor.rig import found, found_until, looked, of
 from tests.sdk.driving import driving, emulated
 
 Skins = Callable[..., EmulatedSkin]
-DRIVERS = sorted(entry_points(group="skinware.emulators").names)
+DRIVERS = sorted(entry_points(group="skinware.drivers").names)
 
 
 @pytest.mark.parametrize("driver", DRIVERS)

@@ -10,24 +10,36 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5UdpDriver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
+from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
+from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.conformance import DriverConformance
+from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.allegro_v5 import (
+    EmulatedAllegroV5,
+    EmulatedAllegroV5Tips,
+    EmulatedAllegroV5Udp,
+)
 from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
+from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
@@ -88,6 +100,46 @@ class TestBarrettTop10(DriverConformance):
         weakest_last = sorted((-value, cell) for cell, value in enumerate(felt))
         listed = {cell for _, cell in weakest_last[:10]}
         return [value // 256 if cell in listed else 0 for cell, value in enumerate(felt)]
+
+
+class TestLinkerHand(DriverConformance):
+    """It asks."""
+
+    driver = LinkerHandDriver
+    emulator = EmulatedLinkerHand
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": True}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0}
+
+
+class TestLinkerHandBesideItsProgram(DriverConformance):
+    """Two hands of ten by four, whose own program asks."""
+
+    driver = LinkerHandDriver
+    emulator = EmulatedLinkerHand
+    driver_options: ClassVar[Mapping[str, Any]] = {"hands": (0x27, 0x28), "touch": "10x4"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"hands": (0x27, 0x28), "touch": "10x4"}
+
+
+class TestLinkerHandFingers(DriverConformance):
+    driver = LinkerHandDriver
+    emulator = EmulatedLinkerHand
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": True, "touch": "fingers_90"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "fingers_90"}
+
+
+class TestAllegroV5(DriverConformance):
+    driver = AllegroV5Driver
+    emulator = EmulatedAllegroV5
+
+
+class TestAllegroV5Tips(DriverConformance):
+    driver = AllegroV5Driver
+    emulator = EmulatedAllegroV5Tips
+
+
+class TestAllegroV5Udp(DriverConformance):
+    driver = AllegroV5UdpDriver
+    emulator = EmulatedAllegroV5Udp
 
 
 class EmulatedTriangles(EmulatedRoboskin):
@@ -174,6 +226,25 @@ class TestWujiGlove(DriverConformance):
 class TestAgni(DriverConformance):
     driver = AgniDriver
     emulator = EmulatedAgni
+
+
+class TestFlexiTac(DriverConformance):
+    driver = FlexiTacDriver
+    emulator = EmulatedFlexiTac
+
+
+class TestFlexiTacText(DriverConformance):
+    """The older firmware, in its own size."""
+
+    driver = FlexiTacDriver
+    emulator = EmulatedFlexiTac
+    driver_options: ClassVar[Mapping[str, Any]] = {"firmware": "text"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"firmware": "text", "rows": 16, "columns": 16, "period_ms": 31}
+
+
+class TestAbilityHand(DriverConformance):
+    driver = AbilityHandDriver
+    emulator = EmulatedAbilityHand
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -13,9 +13,11 @@ from skinware.errors import BusNotAvailable, HandshakeTimeout
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.can import roboskin_boards
+from skinware_drivers.can.allegro_v5 import AllegroV5Driver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
 from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
+from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver, RoboskinOptions
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
@@ -23,7 +25,14 @@ from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.looking import Answer, HeardOnBus, ask, ask_port, listen_on
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.devices.allegro_v5 import (
+    EmulatedAllegroV5,
+    EmulatedAllegroV5Options,
+    EmulatedAllegroV5Tips,
+    EmulatedAllegroV5TipsOptions,
+)
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
+from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.hardware import EmulatedHardware
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions as EmulatorOptions
@@ -218,6 +227,9 @@ def test_drivers_that_do_not_say_how_to_ask_ask_nobody() -> None:
         (EmulatedRoboskin(EmulatorOptions(boards=(7,), streaming=True)), "roboskin", ("board 7",)),
         (EmulatedXela(EmulatedXelaOptions(streaming=True)), "xela", ("board 1",)),
         (EmulatedCyskinCpm(EmulatedCyskinCpmOptions(streaming=True)), "cyskin_cpm", ("finger",)),
+        (EmulatedLinkerHand(EmulatedLinkerHandOptions(hands=(0x28,))), "linkerhand", ("left hand",)),
+        (EmulatedAllegroV5(EmulatedAllegroV5Options()), "allegro_v5", ("hand",)),
+        (EmulatedAllegroV5Tips(EmulatedAllegroV5TipsOptions()), "allegro_v5", ("hand",)),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -226,9 +238,11 @@ def test_devices_are_taken_for_what_they_are_and_for_nothing_else(
 ) -> None:
     bus = VirtualCanBus.with_hardware(emulator, listen_only=True)
     drivers: dict[str, type[AnyAdapter]] = {
+        "allegro_v5": AllegroV5Driver,
         "barrett": BarrettDriver,
         "canopen": CanopenDriver,
         "cyskin_cpm": CyskinCpmDriver,
+        "linkerhand": LinkerHandDriver,
         "roboskin": RoboskinDriver,
         "xela": XelaDriver,
     }

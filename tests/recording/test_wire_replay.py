@@ -37,9 +37,25 @@ from tests.sdk.cable import Cable
 from tests.sdk.test_flow import EndOfCable
 
 MS = 1_000_000
-UNASKED = ("agni", "cyskin_cpm", "skintalk", "tactile_glove", "xela")
+UNASKED = ("agni", "allegro_v5", "cyskin_cpm", "linkerhand", "skintalk", "tactile_glove", "xela")
 """Devices that send by themselves: between their frames, nothing moves the time."""
-DRIVERS = (*UNASKED, "anyskin", "barrett", "canopen", "openpatch", "roboskin", "weiss_wts", "wuji_glove")
+OPTIONS: dict[str, dict[str, Any]] = {
+    "allegro_v5": {"model": "sense"},
+    "linkerhand": {"hands": (0x27,), "touch": "12x6"},
+}
+"""Of those that would listen first, to learn who is there: a recording of a few frames has none to spare."""
+DRIVERS = (
+    *UNASKED,
+    "ability_hand",
+    "anyskin",
+    "barrett",
+    "canopen",
+    "flexitac",
+    "openpatch",
+    "roboskin",
+    "weiss_wts",
+    "wuji_glove",
+)
 
 
 @pytest.fixture
@@ -97,10 +113,11 @@ def equal_updates(then: Series, now: Series, *, with_times: bool) -> int:
 def test_every_driver_decodes_its_wire_to_the_same_values(tmp_path: Path, driver: str) -> None:
     kind = load_driver(driver)
     first, again = tmp_path / "first.mcap", tmp_path / "again.mcap"
-    adapter = kind(kind.Options())
+    options = OPTIONS.get(driver, {})
+    adapter = kind(kind.Options(**options))
     emulated = make_bus("virtual", payload_size=adapter.payload_size, driver=driver)
     before = record(first, adapter, emulated, 25)
-    adapter = kind(kind.Options())
+    adapter = kind(kind.Options(**options))
     after = record(again, adapter, make_bus(f"replay:{first}", payload_size=adapter.payload_size), 15)
     assert after.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
     assert equal_updates(before, after, with_times=driver in UNASKED) >= 10

@@ -22,7 +22,9 @@ from skinware_drivers.serial.checksums import (
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
+from skinware_drivers.serial.recurring import Recurring
 from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
+from skinware_drivers.serial.text_matrix import TextMatrix
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,7 @@ EXAMPLES: dict[str, Example] = {
         range(0x3C, 0x7C),
     ),
     "anyskin": Example(Packet(length=82, trailer=b"\r\n", confirmed=True)),
+    "flexitac": Example(Packet(sync=b"\xaa\x55", length=258, confirmed="each")),
     "fixed_crc32": Example(Packet(sync=b"\xa5\x5a", length=40, checksum=CRC32)),
     "no_sync": Example(Packet(length=12, checksum=CRC16_MODBUS)),
     "big_endian": Example(
@@ -159,3 +162,9 @@ EXAMPLES: dict[str, Example] = {
     "lines_and_blanks": Example(Delimited(LINES, maximum_body=200, minimum_body=0)),
 }
 """By name."""
+
+ONLY_IN_PYTHON: dict[str, Example] = {
+    "recurring": Example(Recurring(b"\xaa\x55", maximum_body=60, minimum_body=4), (1,), (20, 33)),
+    "text_matrix": Example(TextMatrix(rows=3, columns=4)),
+}
+"""By name: framings with which drivers hear what C is to find; and of text, of which little comes."""

@@ -13,7 +13,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.packets import Packet
-from tests.serial.framings import Example
+from tests.serial.framings import EXAMPLES, ONLY_IN_PYTHON, Example
 from tests.serial.streams import cut, outcome
 
 _LONGEST_STREAM = 1 << 14
@@ -134,8 +134,7 @@ def _frame(example: Example, script: Script) -> tuple[int, bytes, bytes] | None:
 
 
 def _is_checked(framing: Framing) -> bool:
-    assert isinstance(framing, Packet | Delimited)
-    return framing.checksum is not None
+    return isinstance(framing, Packet | Delimited) and framing.checksum is not None
 
 
 def _check_recovery(framing: Framing, stream: bytes, wholes: dict[int, tuple[int, bytes, bytes]]) -> None:
@@ -151,6 +150,11 @@ def _check_recovery(framing: Framing, stream: bytes, wholes: dict[int, tuple[int
         assert any(other.end > end - len(frame) for other in found if other.end not in wholes or other is seen), (
             f"lost: {frame.hex()} which ends at {end} of {stream.hex()}"
         )
+
+
+def known_examples() -> dict[str, Example]:
+    """All framings there are to be fuzzed."""
+    return {**EXAMPLES, **ONLY_IN_PYTHON, **examples_of_drivers()}
 
 
 def examples_of_drivers() -> dict[str, Example]:

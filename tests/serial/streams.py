@@ -18,7 +18,9 @@ from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framed, Framer, Framing
 from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.recurring import Recurring
 from skinware_drivers.serial.stuffing import LINES
+from skinware_drivers.serial.text_matrix import TextMatrix
 from skinware_drivers.testing.both_streams import made
 from tests.serial.framings import Example
 
@@ -48,6 +50,10 @@ def held_at_most(framer: Framer) -> int:
     framing = getattr(framer, "_framing")  # noqa: B009
     if isinstance(framing, Packet):
         return 2 * framing.longest + len(framing.sync)
+    if isinstance(framing, Recurring):
+        return 3 * (len(framing.marker) + framing.maximum_body) + len(framing.marker)
+    if isinstance(framing, TextMatrix):
+        return framing.longest + 2
     assert isinstance(framing, Delimited)
     return framing.stuffing.longest(framing.maximum_body + framing.overhead)
 

@@ -9,8 +9,8 @@ import random
 import tomllib
 from pathlib import Path
 
-from tests.serial.framings import EXAMPLES
-from tests.serial.fuzzing import changed, examples_of_drivers, run
+from tests.serial.framings import EXAMPLES, ONLY_IN_PYTHON
+from tests.serial.fuzzing import changed, examples_of_drivers, known_examples, run
 
 SEEDS = Path(__file__).parent / "seeds"
 NAMES = sorted(path.stem for path in SEEDS.iterdir())
@@ -25,11 +25,11 @@ def seeds_of(name: str) -> list[bytes]:
 def test_every_framing_has_seeds() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
     ours = {f"driver_{name}" for name in project["project"]["entry-points"]["skinware.drivers"]}
-    assert set(EXAMPLES) | ours & set(examples_of_drivers()) == set(NAMES)
+    assert {*EXAMPLES, *ONLY_IN_PYTHON} | ours & set(examples_of_drivers()) == set(NAMES)
 
 
 def test_seeds_and_what_comes_of_them() -> None:
-    known = {**EXAMPLES, **examples_of_drivers()}
+    known = known_examples()
     for name in NAMES:
         inputs, rng = seeds_of(name), random.Random(1)
         for data in [*inputs, *(changed(inputs, rng, LONGEST) for _ in range(N_CHANGED))]:

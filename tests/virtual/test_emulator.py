@@ -193,7 +193,7 @@ def test_devices_that_are_not_there_are_refused() -> None:
         Rig(lose=2)
 
 
-@pytest.mark.parametrize("name", ["barrett", "canopen", "cyskin_cpm", "roboskin", "xela"])
+@pytest.mark.parametrize("name", ["allegro_v5", "barrett", "canopen", "cyskin_cpm", "linkerhand", "roboskin", "xela"])
 def test_every_driver_has_an_emulator_of_its_name(name: str) -> None:
     emulator = load_emulator(name)
     emulator(emulator.Options()).skip(START_NS)

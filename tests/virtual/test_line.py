@@ -12,7 +12,7 @@ import pytest
 
 from skinware.errors import BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.registry import load_driver
+from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import line
@@ -101,8 +101,15 @@ def test_devices_of_can_are_on_can() -> None:
 def test_every_driver_has_an_emulator_of_its_medium() -> None:
     names = entry_points(group=EMULATORS).names
     assert len(names) > 10
-    for name in names:
+    for name in entry_points(group=DRIVERS).names:
         assert medium_of(load_emulator(name)) == load_driver(name).medium, name
+
+
+def test_other_emulators_are_of_a_driver_that_their_names_begin_with() -> None:
+    drivers = entry_points(group=DRIVERS).names
+    for name in entry_points(group=EMULATORS).names - drivers:
+        (driver,) = (load_driver(one) for one in drivers if name.startswith(f"{one}_"))
+        assert medium_of(load_emulator(name)) in {one.medium for one in (driver, *driver.elsewhere)}, name
 
 
 def test_commands_come_in_pieces_behind_garbage() -> None:

@@ -29,9 +29,8 @@ def fuzz_one(name: str, arguments: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["skinware_drivers.serial"]):
-        from tests.serial.framings import EXAMPLES
-        from tests.serial.fuzzing import examples_of_drivers, run
-    example = {**EXAMPLES, **examples_of_drivers()}[name]
+        from tests.serial.fuzzing import known_examples, run
+    example = known_examples()[name]
 
     def one(data: bytes) -> None:
         run(example, data)
@@ -105,10 +104,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, metavar="N", help="the same inputs each time, from 1 on")
     parser.add_argument("--keep", action="store_true", help="write the inputs worth keeping as seeds")
     arguments = parser.parse_args()
-    from tests.serial.framings import EXAMPLES
-    from tests.serial.fuzzing import examples_of_drivers
+    from tests.serial.fuzzing import known_examples
 
-    known = [*EXAMPLES, *examples_of_drivers()]
+    known = list(known_examples())
     names = arguments.names or known
     if unknown := sorted(set(names) - set(known)):
         parser.error(f"no framing {', '.join(unknown)}; there are: {', '.join(known)}")

@@ -1,0 +1,216 @@
+"""Wonik Allegro hand V5: the air pressure of its fingertips (4F, Plus), or sixteen pads (Sense). Only heard.
+
+Wire format: the maker's allegro_hand_ros2_v5 and allegro_hand_ros2_V5_Sense, and a user's allegro_hand_v5_plus_python.
+The hand sends by itself once its own program has set the period and switched the servos on; this driver sends nothing,
+ever.
+
+On CAN, 1 Mbit/s, little-endian, identifier = number of the message << 2:
+
+* 4F, Plus: message 0F0: index and middle fingertip, 0F2: ring finger and thumb; an int32 in Pa each. The manual calls
+  them 050 and 052: both are known here. The manual has 0 at the pressure of the air; a published program has that
+  pressure itself, 101,325. The option ``zero_pa`` says which.
+* Sense: message 054: palm, thumb 1, 2 and tip, index finger 1, 2, 3 and tip; 055: middle and ring finger likewise. A
+  byte each, in 0.4 kPa; FF: no value. (The maker's program for CAN does not divide the palm's by ten, the one for UDP
+  does; here they are all alike. [INF]) Messages 056 and 057 of older firmware are not read.
+
+Sense over UDP, from its port 7000 to port 8000, every 3 ms, little-endian: ``56 35 42 32``, version 1, type, length
+u16, number u32, ms u32; of type 2 follow 164 bytes: number of the sample u32, position and current of 16 joints
+(int16), the sixteen pads (u16, 0.1 kPa), velocity of the joints (int32). What the length counts is not known [INF]:
+datagrams of type 2 have 180 bytes, others are not shown. Which value means that there is none is not known either.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import HandshakeTimeout
+from skinware.geometry import Geometry
+from skinware.sensor_types import PRESSURE, SensorType
+from skinware.status import Status
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.hand import Grid, Hand
+from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.numbering import SequenceNumber
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.framing import Framing, Unframed
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+TIPS = {"index and middle": (0x3C0, 0x140), "ring and thumb": (0x3C8, 0x148)}
+"""Modules of hands with fingertips, and the identifiers of their frames; uid: 0 to 3, index finger to thumb."""
+PADS = {"palm, thumb and index": 0x150, "middle and ring": 0x154}
+"""Modules of hands with pads, and the identifiers of their frames; uid: 0 palm, 1 thumb, 4 index, 8 middle, 12 ring."""
+N_PADS = 16
+_TIP_FRAMES = [
+    Frame(f"{name}, {one:03X}", [Identifier(one)], [8], Values(0, "<i4", 2), module=ids[0])
+    for name, ids in TIPS.items()
+    for one in ids
+]
+_PAD_FRAMES = [
+    Frame(name, [Identifier(one)], [8], Values(0, "u1", 8), module=one, flags=[Sentinel(Status.NO_ACK, 0xFF)])
+    for name, one in PADS.items()
+]
+_PA_IN_A_BYTE, _PA_OVER_UDP = 400.0, 100.0
+_AIR_PA = range(60_000, 150_000)
+"""From the highest towns to the sea, where somebody presses."""
+_FROM_PAD_TO_PAD_M = 0.02
+_LONGEST_DATAGRAM = 1472
+
+
+class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    model: Annotated[
+        Literal["auto", "tips", "sense"],
+        msgspec.Meta(description="tips: 4F or Plus, with fingertips; sense: V5 Sense; auto: as the frames tell"),
+    ] = "auto"
+    zero_pa: Annotated[
+        int, msgspec.Meta(description="what an untouched fingertip sends, Pa: 0, or 101325 for the pressure of the air")
+    ] = 0
+    side: Annotated[Literal["right", "left"], msgspec.Meta(description="which hand it is, for the places")] = "right"
+    period_ms: Annotated[
+        Annotated[int, msgspec.Meta(ge=1)] | None,
+        msgspec.Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
+    ] = None
+    learn_s: Annotated[float, msgspec.Meta(description="how long is heard which model it is, s", gt=0)] = 0.5
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
+    """One V5 Sense over UDP; each datagram is a sample."""
+
+    types: Sequence[SensorType] = (PRESSURE.measured(scale=_PA_OVER_UDP, minimum=0),)
+    dtype: npt.DTypeLike = np.uint16
+    period_s = 0.003
+    framing: Framing = Unframed(_LONGEST_DATAGRAM)
+    layout: Layout = Layout(
+        [
+            Frame(
+                "sample",
+                [Byte(at, value) for at, value in enumerate((0x56, 0x35, 0x42, 0x32, 1, 2))],
+                [180],
+                Values(84, "<u2", N_PADS),
+                sequence=SequenceNumber(16, "<u4"),
+            )
+        ]
+    )
+    patches: Sequence[Patch] = (Patch("hand", [Module(taxels(N_PADS), kind="pads")]),)
+
+    def __init__(self, options: AllegroV5Options) -> None:
+        super().__init__(options)
+        self.geometry: Geometry | None = _places_of_pads(options.side)
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Nothing is asked."""
+        return False
+
+
+class AllegroV5Driver(CanAdapter[AllegroV5Options]):
+    """One hand on CAN, or a V5 Sense over UDP."""
+
+    elsewhere: ClassVar[Sequence[type[AnyAdapter]]] = (AllegroV5UdpDriver,)
+    payload_size = 8
+    period_s = 0.01
+    types: Sequence[SensorType]
+    dtype: npt.DTypeLike
+    layout: Layout = Layout([*_TIP_FRAMES, *_PAD_FRAMES])
+    patches: Sequence[Patch]
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """The hand of the option ``model``, or as its frames tell.
+
+        Raises:
+            BusError: none is heard.
+        """
+        model = self.options.model
+        if model == "sense":
+            self._take_pads()
+            return self.patches
+        of_tips = [Match(one) for ids in TIPS.values() for one in ids]
+        with link.follow(*of_tips) as frames:
+            heard = {one.identifier for one in await link.listen(self.options.learn_s)}
+        if model == "tips" or not heard.isdisjoint(match.value for match in of_tips):
+            self._take_tips()
+            self._judge_zero([frames.get_nowait() for _ in range(frames.qsize())])
+        elif not heard.isdisjoint(PADS.values()):
+            self._take_pads()
+        else:
+            raise HandshakeTimeout(
+                f"{link.bus_name}: nothing is heard of the hand's skin; its own program has to set a period and to"
+                " switch the servos on"
+            )
+        return self.patches
+
+    async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:  # noqa: ARG002
+        """There is one hand on a bus, and it is known."""
+        return known
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Nothing is asked."""
+        return False
+
+    def _take_tips(self) -> None:
+        self.types = (PRESSURE.measured(offset=-float(self.options.zero_pa)),)
+        self.dtype, self.layout = np.int32, Layout(_TIP_FRAMES)
+        modules = [
+            Module(taxels(2, first_uid=2 * at), ids[0], "tips", name) for at, (name, ids) in enumerate(TIPS.items())
+        ]
+        self.patches = [Patch("hand", modules)]
+        self.geometry = _places_of_tips(self.options.side)
+
+    def _take_pads(self) -> None:
+        self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=254 * _PA_IN_A_BYTE),)
+        self.dtype, self.layout = np.uint8, Layout(_PAD_FRAMES)
+        modules = [
+            Module(taxels(8, first_uid=8 * at), one, "pads", name) for at, (name, one) in enumerate(PADS.items())
+        ]
+        self.patches = [Patch("hand", modules)]
+        self.geometry = _places_of_pads(self.options.side)
+
+    def _judge_zero(self, frames: Sequence[Reply]) -> None:
+        """Tell if most fingertips seem to send the pressure of the air, and nobody said so."""
+        payloads = b"".join(frame.payload for frame in frames if len(frame.payload) == 8)
+        told = np.frombuffer(payloads, "<i4")
+        if len(told) and int(np.median(told)) - self.options.zero_pa in _AIR_PA:
+            log.warning(
+                "the fingertips send about %.0f Pa, as if it were the pressure of the air: give zero_pa=%d, if nothing"
+                " touches them",
+                *(2 * [float(np.median(told))]),
+            )
+
+
+def _places_of_tips(side: Literal["right", "left"]) -> Geometry:
+    """Nominal; one tip on each finger."""
+    tip = Grid(1, 1)
+    parts = ("index", "middle", "ring", "thumb")
+    return Geometry.joined(
+        [tip.at(Hand(side).down(part, [tip])[0], ["pressure"], [uid]) for uid, part in enumerate(parts)]
+    )
+
+
+def _places_of_pads(side: Literal["right", "left"]) -> Geometry:
+    """Nominal; the number of a pad grows from the palm to the tip [INF]."""
+    pad, uids = Grid(1, 1, _FROM_PAD_TO_PAD_M), iter(range(N_PADS))
+    counts = {"palm": 1, "thumb": 3, "index": 4, "middle": 4, "ring": 4}
+    return Geometry.joined(
+        [
+            pad.at(centre, ["pressure"], [next(uids)])
+            for part, count in counts.items()
+            for centre in reversed(Hand(side).down(part, [pad] * count))
+        ]
+    )
+
+
+__all__ = ["AllegroV5Driver", "AllegroV5Options", "AllegroV5UdpDriver"]

@@ -1,0 +1,275 @@
+"""LinkerHand L6, L7, L10, L20, L21, L25 and O6 on CAN: matrices or values of touch at each finger.
+
+Wire format: the maker's linkerhand-python-sdk, and linkerhand-ros2-sdk with its table of commands. Classic CAN, 1
+Mbit/s. A hand has one identifier, a right one 0x27 and a left one 0x28, for all that is said to it and by it. Byte 0 is
+a command; alone it is a question, which the hand answers with the same byte and data within a millisecond. What it does
+not know it ignores.
+
+* ``B0``: kind of touch (0 none, 1 values of each finger, 2 to 4 matrices, 5 and 7 the whole hand, 6 not over CAN).
+* ``C0``: serial number, in frames ``C0 k`` with six characters each.
+* ``B1 C6`` to ``B5 C6``, thumb to little finger, ``B6 C6`` the palm: twelve rows of six, a frame each: ``B1 r0`` with r
+  the row, and its values. ``A4`` instead of ``C6``: ten rows of four. A hand knows one of the two.
+* ``20`` to ``23`` (L21, L25: ``90`` to ``93``): normal force, tangential force, its direction (255: none), proximity,
+  of the five fingers.
+
+Nothing numbers the frames. A matrix is shown if all its rows came, in order and soon after each other, whoever asked
+for them. Usually the hand's own program does, and this driver sends nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
+from skinware.geometry import Geometry
+from skinware.sensor_types import SensorType
+from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
+from skinware_drivers.can.adapter import CanAdapter
+from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, parts_heard
+from skinware_drivers.conditions import Identifier
+from skinware_drivers.description import Patch
+from skinware_drivers.hand import FINGERS, Hand
+from skinware_drivers.layout import Layout
+from skinware_drivers.link import Heard, Link, Match
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.polling import Poll
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+RIGHT, LEFT = 0x27, 0x28
+_KIND_OF_TOUCH, _SERIAL_NUMBER = 0xB0, 0xC0
+_CANDIDATES = {1: ("fingers", "fingers_90"), **dict.fromkeys((2, 3, 4), ("12x6", "10x4"))}
+_UNREADABLE = {
+    0: "it has none",
+    5: "the whole hand in one matrix",
+    6: "not over CAN",
+    7: "the whole hand in one matrix",
+}
+_ANSWER_S, _REPLY_S, _SERIAL_S = 0.03, 0.02, 0.05
+_TRIES = 2
+
+
+class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    hands: Annotated[
+        tuple[int, ...], msgspec.Meta(description="identifiers of the hands; default: 0x27 and 0x28, as far as there")
+    ] = ()
+    touch: Annotated[
+        Literal["auto", "12x6", "10x4", "fingers", "fingers_90"],
+        msgspec.Meta(description="matrices of this size, or values of each finger (commands 20 or 90); auto: find out"),
+    ] = "auto"
+    ask: Annotated[
+        bool, msgspec.Meta(description="ask the hands for their touch; only where no other program does")
+    ] = False
+    period_ms: Annotated[int, msgspec.Meta(description="time between two updates, ms", ge=20, le=2000)] = 50
+    learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns who is there, s", gt=0)] = 1.0
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if len(set(self.hands)) < len(self.hands) or not all(0 < hand <= LARGEST_STANDARD for hand in self.hands):
+            raise ConfigurationError(f"hands {self.hands}: give different identifiers of 1 to 0x7FF")
+
+
+class _Found(NamedTuple):
+    """A hand.
+
+    Attributes:
+        touch: how it tells of touch.
+        parts: what of it does.
+    """
+
+    touch: str
+    parts: Sequence[str]
+
+
+class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
+    """Hands on one bus, a patch each. Sensor uid = identifier << 16 | part << 12 | taxel, parts in the order of PARTS.
+
+    Values are raw, larger for more force.
+    """
+
+    payload_size = 8
+    dtype: npt.DTypeLike = np.uint8
+    types: Sequence[SensorType]
+    layout: Layout
+    patches: Sequence[Patch]
+
+    def __init__(self, options: LinkerHandOptions) -> None:
+        super().__init__(options)
+        usual = "12x6" if options.touch == "auto" else options.touch
+        self._take({hand: _Found(usual, FINGERS) for hand in self._wanted})
+
+    @property
+    def _wanted(self) -> Sequence[int]:
+        return self.options.hands or (RIGHT, LEFT)
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """All parts of all hands, each when the reply before has ended; nothing, if another program asks."""
+        if not self.options.ask:
+            return ()
+        timeout_s = min(_REPLY_S, self.period_s)
+        return [
+            Poll(hand, payload, self.period_s, Match(hand, prefix=last, shortest=shortest), timeout_s)
+            for hand, questions in self._questions.items()
+            for payload, last, shortest in questions
+        ]
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """The hands that answer, or those that are heard to tell of touch.
+
+        Raises:
+            BusError: there is none, none has touch that can be read, or the hands differ.
+        """
+        found = await self._find(link, self._wanted)
+        if not found:
+            names = ", ".join(map(identifier_text, self._wanted))
+            raise HandshakeTimeout(
+                f"{link.bus_name}: no hand with touch answers at {names}"
+                if self._asks(link)
+                else f"{link.bus_name}: no hand tells of touch at {names}, as if no program asked for it; if this"
+                " driver is to ask, give it ask=yes"
+            )
+        self._take(found)
+        return self.patches
+
+    async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:
+        """Those that are known, and others that are there now."""
+        found = {patch.key: self._found[patch.key] for patch in known}
+        self._take({**found, **await self._find(link, [hand for hand in self._wanted if hand not in found])})
+        return self.patches
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Nothing: a silent hand is asked for its touch all the time, by somebody."""
+        return False
+
+    async def attend(self, link: Link) -> None:
+        """Hear what else is said on the hands' identifiers, and tell if somebody else asks for touch, too."""
+        questions = {question.payload for questions in self._questions.values() for question in questions}
+        told = not self._asks(link)
+        with link.follow(*(Match(patch.key) for patch in self.patches)) as others:
+            while True:
+                frame = await others.get()
+                if not told and frame.payload in questions:
+                    told = True
+                    log.warning(
+                        "%s: another program asks %s for its touch, too: answers to both get mixed up, and questions"
+                        " collide with answers; leave out ask=yes, and this driver shows what the other one asks for",
+                        link.bus_name,
+                        _name(frame.identifier),
+                    )
+
+    @operation(looks=True)
+    async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:
+        """Serial numbers of the hands."""
+        return {patch.name: await self._serial_number(link, patch.key) for patch in patches}
+
+    def _asks(self, link: Link) -> bool:
+        return self.options.ask and not link.listen_only
+
+    def _take(self, found: Mapping[int, _Found]) -> None:
+        """These are the hands.
+
+        Raises:
+            BusError: they tell of touch in different ways.
+        """
+        if len({of.touch for of in found.values()}) > 1:
+            told = ", ".join(f"{identifier_text(hand)}: {of.touch}" for hand, of in found.items())
+            raise BusError(
+                f"hands of different touch on one bus ({told}): run a driver for each, with its option hands"
+            )
+        touch = TOUCH[next(iter(found.values())).touch]
+        self._found = dict(found)
+        self._questions = {hand: touch.questions(of.parts) for hand, of in found.items()}
+        self.types = touch.types
+        self.layout = touch.layout(Identifier.covering(list(found)))
+        self.patches = [Patch(_name(hand), touch.modules(hand, of.parts), hand) for hand, of in found.items()]
+        self.geometry = Geometry.joined([touch.geometry(hand, of.parts, _side(hand)) for hand, of in found.items()])
+
+    async def _find(self, link: Link, wanted: Sequence[int]) -> dict[int, _Found]:
+        """Of these hands, those that are there; a listener believes what it was told of them."""
+        if self._asks(link):
+            return {hand: of for hand in wanted if (of := await self._ask_hand(link, hand)) is not None}
+        if self.options.hands and self.options.touch != "auto":
+            return {hand: _Found(self.options.touch, FINGERS) for hand in wanted}
+        return self._heard(await link.listen(self.options.learn_s), wanted)
+
+    def _heard(self, heard: Counter[Heard], wanted: Sequence[int]) -> dict[int, _Found]:
+        """The hands that told of touch; of one that told of it in several ways, what was told most."""
+        found = {}
+        for hand in wanted:
+            frames = [(one.first_byte, one.length, n) for one, n in heard.items() if one.identifier == hand]
+            told = {
+                name: sum(n for first, length, n in frames if touch.knows(first, length))
+                for name, touch in TOUCH.items()
+            }
+            name = max(told, key=lambda name: told[name]) if self.options.touch == "auto" else self.options.touch
+            if told[name]:
+                found[hand] = _Found(
+                    name, parts_heard(TOUCH[name], {first for first, length, _ in frames if length > 2})
+                )
+        return found
+
+    async def _ask_hand(self, link: Link, hand: int) -> _Found | None:
+        """What this hand has, as far as it answers.
+
+        Raises:
+            BusError: it has no touch that can be read.
+        """
+        names: Sequence[str] = (self.options.touch,)
+        if self.options.touch == "auto":
+            names = await self._likely(link, hand)
+        for name in names:
+            questions = TOUCH[name].questions(PARTS)
+            if await _answers(link, hand, questions[0]):
+                has_palm = len(questions) == len(PARTS) and await _answers(link, hand, questions[-1])
+                return _Found(name, PARTS if has_palm else FINGERS)
+        return None
+
+    async def _likely(self, link: Link, hand: int) -> Sequence[str]:
+        """In which ways it may tell of touch, by what it says of itself."""
+        reply = Match(hand, prefix=bytes([_KIND_OF_TOUCH]), shortest=2)
+        try:
+            frame = await link.request(hand, bytes([_KIND_OF_TOUCH]), reply, timeout_s=_ANSWER_S, tries=_TRIES)
+        except HandshakeTimeout:  # hands ignore questions that they do not know
+            return tuple(TOUCH)
+        kind = frame.payload[1]
+        if kind in _UNREADABLE:
+            raise BusError(
+                f"{link.bus_name}: the touch of {_name(hand)} cannot be read: {_UNREADABLE[kind]} (kind {kind})"
+            )
+        return _CANDIDATES.get(kind, tuple(TOUCH))
+
+    @staticmethod
+    async def _serial_number(link: Link, hand: int) -> str:
+        reply = Match(hand, prefix=bytes([_SERIAL_NUMBER]), shortest=3)
+        frames = await link.collect(hand, bytes([_SERIAL_NUMBER]), reply, duration_s=_SERIAL_S)
+        pieces = {frame.payload[1]: frame.payload[2:] for frame in frames}
+        return b"".join(pieces[number] for number in sorted(pieces)).decode("ascii", "replace").strip("\0 ")
+
+
+async def _answers(link: Link, hand: int, question: Question) -> bool:
+    """Whether a hand answers a question for touch to the end."""
+    last = Match(hand, prefix=question.last, shortest=question.shortest)
+    try:
+        await link.request(hand, question.payload, last, timeout_s=_ANSWER_S, tries=_TRIES)
+    except HandshakeTimeout:
+        return False
+    return True
+
+
+def _name(hand: int) -> str:
+    return {RIGHT: "right hand", LEFT: "left hand"}.get(hand, f"hand {identifier_text(hand)}")
+
+
+def _side(hand: int) -> Hand:
+    return Hand("left" if hand == LEFT else "right")

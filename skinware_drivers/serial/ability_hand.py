@@ -1,0 +1,153 @@
+"""PSYONIC's Ability Hand: 30 force-sensitive resistors, six on each finger, over its UART. Nothing here moves it.
+
+Wire format: the maker's programs (github.com/psyonicinc/ability-hand-api, MIT), with byte stuffing switched on as they
+need it. A message stands between ``7E``; ``7D`` and the byte with bit 5 inverted replace 7E and 7D in it; its last byte
+makes the sum of all others 0. A question is the hand's address and a command. The commands A0, A1 and A2 are *read
+only* (``read_only.py`` of the maker's): no target follows them, as it does those that move the hand. All answers have a
+header, whose lower four bits say what comes, six positions and six currents (0) or speeds (1), i16, the sensors of
+index, middle, ring, little finger and thumb, of 12 bits, the lower ones first, and a byte of temperatures. Those with 2
+have no touch.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.geometry import Geometry
+from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
+from skinware.status import Status
+from skinware_drivers.conditions import Identifier
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.hand import Grid, Hand
+from skinware_drivers.layout import Expand, Frame, Layout, Packed, Sentinel, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.options import check_options
+from skinware_drivers.polling import Poll
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.delimited import Delimited
+from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.stuffing import HDLC
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
+_FINGERS = ("index", "middle", "ring", "little", "thumb")
+_SITES_M = ((0.0, 0.0), (0.0, 0.006), (-0.004, 0.006), (-0.004, 0.020), (0.004, 0.006), (0.004, 0.020))
+"""Across and down the finger, from its outermost sensor: upper and lower tip, upper and lower left, and right. After
+``fsrlocs_to_xml.py`` of the maker's, of fingers of the large hand; which side is seen as the left one is not told."""
+_N = len(_FINGERS) * len(_SITES_M)
+_TOUCH_AT, _BODY = 24, 70
+_MOST = 4095
+_WITH_TOUCH = (Identifier(0x00, 0x74E), Identifier(0x40, 0x75E))
+"""Headers of answers: 0 or 1 in the lower four bits. None of them is 50, with which questions to a hand begin."""
+_WITHOUT_TOUCH = Match(0x02, 0x0F)
+_IDENTIFY_S = 0.3
+_C1, _C2, _DIVIDER_OHM = 121591.0, 0.878894, 1e4
+"""Placeholders: the maker says that nothing is calibrated."""
+
+_Bytes = npt.NDArray[np.uint8]
+
+
+class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver."""
+
+    address: Annotated[int, Meta(ge=0, le=0xFF, description="of the hand")] = 0x50
+    period_ms: Annotated[int, Meta(ge=2, description="time from question to question, ms")] = 10
+    side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for views")] = "right"
+    zero: Annotated[Literal["suspect", "good"], Meta(description="what a sensor is that reads 0")] = "suspect"
+    force: Annotated[
+        Literal["no", "published", "divider"],
+        Meta(description="newton instead of counts, by the maker's uncalibrated formula; divider: with its other sign"),
+    ] = "no"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
+    """One hand on a serial line; uid = 6 * finger + site, in the order of the wire."""
+
+    framing: Framing = Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0))
+    baudrate = 460_800
+
+    def __init__(self, options: AbilityHandOptions) -> None:
+        super().__init__(options)
+        touch = Values(_TOUCH_AT, Packed(12, order="little"), _N)
+        zero, most = Sentinel(Status.SUSPECT, 0), Sentinel(Status.OUT_OF_RANGE, _MOST)
+        kind: SensorType = PRESSURE.measured(unit="counts", minimum=0, maximum=_MOST)
+        values: Values | Expand = touch
+        self.dtype: npt.DTypeLike = np.uint16
+        if options.force != "no":
+            newton = partial(_newton, sign=1 if options.force == "published" else -1)
+            values, self.dtype = Expand(partial(_expand, newton=newton)), np.float32
+            most = Sentinel(Status.OUT_OF_RANGE, float(newton(np.array([_MOST]))[0]))
+            kind = FORCE_Z.measured(minimum=0)
+        flags = [zero, most] if options.zero == "suspect" else [most]
+        self.types: Sequence[SensorType] = (kind,)
+        self.layout: Layout = Layout(
+            [
+                Frame(name, [header], [_BODY], values, flags=flags)
+                for name, header in zip(("answer", "answer to 4x"), _WITH_TOUCH, strict=True)
+            ]
+        )
+        self.patches: Sequence[Patch] = (
+            Patch(f"{options.side} hand", (Module(taxels(_N, kind.name), kind="5x6", name="fingers"),)),
+        )
+        self.geometry: Geometry | None = _places(Hand(options.side), kind.name)
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """The question that moves nothing."""
+        return (Poll(self.options.address, _READ_TOUCH, self.period_s),)
+
+    async def attend(self, link: Link) -> None:
+        """Say once why there is no touch, if the hand answers another program that asks for none."""
+        with link.follow(_WITHOUT_TOUCH) as heard:
+            await heard.get()
+        log.warning(
+            "%s: the hand sends answers without touch: another program asks for them (its reply mode is 2)",
+            link.bus_name,
+        )
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Ask for positions, as the maker's program does on every port when it looks for a hand."""
+        address = AbilityHandOptions().address
+        await link.request(address, _READ_NO_TOUCH, _WITHOUT_TOUCH, timeout_s=_IDENTIFY_S)
+        return f"Ability Hand at address {address:#x}"
+
+
+def _places(hand: Hand, type_name: str) -> Geometry:
+    """Nominal places of all sensors."""
+    found = []
+    for number, finger in enumerate(_FINGERS):
+        [(x, y, z)] = hand.down(finger, [Grid(1, 1)])
+        for site, (across, down) in enumerate(_SITES_M, len(_SITES_M) * number):
+            found.append(Grid(1, 1).at((x + across, y - down, z), [type_name], [site]))
+    return Geometry.joined(found)
+
+
+def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:
+    """C1 / R + C2, where R = 33000 / V + sign * 10000 and V = 3.3 * counts / 4096; 0 of 0 counts."""
+    over_r = counts / (_DIVIDER_OHM * (_MOST + 1 + sign * counts))
+    return np.where(counts > 0, _C1 * over_r + _C2, 0).astype(np.float32)
+
+
+def _expand(payload: _Bytes, length: _Bytes, newton: Any) -> tuple[Any, Any, npt.NDArray[np.float32]]:
+    """Of each pair of sensors, three bytes."""
+    low, middle, high = np.moveaxis(payload[:, _TOUCH_AT : _BODY - 1].astype(np.int64).reshape(-1, _N // 2, 3), 2, 0)
+    counts = np.stack([low | (middle & 0xF) << 8, middle >> 4 | high << 4], axis=2).ravel()
+    row, channel = np.divmod(np.arange(len(length) * _N), _N)
+    return row, channel, newton(counts)
+
+
+__all__ = ["AbilityHandDriver", "AbilityHandOptions"]

@@ -1,0 +1,90 @@
+"""An emulated Ability Hand: it answers what the maker's programs ask, and would move if it were told to.
+
+Source: github.com/psyonicinc/ability-hand-api (``ah_api.py``, ``ah_parser.py``, ``ppp_stuffing.py``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+
+_ASKED = "asked"  # in the memory of a device: the command that is answered
+_MOVES = "moves"  # how often it was told to move
+_TARGETS = 12
+
+
+def message(content: bytes) -> bytes:
+    """A message as it goes over the line."""
+    stuffed = bytearray()
+    for byte in content + bytes([-sum(content) & 0xFF]):
+        stuffed += bytes([0x7D, byte ^ 0x20]) if byte in (0x7E, 0x7D) else bytes([byte])
+    return b"~" + bytes(stuffed) + b"~"
+
+
+class EmulatedAbilityHandOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the hand is."""
+
+    address: Annotated[int, Meta(ge=0, le=255, description="of the hand")] = 0x50
+
+
+class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
+    """One hand, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+
+    Values: the sensors of index, middle, ring, little finger and thumb, six each.
+    """
+
+    full_scale = 4095
+    rest = 300
+    swing = 3000
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """A row for each finger."""
+        return on_a_grid(30, 6)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """It waits to be asked."""
+
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """What stands between two delimiters."""
+        *parts, rest = heard.split(b"~")
+        return [part for part in parts if part], rest[-64:]
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        """Take a message to its address whose sum is right."""
+        content, escaped = bytearray(), False
+        for byte in command:
+            if byte == 0x7D and not escaped:
+                escaped = True
+                continue
+            content.append(byte ^ 0x20 if escaped else byte)
+            escaped = False
+        if len(content) < 3 or sum(content) & 0xFF or content[0] != self.options.address:
+            return None
+        kind, variant = content[1] & 0xF0, content[1] & 0x0F
+        size = {0xA0: 0, 0x10: _TARGETS, 0x20: _TARGETS, 0x30: _TARGETS, 0x40: _TARGETS}.get(kind)
+        if variant > 2 or len(content) - 3 != size:
+            return None
+        if size:
+            device.memory[_MOVES] = device.memory.get(_MOVES, 0) + 1
+        if variant == 2:
+            return message(bytes([content[1]]) + bytes(24) + bytes(12) + b"\0")
+        device.memory[_ASKED] = content[1]
+        self.burst(device, now_ns)
+        return b""
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        """The answer: 12 bits of each sensor, the lowest first."""
+        bits = sum(value << 12 * number for number, value in enumerate(values))
+        positions = bytes(range(24))
+        return [message(bytes([device.memory[_ASKED]]) + positions + bits.to_bytes(45, "little") + b"\0")]
+
+    def moves(self) -> int:
+        """How often it was told to move, since it has power."""
+        return sum(device.memory.get(_MOVES, 0) for device in self.devices.values())

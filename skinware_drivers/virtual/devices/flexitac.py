@@ -1,0 +1,62 @@
+"""An emulated FlexiTac or 3D-ViTac pad: sends from power-up to the end, and hears nothing.
+
+Source: ``32_16_fast.ino`` of FlexiTac/FlexiTac_Hardware_Repo; for the text, ``MatrixArray.ino`` of
+binghao-huang/3D-ViTac_Tactile_Hardware. A board sends the next marker at once behind a frame; this one sends it a
+period later, so that its frames are known to be whole a period later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+
+
+class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the pad is, and which of its lines are broken."""
+
+    rows: Annotated[int, Meta(ge=1, le=64, description="rows of the pad")] = 12
+    columns: Annotated[int, Meta(ge=1, le=64, description="columns of the pad")] = 32
+    firmware: Annotated[Literal["binary", "text"], Meta(description="which one it has")] = "binary"
+    broken_rows: Annotated[tuple[int, ...], Meta(description="rows whose cells all read 0")] = ()
+    broken_columns: Annotated[tuple[int, ...], Meta(description="columns whose cells all read 0")] = ()
+
+
+class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
+    """One pad, device 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`.
+
+    Values: one for each cell, row by row.
+    """
+
+    full_scale = 255
+    rest = 20
+    swing = 220
+    speed_mbit_s: ClassVar[int] = 2
+
+    def __init__(self, options: EmulatedFlexiTacOptions, **more: Any) -> None:
+        super().__init__(options, **more)
+        self._sound = np.ones((options.rows, options.columns), np.int64)
+        self._sound[list(options.broken_rows)] = 0
+        self._sound[:, list(options.broken_columns)] = 0
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All cells on one square."""
+        return on_a_grid(self.options.rows * self.options.columns, self.options.columns)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """It sends by itself."""
+        self.start(device, now_ns)
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
+        """One frame, or the lines of one."""
+        cells = np.reshape(values, self._sound.shape) * self._sound
+        if self.options.firmware == "binary":
+            return [b"\xaa\x55" + cells.astype(np.uint8).tobytes()]
+        lines = ["".join(f"{cell} " for cell in row) for row in cells.tolist()]
+        return ["\r\n".join([*lines, "", ""]).encode()]

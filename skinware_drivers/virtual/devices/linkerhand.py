@@ -1,0 +1,129 @@
+"""Emulated LinkerHands, as far as their touch: questions and answers have one identifier.
+
+Sources: linkerhand-python-sdk, linkerhand-ros2-sdk. Assumed: all parts of a hand are felt when its first one is asked
+for; with ``program_ms`` a program on the same bus asks for all of them in turn, and moves the fingers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+
+_SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
+_FIRST = {"fingers": 0x20, "fingers_90": 0x90}
+_KINDS = {"12x6": 2, "10x4": 3, "fingers": 1, "fingers_90": 1}
+_SERIAL = "LHL10-010-014-{}-B-1-A"
+_FELT, _WANTED = "felt", "wanted"  # in the memory of a device
+
+
+class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which hands there are, and who asks them."""
+
+    hands: Annotated[tuple[int, ...], Meta(description="identifiers of the hands")] = (0x27,)
+    touch: Annotated[
+        Literal["12x6", "10x4", "fingers", "fingers_90"], Meta(description="matrices, or values of each finger")
+    ] = "12x6"
+    palm: Annotated[bool, Meta(description="whether the palm has a matrix, too")] = False
+    program_ms: Annotated[
+        int, Meta(ge=0, description="time between two rounds of questions of the hands' own program, ms; 0: it is off")
+    ] = 50
+    mute: Annotated[tuple[int, ...], Meta(description="commands that are ignored, as by hands without them")] = ()
+
+
+class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
+    """Hands on one bus; see :class:`skinware_drivers.virtual.emulator.Emulator`.
+
+    Values: row by row, from the thumb to the little finger and the palm; or normal force of all fingers, tangential
+    force of all, direction, proximity.
+    """
+
+    full_scale = 255
+    swing = 200
+    period_s = 0.05
+
+    def __init__(self, options: EmulatedLinkerHandOptions, **more: Any) -> None:
+        self.numbers: Sequence[int] = options.hands
+        self.identifiers: Collection[int] = frozenset(options.hands)
+        super().__init__(options, **more)
+        if options.program_ms:
+            self.period_s = options.program_ms / 1e3
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All matrices beside each other."""
+        if self.options.touch in _FIRST:
+            return on_a_grid(20, 5)
+        rows, columns = _SIZES[self.options.touch]
+        return on_a_grid(rows * columns * len(self._commands), len(self._commands) * columns)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """Be asked, if there is a program."""
+        if self.options.program_ms or self.options.streaming:
+            self.start(device, now_ns)
+
+    def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
+        """Answer a question; ignore what it does not know."""
+        if identifier != device.number or not payload or payload[0] in self.options.mute:
+            return False
+        if payload == b"\xb0":
+            self.reply(device, (identifier, bytes([0xB0, _KINDS[self.options.touch]])), now_ns)
+        elif payload == b"\xc0":
+            serial = _SERIAL.format("R" if identifier == 0x27 else "L").encode()
+            for at in range(0, len(serial), 6):
+                self.reply(device, (identifier, bytes([0xC0, at // 6]) + serial[at : at + 6]), now_ns)
+        elif payload == self._question(payload[0]):
+            if payload[0] == self._commands[0] or _FELT not in device.memory:
+                device.memory[_WANTED] = payload[0]
+                self.burst(device, now_ns)
+            else:
+                for frame in self._told(device, payload[0]):
+                    self.reply(device, frame, now_ns)
+        else:
+            return False
+        return True
+
+    def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
+        """What was asked for; or a round of the program's questions, with the answers and a movement between them."""
+        device.memory[_FELT] = values
+        if (wanted := device.memory.pop(_WANTED, None)) is not None:
+            return list(self._told(device, wanted))
+        told: list[CanFrame] = []
+        for command in self._commands:
+            told += [(device.number, self._question(command)), *self._told(device, command)]
+        return [
+            *told,
+            (device.number, bytes.fromhex("01FF80FF10FF20")),
+            (device.number, bytes.fromhex("01FE81FE11FE21")),
+        ]
+
+    @property
+    def _commands(self) -> Sequence[int]:
+        if self.options.touch in _FIRST:
+            return range(_FIRST[self.options.touch], _FIRST[self.options.touch] + 4)
+        return range(0xB1, 0xB7 if self.options.palm else 0xB6)
+
+    def _question(self, command: int) -> bytes:
+        """What makes a hand tell what this command is about; nothing does if it has no such command."""
+        if command not in self._commands:
+            return b""
+        sizes = {"12x6": "C6", "10x4": "A4"}
+        return bytes([command]) + bytes.fromhex(sizes.get(self.options.touch, ""))
+
+    def _told(self, device: Device, command: int) -> Iterator[CanFrame]:
+        """The frames of an answer."""
+        nth, values = command - self._commands[0], device.memory[_FELT]
+        if self.options.touch in _FIRST:
+            yield device.number, bytes([command, *values[5 * nth : 5 * nth + 5]])
+            return
+        rows, columns = _SIZES[self.options.touch]
+        matrix = values[rows * columns * nth :]
+        for row in range(rows):
+            yield device.number, bytes([command, 16 * row, *matrix[row * columns : row * columns + columns]])
+
+
+__all__ = ["EmulatedLinkerHand", "EmulatedLinkerHandOptions"]

@@ -107,8 +107,13 @@ def _is_of_this_machine(endpoint: str) -> bool:
         return False
 
 
+def tls_files(folder: Path) -> dict[str, Path]:
+    """The files of a folder with certificates: of the authority, the own one, and its key."""
+    return {name: folder / f"{name}.pem" for name in ("ca", "cert", "key")}
+
+
 def _tls(folder: Path) -> dict[str, str]:
-    files = {name: folder / f"{name}.pem" for name in ("ca", "cert", "key")}
+    files = tls_files(folder)
     for path in files.values():
         try:
             with path.open("rb"):
@@ -155,4 +160,4 @@ def _rules(callers: Sequence[str]) -> str:
     )
 
 
-__all__ = ["DEFAULT_LISTEN", "Endpoints", "endpoints"]
+__all__ = ["DEFAULT_LISTEN", "Endpoints", "endpoints", "tls_files"]

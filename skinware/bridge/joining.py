@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ import numpy.typing as npt
 from skinware.bridge.clock import PeerClock, Sample
 from skinware.bridge.link import Link, Priority, Reply
 from skinware.bridge.messages import (
+    ALL_TOKENS,
     CLOCK,
     RAW,
     VERSION,
@@ -48,6 +50,8 @@ _SERVICES_NS = NS_PER_S
 """Between two questions for all services: what is told unasked may not arrive."""
 _ANSWER_S = 1.0
 _CALL_S = 30.0
+_PATIENCE_NS = 3 * NS_PER_S
+"""With nobody there, until it is looked at why, and until it is looked at again."""
 _PING_NS = 150_000_000
 _SILENCE_NS = 400_000_000
 
@@ -110,6 +114,7 @@ class Joiner:
         link: to it.
         namespace: where its services appear.
         mode: ``push`` or ``pull``; None: it finds out for each service.
+        why_not: why nobody is reached, a line for people, empty if somebody is; called in a thread, may wait.
         tell: is told what happens, as JSON has it.
 
     Attributes:
@@ -123,6 +128,7 @@ class Joiner:
         namespace: Namespace,
         *,
         mode: str | None = None,
+        why_not: Callable[[], str] = str,
         tell: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> None:
         self._keys, self._link, self._mode, self._tell = Keys(robot), link, mode, tell
@@ -133,7 +139,9 @@ class Joiner:
         self._jobs: deque[Callable[[], None]] = deque()
         self._who = os.urandom(8).hex()
         self._instance = self._start = ""
-        self._there: set[str] = set()
+        self._there: set[str] = set()  # bridges that serve the robot
+        self._others: set[str] = set()  # other robots
+        self._why_not, self._next_why_ns, self._asking_why = why_not, now_ns() + _PATIENCE_NS, False
         self._callers: tuple[str, ...] = ()
         self._stopping = False
         self._connected = False
@@ -142,7 +150,7 @@ class Joiner:
         self.clock = PeerClock()
         self._wake = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._mirror.watch(self._wake, self._work)
-        link.watch(self._keys.tokens, lambda key, there: self._soon(lambda: self._token(key, there)))
+        link.watch(ALL_TOKENS, lambda key, there: self._soon(lambda: self._token(key, there)))
         link.listen(self._keys.services, lambda _key, payload: self._soon(lambda: self._take_services(payload)))
 
     @property
@@ -205,7 +213,10 @@ class Joiner:
     # -- who is there ---------------------------------------------------------------------------------------------
 
     def _token(self, key: str, there: bool) -> None:
-        version, instance = token_parts(key)
+        robot, version, instance = token_parts(key)
+        if robot != self._keys.robot:
+            (self._others.add if there else self._others.discard)(robot)
+            return
         (self._there.add if there else self._there.discard)(instance)
         if there and version != VERSION:
             self._say_once(
@@ -303,9 +314,25 @@ class Joiner:
                 self._lose("nothing comes over the link")
             elif time_ns - self._pinged_ns > _PING_NS:
                 self._ask_clock()
+        if not self._connected and time_ns >= self._next_why_ns and not self._asking_why:
+            self._asking_why, self._next_why_ns = True, time_ns + _PATIENCE_NS
+            threading.Thread(target=self._ask_why, name="skinware bridge diagnosis", daemon=True).start()
         for name, mirrored in self._services.items():
             if mirrored.pacing.pulls and self._connected and time_ns > mirrored.pull_until_ns:
                 self._pull(name, mirrored)
+
+    def _ask_why(self) -> None:
+        why = self._why_not()
+
+        def tell() -> None:
+            self._asking_why = False
+            if self._connected:
+                return
+            others = f"; there are: {', '.join(sorted(self._others))}" if self._others else ""
+            silent = f"something listens there, but no robot {self._keys.robot!r} answers; does it want --tls?{others}"
+            self._say_once("link", why or silent)
+
+        self._soon(tell)
 
     # -- clock ----------------------------------------------------------------------------------------------------
 

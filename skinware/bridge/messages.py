@@ -98,6 +98,9 @@ class Answered(msgspec.Struct, frozen=True):
     why: str = ""
 
 
+ALL_TOKENS = "skinware/live/*/*/*"
+
+
 class Keys:
     """The keys of a robot.
 
@@ -116,7 +119,6 @@ class Keys:
         self.robot = robot
         self._root = f"skinware/{VERSION}/{robot}"
         self.clock, self.services = f"{self._root}/clock", f"{self._root}/services"
-        self.tokens = f"skinware/live/{robot}/*/*"
 
     def token(self, instance: str) -> str:
         """Of a bridge that serves it."""
@@ -137,10 +139,10 @@ def parts_of(key: str) -> tuple[str, str]:
     return parts[3], parts[-1]
 
 
-def token_parts(key: str) -> tuple[int, str]:
-    """(version, instance) of a token; version 0: not to be understood."""
-    version, instance = key.split("/")[3:5]
-    return (int(version) if version.isdigit() else 0), instance
+def token_parts(key: str) -> tuple[str, int, str]:
+    """(robot, version, instance) of a token; version 0: not to be understood."""
+    robot, version, instance = key.split("/")[2:5]
+    return robot, (int(version) if version.isdigit() else 0), instance
 
 
 def raw_message(frame: Frame) -> bytes:

@@ -163,13 +163,21 @@ def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | Non
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.bridge import Joiner, Link, endpoints
+    from skinware.bridge.diagnosis import why_unreachable
     from skinware.memory.namespace import Namespace
 
     place = Namespace(into or robot)
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:
         status = _Joined(as_json)
-        joiner = Joiner(robot, link, place, mode=None if mode == "auto" else mode, tell=status.happened)
+        joiner = Joiner(
+            robot,
+            link,
+            place,
+            mode=None if mode == "auto" else mode,
+            why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
+            tell=status.happened,
+        )
         with contextlib.closing(joiner), signals_end(joiner.stop):
             if as_json:
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})

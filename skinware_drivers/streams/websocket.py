@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from urllib.parse import urlsplit
 
 import msgspec
@@ -12,7 +13,7 @@ from msgspec import Meta
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
@@ -39,6 +40,31 @@ class WebSocketOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
+def split_url(channel: str) -> str:
+    """Host and port of a URL.
+
+    Raises:
+        ConfigurationError: it is none of a websocket without encryption.
+    """
+    parts = urlsplit(channel)
+    if parts.scheme != "ws":
+        raise ConfigurationError(f"bus websocket:{channel}: write websocket:ws://HOST:PORT (there is no wss)")
+    return parts.netloc
+
+
+def _need_package(name: str) -> None:
+    if find_spec("websockets") is None:
+        raise ConfigurationError(f"{name}: needs the package websockets: pip install 'skinware[websocket]'")
+
+
+def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
+    """A server; see :class:`skinware_drivers.streams.websocket_serving.WebSocketServerBus`."""
+    _need_package(f"bus websocket:{channel}")
+    from skinware_drivers.streams.websocket_serving import WebSocketServerBus
+
+    return WebSocketServerBus(channel, options, **more)
+
+
 class WebSocketBus(SerialBus):
     """A connection to a websocket server. Its name is ``websocket:ws://HOST:PORT/PATH?key=value``.
 
@@ -56,17 +82,15 @@ class WebSocketBus(SerialBus):
         ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.
     """
 
+    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
+
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        if find_spec("websockets") is None:
-            raise ConfigurationError(f"{self.name}: needs the package websockets: pip install 'skinware[websocket]'")
+        _need_package(self.name)
         self._options = options_from_strings(WebSocketOptions, options or {})
-        parts = urlsplit(channel)
-        if parts.scheme != "ws":
-            raise ConfigurationError(f"{self.name}: write websocket:ws://HOST:PORT (there is no wss)")
-        self._address = parse_address("ws", parts.netloc, default_port=_HTTP)
+        self._address = parse_address("ws", split_url(channel), default_port=_HTTP)
         self._web: WebSocketPort | None = None
         self._heard_ns = 0
         self._unusable = 0
@@ -161,4 +185,4 @@ class WebSocketBus(SerialBus):
         self._unusable += 1
 
 
-__all__ = ["WebSocketBus", "WebSocketOptions"]
+__all__ = ["WebSocketBus", "WebSocketOptions", "split_url"]

@@ -26,8 +26,12 @@ from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
+from skinware_drivers.serial.weiss_dsa import WeissDsaDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
+from skinware_drivers.streams.icub_eth import IcubEthDriver
+from skinware_drivers.streams.tesollo import TesolloDriver
+from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
@@ -41,14 +45,18 @@ from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
+from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
+from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela
+from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -216,6 +224,51 @@ class TestSkintalk(DriverConformance):
 class TestWeissWts(DriverConformance):
     driver = WeissWtsDriver
     emulator = EmulatedWeissWts
+
+
+class TestWeissDsa(DriverConformance):
+    driver = WeissDsaDriver
+    emulator = EmulatedWeissDsa
+
+
+class TestTesollo(DriverConformance):
+    driver = TesolloDriver
+    emulator = EmulatedTesollo
+
+
+class TestTesolloShort(DriverConformance):
+    """Three of five fingers have sensors of 16 bits; the fingertips are asked for alone."""
+
+    driver = TesolloDriver
+    emulator = EmulatedTesollo
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": "fingertips"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"tips": "tactile_s", "fitted": 0b01011, "pads": True}
+
+
+class TestXelaServer(DriverConformance):
+    driver = XelaServerDriver
+    emulator = EmulatedXelaServer
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        return [value / 256 for value in felt]
+
+
+class TestXelaServerCounts(DriverConformance):
+    driver = XelaServerDriver
+    emulator = EmulatedXelaServer
+    emulator_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3), "model": "uSCuAH", "calibrated": False}
+
+
+class TestIcubEth(DriverConformance):
+    driver = IcubEthDriver
+    emulator = EmulatedIcubEth
+
+
+class TestIcubEthSecondPort(DriverConformance):
+    driver = IcubEthDriver
+    emulator = EmulatedIcubEth
+    driver_options: ClassVar[Mapping[str, Any]] = {"port": 2}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 9), "triangles": 4, "skin": 1}
 
 
 class TestWujiGlove(DriverConformance):

@@ -15,7 +15,7 @@ _PLACING: dict[str, dict[str, str]] = {
     "socketcand": {"host": "", "port": ""},
 }
 """By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
-NETWORKS = ("tcp", "udp")
+NETWORKS = ("tcp", "udp", "websocket")
 """Interfaces of serial devices that are reached over a network."""
 
 

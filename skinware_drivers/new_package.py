@@ -68,7 +68,7 @@ def make_package(name: str, transport: str, where: Path) -> list[Path]:
 
     Args:
         name: of the driver, the package and the folder.
-        transport: ``can``, ``serial`` or ``virtual``.
+        transport: ``can``, ``serial``, ``modbus``, ``tcp`` or ``virtual``.
         where: folder that gets the new one.
 
     Returns:

@@ -101,7 +101,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         Discovery (identifier 70F) silences an MTB3 that is sending, so it is only used before anything was started.
         """
         if link.listen_only:
-            return self._patches_heard(await link.listen(self.options.learn_s), ())
+            return self.patches_heard(await link.listen(self.options.learn_s), ())
         if self.options.boards:
             await self._name_missing(link)
         else:
@@ -119,7 +119,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         """A listener adds what it hears now; a driver that sends must be started again to find new boards."""
         if not link.listen_only:
             return known
-        return self._patches_heard(await link.listen(self.options.learn_s), known)
+        return self.patches_heard(await link.listen(self.options.learn_s), known)
 
     async def configure(self, link: Link) -> None:
         """Set all boards up, in the order and with the waits of CanBusSkin.cpp."""
@@ -311,7 +311,8 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
                 patches.append(inertial_patch(set_up.board, set_up.inertial))
         return patches
 
-    def _patches_heard(self, heard: Counter[Heard], known: Sequence[Patch]) -> list[Patch]:
+    def patches_heard(self, heard: Counter[Heard], known: Sequence[Patch]) -> list[Patch]:
+        """What a listener knows, and what it heard beside that."""
         skin: dict[tuple[int, int], set[int]] = {
             (board_of(p), p.key >> 4): {m.key for m in p.modules} for p in known if not is_inertial(p)
         }

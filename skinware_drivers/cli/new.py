@@ -14,8 +14,17 @@ _HOW_TO_RUN = {
         "skin-emulate --driver {name} --bus pty:port",
         "skin-driver --driver {name} --bus ./port       # in another terminal",
     ),
+    "modbus": (
+        "skin-emulate --driver {name} --bus modbus:tcp://127.0.0.1:5020",
+        "skin-driver --driver {name} --bus modbus:tcp://127.0.0.1:5020    # in another terminal",
+    ),
+    "tcp": (
+        "skin-emulate --driver {name} --bus tcp://127.0.0.1:5000",
+        "skin-driver --driver {name} --bus tcp://127.0.0.1:5000    # in another terminal",
+    ),
     "virtual": ("skin-driver --driver {name} --bus virtual",),
 }
+"""Of each transport."""
 
 
 @click.command(
@@ -24,15 +33,17 @@ _HOW_TO_RUN = {
     epilog=examples(
         "skin-new fingertip --transport can     a driver for a device on a CAN bus",
         "skin-new forearm --transport serial    for a device on a serial line",
+        "skin-new palm --transport modbus       for registers, behind TCP or on a serial line",
+        "skin-new cuff --transport tcp          for a device behind a network, TCP or UDP",
         "skin-new dummy --transport virtual     for values that a program computes",
     ),
 )
 @click.argument("name")
 @click.option(
     "--transport",
-    type=click.Choice(["can", "serial", "virtual"]),
+    type=click.Choice(list(_HOW_TO_RUN)),
     required=True,
-    help="Where the data comes from: a CAN bus, a serial line, or the program itself.",
+    help="Where the data comes from: a CAN bus, a serial line, Modbus registers, a network, or the program itself.",
 )
 @version_option
 def command(name: str, transport: str) -> None:

@@ -78,6 +78,18 @@ class ModbusAdapter(Adapter[OptionsT]):
         """Longest frame; also answers to questions of its own must fit."""
         return max(self.layout.payload_size if self.registers else 0, 256)
 
+    @property
+    def wanted(self) -> Wanted:
+        """What a bus is to ask for; ``wanted.reads()`` are the questions of a cycle."""
+        return Wanted(
+            self.registers,
+            self.address_step,
+            self.largest_gap,
+            self.most_registers,
+            self.byte_order,
+            self.word_order,
+        )
+
     def check(self) -> None:
         """Also the registers.
 
@@ -108,15 +120,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         if registers:
             self.layout = self._layout()
         if self._line is not None:
-            wanted = Wanted(
-                registers,
-                self.address_step,
-                self.largest_gap,
-                self.most_registers,
-                self.byte_order,
-                self.word_order,
-            )
-            self._line.use(wanted, self.period_s, self.timeout_s, self.turnaround_s, self.baudrate)
+            self._line.use(self.wanted, self.period_s, self.timeout_s, self.turnaround_s, self.baudrate)
 
     async def probe(self, link: Link, patch: object) -> bool:  # noqa: ARG002
         """Nothing: the registers of a silent device are asked for all the time."""

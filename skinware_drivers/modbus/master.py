@@ -304,6 +304,11 @@ class Listener(Talk):
         """Never."""
         return None
 
+    @property
+    def pending(self) -> int:
+        """Bytes that may still become part of a message."""
+        return self._line.pending
+
     def say(self, time_ns: int) -> bytes:  # noqa: ARG002
         """Nothing."""
         return b""

@@ -122,7 +122,7 @@ class SerialBus(KernelBus):
         """Append the frames that have arrived, at most ``batch.free``; the others stay, and the bus stays readable.
 
         Raises:
-            BusNotAvailable: the port went away.
+            BusNotAvailable: the port went away, or nothing on it can be understood any more until it is opened again.
         """
         if self._port is None:
             raise BusNotAvailable(f"{self!r} is not open")
@@ -133,7 +133,9 @@ class SerialBus(KernelBus):
         taken = self._stream.fill(batch, ordinal)
         if damaged := self._stream.take_damaged():
             self.samples.note(Unused.REFUSED, 0, damaged)
-        self._stay_readable(self._stream.is_behind)
+        if self._stream.is_lost and not taken:
+            raise BusNotAvailable(f"{self.name}: out of step: what came is no answer; beginning anew")
+        self._stay_readable(self._stream.is_behind or self._stream.is_lost)
         self._tell_garbled(now_ns())
         return taken
 
@@ -243,6 +245,9 @@ class SerialBus(KernelBus):
             raise BusSendError(f"{self!r}: {error}") from None
         if self._unsent and len(self._unsent) + len(data) > port.longest_wait:
             raise BusSendError(f"{self!r}: the port takes nothing any more ({len(self._unsent)} bytes wait)")
+        self._stream.asked()
+        if self._stream.is_lost:
+            self._stay_readable(True)
         waited = bool(self._unsent)
         self._unsent += data
         if not waited:

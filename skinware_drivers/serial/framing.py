@@ -137,6 +137,14 @@ class Framer(ABC):
         """Bytes that may still become part of a frame."""
         return len(self._rest)
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether nothing more is found, whatever comes, so that the bus must be opened again; most find on."""
+        return False
+
+    def asked(self) -> None:  # noqa: B027  (most frames are found whatever the host has said)
+        """The host is about to ask something: what is held back belongs to no answer to that."""
+
     def feed(self, chunk: bytes) -> list[Framed]:
         """Take the next bytes of the stream; gives the frames that they complete, in the order of the stream."""
         self.counters.bytes_in += len(chunk)

@@ -48,7 +48,7 @@ def can_compile(framing: Framing) -> bool:
     if type(framing) is Delimited:
         can = type(framing.stuffing) in (Lines, Cobs, Escaped) and framing.body_start >= 0
     else:
-        can = type(framing) is Packet and _stays_within(framing)
+        can = type(framing) is Packet and framing.parts is None and _stays_within(framing)
     checksum, identifier = getattr(framing, "checksum", None), getattr(framing, "identifier", None)
     return can and _is_known(checksum) and _is_plain(identifier)
 
@@ -71,6 +71,8 @@ def _stays_within(framing: Packet) -> bool:
         if framing.bare_when_empty:
             least_checked = max(least, 1 + framing.length.more)
     elif isinstance(framing.length, LengthTable):
+        if framing.length.has_fields:
+            return False
         ends.append(framing.length.offset)
     if framing.identifier is not None:
         ends.append(framing.identifier.end)
@@ -116,7 +118,8 @@ def _compile_packet(framing: Packet, compiled: structs.Framing, arrays: structs.
             compiled.bare = framing.checksum.size
     elif isinstance(framing.length, LengthTable):
         compiled.length = _field(Field(framing.length.offset))
-        totals = [framing.length.total.get(value, 0) for value in range(_BYTE_VALUES)]
+        known = {value: total for value, total in framing.length.total.items() if isinstance(total, int)}
+        totals = [known.get(value, 0) for value in range(_BYTE_VALUES)]
         compiled.totals = arrays.of(totals, np.int64)
     compiled.known_from, compiled.look_ahead = framing.known_from, framing.look_ahead
     compiled.confirms_each = framing.confirmed == "each"

@@ -10,6 +10,7 @@ from typing import Literal
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.checksums import Checksum
 from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
+from skinware_drivers.serial.parts import Parts
 
 _GOOD, _REFUSED, _INCOMPLETE = range(3)
 
@@ -32,15 +33,20 @@ class Length:
 
 @dataclass(frozen=True)
 class LengthTable:
-    """A byte of the header determines how long a frame is.
+    """A byte of the header determines how long a frame is, or where the frame says it.
 
     Attributes:
         offset: place of the byte.
-        total: bytes of the whole frame for each value that the byte can have.
+        total: bytes of the whole frame, or a field that says them, for each value that the byte can have.
     """
 
     offset: int
-    total: Mapping[int, int] = field(hash=False)
+    total: Mapping[int, int | Length] = field(hash=False)
+
+    @property
+    def has_fields(self) -> bool:
+        """Whether some frames say how long they are."""
+        return any(isinstance(total, Length) for total in self.total.values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +60,7 @@ class Packet(Framing):
     Attributes:
         sync: first bytes of every frame.
         length: bytes of a whole frame, or where the frame says it.
-        maximum: bytes of the longest whole frame; needed with :class:`Length`.
+        maximum: bytes of the longest whole frame; needed with :class:`Length`, also in a table.
         checksum: of the bytes ``covers``.
         checksum_at: place of the checksum in the header; default: behind the body.
         covers: bytes that the checksum is of: (start, end); end counts from the end of the frame and is at most 0.
@@ -67,6 +73,7 @@ class Packet(Framing):
             it (and, with a trailer, ends as it should). For devices without a checksum; costs one frame of delay
             after every fault. ``"each"``: every frame is confirmed so, always; for devices whose frames have so little
             that can be checked that a shortened one passes together with the beginning of the next.
+        parts: frames that tell of several modules at once are divided into a frame for each.
 
     Raises:
         ConfigurationError: the declaration contradicts itself.
@@ -83,13 +90,14 @@ class Packet(Framing):
     identifier: Field | None = None
     header: int | None = None
     confirmed: bool | Literal["each"] = False
+    parts: Parts | None = None
     maximum_body: int = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "maximum_body", self.longest - self.body_start - self.behind)
         if not self.sync and not self.trailer and self.checksum is None:
             raise ConfigurationError("frames without sync, trailer and checksum cannot be told from anything else")
-        if isinstance(self.length, Length) and not self.maximum:
+        if self._has_length_field and not self.maximum:
             raise ConfigurationError("frames say how long they are: say how long they can be (maximum)")
         if self.confirmed and not isinstance(self.length, int):
             raise ConfigurationError("only frames of one length can be confirmed by the next")
@@ -100,6 +108,10 @@ class Packet(Framing):
             raise ConfigurationError(f"the checksum covers bytes {self.covered(most)} of a frame of {most}")
         if self.bare_when_empty and (not isinstance(self.length, Length) or self.checksum_at is not None):
             raise ConfigurationError("bare_when_empty needs a length field, and a checksum at the end")
+
+    @property
+    def _has_length_field(self) -> bool:
+        return isinstance(self.length, Length) or (isinstance(self.length, LengthTable) and self.length.has_fields)
 
     @property
     def body_start(self) -> int:
@@ -127,9 +139,10 @@ class Packet(Framing):
         """Bytes of the shortest frame."""
         if isinstance(self.length, int):
             return self.length
-        least = self.body_start + self.behind
+        least = max(self.body_start, 0 if self.identifier is None else self.identifier.end) + self.behind
         if isinstance(self.length, LengthTable):
-            return min((total for total in self.length.total.values() if total >= least), default=least)
+            totals = [max(least, t.more) if isinstance(t, Length) else t for t in self.length.total.values()]
+            return min((total for total in totals if total >= least), default=least)
         return least - (self.checksum.size if self.bare_when_empty and self.checksum else 0)
 
     @property
@@ -137,8 +150,8 @@ class Packet(Framing):
         """Bytes of the longest frame."""
         if isinstance(self.length, int):
             return self.length
-        if isinstance(self.length, LengthTable):
-            return max(self.length.total.values(), default=0)
+        if isinstance(self.length, LengthTable) and not self.length.has_fields:
+            return max((total for total in self.length.total.values() if isinstance(total, int)), default=0)
         return self.maximum
 
     @property
@@ -162,7 +175,7 @@ class Packet(Framing):
         return PacketFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent; what the declaration leaves open in the header is zero.
+        """A frame as it is sent; what the declaration leaves open in the header is zero. Frames are not divided.
 
         Raises:
             ValueError: there is no such frame.
@@ -172,13 +185,16 @@ class Packet(Framing):
         frame = bytearray(_first(self.sync)).ljust(self.body_start, b"\0")
         total = self.body_start + len(payload) + self.behind
         has_checksum = self.checksum is not None
-        if isinstance(self.length, Length):
-            says = total - self.length.more
-            has_checksum = has_checksum and not (self.bare_when_empty and says == 0)
-            self.length.field.put(frame, says)
         if self.identifier is not None:
             self.identifier.put(frame, identifier)
+        length = self._length_field(frame)
         frame += payload
+        if length is not None:
+            if length.field.end > len(frame):
+                raise ValueError(f"{len(payload)} bytes of payload have no room for the length of the frame")
+            says = total - length.more
+            has_checksum = has_checksum and not (self.bare_when_empty and says == 0)
+            length.field.put(frame, says)
         if self.checksum is not None and has_checksum:
             if self.checksum_at is None:
                 frame += bytes(self.checksum.size)
@@ -191,9 +207,17 @@ class Packet(Framing):
         made = bytes(frame)
         if not all(byte in values_of(what) for byte, what in zip(made, self.sync, strict=False)):
             raise ValueError(f"frames of this device cannot carry the identifier {identifier:#x}")
-        if isinstance(self.length, LengthTable) and self.length.total.get(made[self.length.offset]) != len(made):
+        table = self.length if isinstance(self.length, LengthTable) and length is None else None
+        if table is not None and table.total.get(made[table.offset]) != len(made):
             raise ValueError(f"no frame of this device has {len(payload)} bytes of payload and begins {made[:8].hex()}")
         return made
+
+    def _length_field(self, header: bytes | bytearray) -> Length | None:
+        """Where frames that begin so say how long they are; None if they do not."""
+        length: int | Length | LengthTable = self.length
+        if isinstance(length, LengthTable):
+            length = length.total.get(header[length.offset], 0) if length.has_fields else 0
+        return length if isinstance(length, Length) else None
 
     def checksum_place(self, total: int) -> int:
         """Where the checksum begins in a frame of so many bytes."""
@@ -238,14 +262,15 @@ class PacketFramer(Framer):
         done = self._search(stream, 0, found)
         framing, field = self._framing, self._framing.identifier
         first, behind, bare = framing.body_start, framing.behind, self._bare
-        return [
+        frames = [
             Framed(
                 0 if field is None else field.of(stream, place),
                 stream[place + first : place + total - behind + (bare if is_bare else 0)],
                 self._before + place + total,
             )
             for place, total, is_bare in found
-        ], done
+        ]
+        return (frames if framing.parts is None else framing.parts.of(frames)), done
 
     def _search(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
         """Judge what may be a beginning, from ``place`` on, until one cannot be judged yet; gives its place."""
@@ -285,14 +310,17 @@ class PacketFramer(Framer):
     def _total(self, stream: bytes, place: int) -> tuple[int, bool]:
         """Bytes of the frame that begins here, 0 if it cannot be; and whether it has no checksum."""
         framing = self._framing
-        if isinstance(framing.length, int):
-            return framing.length, False
-        if isinstance(framing.length, LengthTable):
-            total, is_bare = framing.length.total.get(stream[place + framing.length.offset], 0), False
+        length: int | Length | LengthTable = framing.length
+        if isinstance(length, LengthTable):
+            length = length.total.get(stream[place + length.offset], 0)
+        if isinstance(length, int):
+            total, is_bare = length, False
+        elif len(stream) - place < length.field.end:  # so much at least
+            return max(length.field.end, framing.shortest), False
         else:
-            says = framing.length.field.of(stream, place)
+            says = length.field.of(stream, place)
             is_bare = says == 0 and self._bare > 0
-            total = says + framing.length.more - (self._bare if is_bare else 0)
+            total = says + length.more - (self._bare if is_bare else 0)
         return (total if framing.shortest <= total <= framing.longest else 0), is_bare
 
     def _form(self, stream: bytes, place: int, total: int, follows: bool) -> int:

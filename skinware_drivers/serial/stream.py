@@ -35,6 +35,14 @@ class Stream(ABC):
     def pending(self) -> int:
         """Bytes that may still become part of a frame."""
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether nothing more is found in it: only another one helps."""
+        return False
+
+    def asked(self) -> None:  # noqa: B027  (most frames are found whatever the host has said)
+        """The host is about to ask something."""
+
     @abstractmethod
     def add(self, chunk: bytes, time_ns: int) -> None:
         """What was read at this time, CLOCK_MONOTONIC ns: at most ``CHUNK`` bytes."""
@@ -75,6 +83,15 @@ class PythonStream(Stream):
     def pending(self) -> int:
         """As the framer holds back."""
         return self._framer.pending
+
+    @property
+    def is_lost(self) -> bool:
+        """As the framer says."""
+        return self._framer.is_lost
+
+    def asked(self) -> None:
+        """Tell the framer."""
+        self._framer.asked()
 
     def add(self, chunk: bytes, time_ns: int) -> None:
         """Find the frames that it completes."""

@@ -82,6 +82,11 @@ class ListeningPort(Port):
         self.address = Address(*self._listener.getsockname()[:2])
         self.note: str = f"listens on {self.address}"
 
+    @property
+    def caller(self) -> socket.socket | None:
+        """Who is there."""
+        return self._caller
+
     def fileno(self) -> int:
         """An epoll's descriptor."""
         return self._epoll.fileno()

@@ -13,6 +13,7 @@ import msgspec
 from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.serial.bus import PtyBus
+from skinware_drivers.streams.tcp import TcpServerBus
 from skinware_drivers.testing.defect import require
 from skinware_drivers.virtual.hardware import load_emulator
 
@@ -60,6 +61,20 @@ def emulated_on_a_pty(emulator: Any, **options: Any) -> Iterator[str]:
 
 
 @contextmanager
+def emulated_over_tcp(emulator: Any, **options: Any) -> Iterator[str]:
+    """Run emulated devices as long as the ``with`` lasts; yields ``HOST:PORT``, where they can be called.
+
+    Args:
+        emulator: class or registered name of an emulator of serial or Modbus devices.
+        options: of the emulator.
+    """
+    factory = load_emulator(emulator) if isinstance(emulator, str) else emulator
+    bus = TcpServerBus("127.0.0.1:0", payload_size=_LONGEST_WRITE)
+    with emulated_on(bus, factory, **options):
+        yield bus.note.removeprefix("listens on ")
+
+
+@contextmanager
 def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
     """Run emulated devices on a bus as long as the ``with`` lasts.
 
@@ -94,4 +109,4 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
         raise control.failure
 
 
-__all__ = ["emulated_on", "emulated_on_a_pty"]
+__all__ = ["emulated_on", "emulated_on_a_pty", "emulated_over_tcp"]

@@ -137,6 +137,18 @@ def pty_patch() -> Iterator[Callable[..., str]]:
 
 
 @pytest.fixture
+def tcp_patch() -> Iterator[Callable[..., str]]:
+    """Makes emulated devices that are called over TCP: ``tcp_patch("my_driver")`` is their ``HOST:PORT``.
+
+    The arguments are as those of ``pty_patch``. All are gone at the end.
+    """
+    from skinware_drivers.testing.carrying import emulated_over_tcp
+
+    with ExitStack() as running:
+        yield lambda emulator, **options: running.enter_context(emulated_over_tcp(emulator, **options))
+
+
+@pytest.fixture
 def vcan() -> Iterator[Callable[[], str]]:
     """Makes virtual CAN interfaces of unique names, up; they are deleted at the end. Skips where there is no CAN."""
     if not has_can():

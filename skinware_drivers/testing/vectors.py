@@ -25,14 +25,18 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BusError
+from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
+from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS
 from skinware_drivers.description import Patch, assemble
 from skinware_drivers.link import Link
+from skinware_drivers.modbus.adapter import ModbusAdapter
+from skinware_drivers.modbus.master import Listener
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.both_paths import require_same
 from skinware_drivers.testing.clock import HandClock, run_in_its_time
@@ -94,7 +98,7 @@ def decode_frames(
 
 
 def decode_stream(
-    adapter: SerialAdapter[Any],
+    adapter: SerialAdapter[Any] | ModbusAdapter[Any],
     stream: str | bytes,
     *,
     strict: bool = True,
@@ -103,14 +107,14 @@ def decode_stream(
     """What a driver makes of bytes on a serial line.
 
     Args:
-        adapter: the driver. Its ``framing`` and ``layout`` are used, and its ``patches``, or what ``describe`` finds.
-        stream: the bytes, or their hexadecimal digits.
+        adapter: the driver. Its ``framing`` and ``layout`` are used (of Modbus, its ``registers`` and byte order), and
+            its ``patches``, or what ``describe`` finds.
+        stream: the bytes, or their hexadecimal digits. Of Modbus: questions and their replies, as on a serial line.
         strict: fail the test if some of them are not shown.
         devices: emulated ones, for a ``describe`` that asks.
     """
-    framer = adapter.framing.framer()
-    framed = framer.feed(_bytes(stream))
-    counters, pending = framer.counters, framer.pending
+    find = _overheard if isinstance(adapter, ModbusAdapter) else _framed
+    frames, counters, pending = find(adapter, _bytes(stream))
     problems = [
         text
         for count, text in (
@@ -118,10 +122,26 @@ def decode_stream(
             (counters.refused, f"{counters.refused} x what begins like a packet has a form that cannot be"),
             (counters.skipped_bytes, f"{counters.skipped_bytes} bytes belong to no good packet"),
             (pending, f"the last {pending} bytes are no whole packet: more would have to follow"),
+            (not frames, "nothing of it is data of this driver"),
         )
         if count
     ]
-    return _decode(adapter, [(frame.identifier, frame.body) for frame in framed], problems, strict, devices)
+    return _decode(adapter, frames, problems, strict, devices)
+
+
+def _framed(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
+    """The frames in the bytes of a serial line, what was counted, and how many bytes are no whole frame yet."""
+    framer = adapter.framing.framer()
+    frames = [(frame.identifier, frame.body) for frame in framer.feed(stream)]
+    return frames, framer.counters, framer.pending
+
+
+def _overheard(adapter: Any, stream: bytes) -> tuple[list[tuple[int, bytes]], FramerCounters, int]:
+    """Likewise of a line on which Modbus is spoken."""
+    counters = BusCounters()
+    listener = Listener(adapter.wanted, counters)
+    listener.heard(stream, NS_PER_S)
+    return [(row.identifier, row.payload) for row in listener.rows], counters.framing, listener.pending
 
 
 def _decode(

@@ -15,6 +15,8 @@ from skinware_drivers.cli.new import command
 from skinware_drivers.new_package import check_name, make_package
 from tests.commands import BIN
 
+TRANSPORTS = ["can", "serial", "modbus", "tcp", "virtual"]
+
 
 @pytest.mark.parametrize(
     ("name", "words"),
@@ -36,7 +38,7 @@ def test_names_that_cannot_be_are_refused_with_a_reason(name: str, words: str) -
         check_name(name)
 
 
-@pytest.mark.parametrize("transport", ["can", "serial", "virtual"])
+@pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_package_says_its_name_wherever_it_must(transport: str, tmp_path: Path) -> None:
     made = make_package("left_hand", transport, tmp_path)
     folder = tmp_path / "left_hand"
@@ -79,7 +81,7 @@ def test_nothing_is_left_of_a_package_that_could_not_be_made(tmp_path: Path, mon
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("transport", ["can", "serial", "virtual"])
+@pytest.mark.parametrize("transport", TRANSPORTS)
 @pytest.mark.parametrize("name", ["q", "the_longest_of_names"])
 def test_what_is_made_is_clean_whatever_its_name(transport: str, name: str, tmp_path: Path) -> None:
     make_package(name, transport, tmp_path)
@@ -92,7 +94,7 @@ def test_every_template_is_used() -> None:
     folder = Path(new_package.__file__).parent / "templates"
     found = {(path.parent.name, path.name) for path in folder.rglob("*") if path.is_file()}
     used = {("common", f"{name}.template") for name in new_package._COMMON}
-    used |= {(part, f"{name}.template") for part in ("can", "serial", "virtual") for name in new_package._OF_TRANSPORT}
+    used |= {(part, f"{name}.template") for part in TRANSPORTS for name in new_package._OF_TRANSPORT}
     assert found == used
 
 

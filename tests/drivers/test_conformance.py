@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,10 +23,15 @@ from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
+from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver
+from skinware_drivers.serial.weiss_dsa import WeissDsaDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
+from skinware_drivers.streams.icub_eth import IcubEthDriver
+from skinware_drivers.streams.tesollo import TesolloDriver
+from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
@@ -39,13 +45,18 @@ from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
+from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
+from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
+from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela
+from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -215,6 +226,51 @@ class TestWeissWts(DriverConformance):
     emulator = EmulatedWeissWts
 
 
+class TestWeissDsa(DriverConformance):
+    driver = WeissDsaDriver
+    emulator = EmulatedWeissDsa
+
+
+class TestTesollo(DriverConformance):
+    driver = TesolloDriver
+    emulator = EmulatedTesollo
+
+
+class TestTesolloShort(DriverConformance):
+    """Three of five fingers have sensors of 16 bits; the fingertips are asked for alone."""
+
+    driver = TesolloDriver
+    emulator = EmulatedTesollo
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": "fingertips"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"tips": "tactile_s", "fitted": 0b01011, "pads": True}
+
+
+class TestXelaServer(DriverConformance):
+    driver = XelaServerDriver
+    emulator = EmulatedXelaServer
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        return [value / 256 for value in felt]
+
+
+class TestXelaServerCounts(DriverConformance):
+    driver = XelaServerDriver
+    emulator = EmulatedXelaServer
+    emulator_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3), "model": "uSCuAH", "calibrated": False}
+
+
+class TestIcubEth(DriverConformance):
+    driver = IcubEthDriver
+    emulator = EmulatedIcubEth
+
+
+class TestIcubEthSecondPort(DriverConformance):
+    driver = IcubEthDriver
+    emulator = EmulatedIcubEth
+    driver_options: ClassVar[Mapping[str, Any]] = {"port": 2}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"boards": (3, 9), "triangles": 4, "skin": 1}
+
+
 class TestWujiGlove(DriverConformance):
     driver = WujiGloveDriver
     emulator = EmulatedWujiGlove
@@ -245,6 +301,42 @@ class TestFlexiTacText(DriverConformance):
 class TestAbilityHand(DriverConformance):
     driver = AbilityHandDriver
     emulator = EmulatedAbilityHand
+
+
+def with_resultant(bytes_felt: Sequence[int]) -> list[int]:
+    """Of one module of Paxini's: forces along the normal have no sign; behind all taxels comes the sum of each axis."""
+    taxels = np.array(bytes_felt).reshape(-1, 3)
+    taxels[:, 2] &= 0xFF
+    return [*taxels.ravel().tolist(), *np.clip(taxels.sum(axis=0), (-128, -128, 0), (127, 127, 255)).tolist()]
+
+
+class TestPaxiniConverter(DriverConformance):
+    """Two sensors that are asked."""
+
+    driver = PaxiniDriver
+    emulator = EmulatedPaxini
+    driver_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3)}
+    emulator_options: ClassVar[Mapping[str, Any]] = {
+        "sensors": (1, 3),
+        "version": "PAXINI PXSR-STDIP03B-v1.0.5",
+        "points": 25,
+    }
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        return with_resultant(felt)
+
+
+class TestPaxiniHighSpeed(DriverConformance):
+    """Modules of different size on two fingers and the palm, streamed together."""
+
+    driver = PaxiniDriver
+    emulator = EmulatedPaxini
+    driver_options: ClassVar[Mapping[str, Any]] = {"board": "high_speed"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"board": "high_speed", "slots": (2, 5, 20, 27), "points": 25}
+
+    def shown(self, felt: Sequence[int]) -> Sequence[int]:
+        edges = np.cumsum([0, 75, 75, 27, 27])
+        return [value for a, b in pairwise(edges) for value in with_resultant(felt[a:b])]
 
 
 def test_every_driver_that_ships_is_here() -> None:

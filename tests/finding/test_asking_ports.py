@@ -19,6 +19,7 @@ from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
+from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from tests.finding.fakes import see_only
@@ -27,6 +28,7 @@ from tests.serial.lines import Line, line, opened
 DEVICES: dict[str, tuple[Any, str]] = {
     "agni": (EmulatedAgni, "AGNI device 7 with 2 sensors"),
     "openpatch": (EmulatedOpenPatch, "open patch: emulated 1"),
+    "paxini": (EmulatedPaxini, "Paxini sensor 3: PAXINI PXSR-STDDP03F-v1.0.5"),
     "weiss_wts": (EmulatedWeissWts, "WTS with 4 x 8 cells"),
     "wuji_glove": (EmulatedWujiGlove, "Wuji left glove"),
 }

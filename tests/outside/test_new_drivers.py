@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from skinware_drivers.testing.waiting import wait_until
 from tests.outside.stranger import Stranger
+from tests.streams.peers import free_port
 from tests.wheel import ROOT
 
 pytestmark = pytest.mark.timeout(400)
@@ -41,10 +41,20 @@ def frame_of(stranger: Stranger, driver: str) -> dict[str, list[float]]:
     raise AssertionError("no fresh frame")
 
 
-@pytest.mark.parametrize(("transport", "sensors"), [("can", 12), ("serial", 24), ("virtual", 100)])
+PORT = "pty:{folder}/port", "{folder}/port"
+MODBUS = "modbus:tcp://127.0.0.1:{free}", "modbus:tcp://127.0.0.1:{free}"
+TCP = "tcp://127.0.0.1:{free}", "tcp://127.0.0.1:{free}"
+
+
+@pytest.mark.parametrize(
+    ("transport", "sensors", "ends"),
+    [("can", 12, None), ("serial", 24, PORT), ("modbus", 24, MODBUS), ("tcp", 24, TCP), ("virtual", 100, None)],
+    ids=["can", "serial", "modbus", "tcp", "virtual"],
+)
 def test_a_new_driver_passes_its_tests_and_runs_at_once(
-    stranger: Stranger, transport: str, sensors: int, tmp_path: Path
+    stranger: Stranger, transport: str, sensors: int, ends: tuple[str, str] | None, tmp_path: Path
 ) -> None:
+    """With the devices in its own process and, where they can be, at the other end of a line or a connection."""
     name = f"new_{transport}"
     told = stranger.do("skin-new", name, "--transport", transport, cwd=tmp_path)
     package = tmp_path / name
@@ -53,17 +63,14 @@ def test_a_new_driver_passes_its_tests_and_runs_at_once(
     check(stranger, package, at_least=20)
     with stranger.running("skin-driver", "--driver", name, "--bus", "virtual"):
         assert len(frame_of(stranger, name)["values"]) == sensors
-
-
-def test_a_new_serial_driver_reads_a_port(stranger: Stranger, tmp_path: Path) -> None:
-    stranger.do("skin-new", "on_a_port", "--transport", "serial", cwd=tmp_path)
-    install(stranger, tmp_path / "on_a_port")
-    port = tmp_path / "port"
+    if ends is None:
+        return
+    free = free_port()
+    there, here = (end.format(folder=tmp_path, free=free) for end in ends)
     with ExitStack() as running:
-        running.enter_context(stranger.running("skin-emulate", "--driver", "on_a_port", "--bus", f"pty:{port}"))
-        wait_until(port.exists)
-        running.enter_context(stranger.running("skin-driver", "--driver", "on_a_port", "--bus", str(port)))
-        assert len(frame_of(stranger, "on_a_port")["values"]) == 24
+        running.enter_context(stranger.running("skin-emulate", "--driver", name, "--bus", there))
+        running.enter_context(stranger.running("skin-driver", "--driver", name, "--bus", here, "--wait"))
+        assert len(frame_of(stranger, name)["values"]) == sensors
 
 
 def test_the_example_is_a_driver_like_any_other(stranger: Stranger, tmp_path: Path) -> None:

@@ -52,6 +52,7 @@ DRIVERS = (
     "canopen",
     "flexitac",
     "openpatch",
+    "paxini",
     "roboskin",
     "weiss_wts",
     "wuji_glove",

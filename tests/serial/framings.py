@@ -100,6 +100,17 @@ EXAMPLES: dict[str, Example] = {
         ),
         range(0, 256, 7),
     ),
+    "paxini_high_speed": Example(
+        Packet(
+            sync=(0xAA, (0x55, 0x56)),
+            length=LengthTable(1, {0x55: Length(Field(6, 2), 9), 0x56: Length(Field(3, 2), 6)}),
+            maximum=200,
+            checksum=LRC,
+            identifier=Field(1),
+            header=8,
+        ),
+        (0x55, 0x56),
+    ),
     "optoforce": Example(
         Packet(
             sync=(0xAA, 0x07, 0x08, (0x0A, 0x1C, 0x10)),

@@ -12,11 +12,13 @@ import pytest
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.weiss_wts import message as weiss_message
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
@@ -43,10 +45,13 @@ def test_no_flipped_bit_makes_a_frame(driver: type[SerialAdapter[Any]], frame: b
         assert len(found) == 1  # the next one is found
 
 
+HAND = {"board": "high_speed", "slots": (2, 6, 20), "points": 9}
 DEVICES: list[tuple[type[SerialAdapter[Any]], Any, dict[str, Any], dict[str, Any], tuple[int, int]]] = [
     (WeissWtsDriver, EmulatedWeissWts, {}, {"columns": 2}, (32, 16)),
     (WujiGloveDriver, EmulatedWujiGlove, {}, {}, (768, 768)),
     (AgniDriver, EmulatedAgni, {}, {"sensors": (3, 4, 5)}, (20, 12)),
+    (PaxiniDriver, EmulatedPaxini, {}, {"version": "PAXINI PXSR-STDIP03B-v1.0.5", "points": 25}, (96, 78)),
+    (PaxiniDriver, EmulatedPaxini, HAND, {**HAND, "slots": (6,)}, (90, 30)),
 ]
 
 

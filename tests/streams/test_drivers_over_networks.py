@@ -15,7 +15,7 @@ from skinware_drivers.virtual.hardware import load_emulator
 from tests.commands import run, running
 from tests.streams.peers import LOCAL, free_port
 
-DRIVERS = ["tactile_glove", "weiss_wts", "openpatch", "wuji_glove"]
+DRIVERS = ["tactile_glove", "weiss_wts", "openpatch", "wuji_glove", "paxini"]
 """One that only listens, and three that ask, of three framings."""
 
 

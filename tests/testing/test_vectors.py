@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Frame, Layout, Link, Match, Module, NoOptions, Patch, Values, taxels
+from skinware_drivers.modbus import ModbusAdapter, Registers
 from skinware_drivers.serial import SUM8, Packet, SerialAdapter
 from skinware_drivers.testing.vectors import Shown, decode_frames, decode_stream
 from skinware_drivers.virtual.emulator import EmulatorOptions
@@ -44,8 +46,28 @@ class Strip(SerialAdapter[NoOptions]):
     layout = Layout([Frame("all", length=[2], values=Values(0, "u1", 2))])
 
 
+class Pad(ModbusAdapter[NoOptions]):
+    dtype = np.uint16
+    registers = (Registers(2, 2),)
+    types = (PRESSURE.measured(unit="counts"),)
+    patches = (Patch("pad", [Module(taxels(2))]),)
+
+
+class LowByteFirst(Pad):
+    byte_order = "little"
+
+
+ASKED, REPLIED = "01 03 00 02 00 02 65 CB", "01 03 04 00 05 01 00 EB A2"
+ASKED_ELSE, REPLIED_ELSE = "01 03 00 09 00 01 54 08", "01 03 02 00 07 F9 86"
+REFUSED = "01 83 02 C0 F1"
+
+
 def decode(*frames: tuple[int, str], **more: bool) -> Shown:
     return decode_frames(Declared(NoOptions()), frames, **more)  # type: ignore[arg-type]
+
+
+def registers(digits: str, **more: bool) -> Shown:
+    return decode_stream(Pad(NoOptions()), digits, **more)  # type: ignore[arg-type]
 
 
 def stream(digits: str, **more: bool) -> Shown:
@@ -57,6 +79,9 @@ def test_what_is_whole_is_shown() -> None:
     assert shown.values.tolist() == [1, 2, 3, 4, 5, 6]
     assert shown.problems == ()
     assert stream("F0 01 02 F3 F0 03 04 F7").values.tolist() == [3, 4]
+    assert registers(ASKED + REPLIED).values.tolist() == [5, 256]
+    assert registers(ASKED_ELSE + REPLIED_ELSE + ASKED + REPLIED).values.tolist() == [5, 256]
+    assert decode_stream(LowByteFirst(NoOptions()), ASKED + REPLIED).values.tolist() == [0x500, 1]
 
 
 @pytest.mark.parametrize(
@@ -84,6 +109,12 @@ def test_what_is_whole_is_shown() -> None:
         ),
         (lambda **m: stream("55 F0 01 02 F3", **m), r"1 bytes belong to no good packet"),
         (lambda **m: stream("F0 01 02 F3 F0 01", **m), r"the last 2 bytes are no whole packet"),
+        (lambda **m: stream("", **m), r"nothing of it is data of this driver"),
+        (lambda **m: registers(REPLIED, **m), r"bytes belong to no good packet|no whole packet"),
+        (lambda **m: registers(ASKED + REPLIED[:-2] + "FF", **m), r"1 x the checksum is wrong|no whole packet"),
+        (lambda **m: registers(ASKED + REPLIED[:-3], **m), r"the last 8 bytes are no whole packet"),
+        (lambda **m: registers(ASKED_ELSE + REPLIED_ELSE, **m), r"nothing of it is data of this driver"),
+        (lambda **m: registers(ASKED + REFUSED, **m), r"nothing of it is data of this driver"),
     ],
 )
 def test_what_is_not_shown_fails_the_test_unless_it_is_meant_to(decoding: Callable[..., Shown], words: str) -> None:

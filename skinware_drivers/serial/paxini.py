@@ -1,0 +1,213 @@
+"""Paxini's PX-6AX GEN3: tactile modules of three axes, behind a serial converter board or behind a high-speed board.
+
+Wire formats: the requests of Paxini's own programs, captured and published; three published programs that read the
+sensors (github.com/riverfog7/paxini-utils, adnan-saood/paxini_ros2, yknxh/paxini-toolkit). They are told where they are
+spoken: :mod:`.paxini_converter`, :mod:`.paxini_high_speed`. Both boards speak at 921600 baud, 8N1.
+
+What is not known, and what is done about it: whether one board minds a question in the other one's protocol is not
+published [INF: it does not; the option ``board`` names the board, and nothing is asked in the other protocol]. What the
+error byte of the high-speed board's frames means is not public: values of a frame that has one are ``SUSPECT``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import BusError, HandshakeTimeout
+from skinware.sensor_types import SensorType
+from skinware_drivers.description import Patch
+from skinware_drivers.hand import Hand
+from skinware_drivers.layout import Layout
+from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.polling import Poll
+from skinware_drivers.serial import paxini_converter, paxini_high_speed
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.framing import Encoding, Framing, Unframed
+from skinware_drivers.serial.packets import LengthTable, Packet
+from skinware_drivers.serial.paxini_board import Board
+from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
+from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES
+
+_HEADERS = 48
+"""More than there is around the taxels in any body."""
+_LISTEN_S, _TIMEOUT_S, _TRIES = 0.1, 0.2, 2
+_VERSIONS: Framing = Packet(
+    sync=(0xAA, 0x55, (0, 110)),
+    length=LengthTable(2, {0: 9 + paxini_high_speed.VERSION_BYTES, 110: 15 + paxini_converter.VERSION_BYTES}),
+    checksum=LRC,
+    identifier=IDENTIFIER,
+    header=5,
+)
+"""Replies of either board to the question for its version, and nothing else."""
+_HEADER_OF_HIGH_SPEED = paxini_high_speed.version_request()[:8]
+"""Of its reply, but for the first two bytes."""
+_VERSION_OF_HIGH_SPEED = Match(IDENTIFIER.of(_HEADER_OF_HIGH_SPEED), prefix=_HEADER_OF_HIGH_SPEED[5:])
+
+
+class PaxiniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    board: Annotated[
+        Literal["auto", "converter", "high_speed"], Meta(description="which board it is; auto: listen and ask")
+    ] = "auto"
+    sensors: Annotated[
+        tuple[Annotated[int, Meta(ge=SENSORS[0], le=SENSORS[-1])], ...],
+        Meta(description="converter board: ids of the sensors that must be there; none: all that answer"),
+    ] = ()
+    points: Annotated[
+        int, Meta(ge=0, le=MOST_POINTS, description="converter board: taxels of each sensor; 0: by its part code")
+    ] = 0
+    period_ms: Annotated[
+        float, Meta(ge=1, le=1000, description="converter board: time between two questions to a sensor, ms")
+    ] = 10
+    hand: Annotated[
+        Literal["right", "left"], Meta(description="high-speed board: of which hand its modules are, for their places")
+    ] = "right"
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class PaxiniDriver(SerialAdapter[PaxiniOptions]):
+    """One board on a serial line, with all modules that are attached to it."""
+
+    framing: Framing = _VERSIONS
+    commands: Encoding | None = Unframed(64)
+    baudrate: int = 921_600
+    types: Sequence[SensorType] = TYPES
+    dtype: npt.DTypeLike = np.int16
+    layout: Layout
+
+    def __init__(self, options: PaxiniOptions) -> None:
+        super().__init__(options)
+        self._converter = ConverterBoard(
+            options.sensors,
+            options.points,
+            self._is_away,
+            period_s=options.period_ms / 1e3,
+            use=self.change_framing,
+            tell=self.tell,
+        )
+        self._high_speed = HighSpeedBoard(Hand(options.hand), use=self.change_framing, tell=self.tell)
+        self._board: Board | None = None
+        self._is_asking = False
+
+    @property
+    def payload_size(self) -> int:
+        """Of the largest module: which ones there are, is known only when they were asked for."""
+        return -(-(_HEADERS + TAXEL * MOST_POINTS) // 8) * 8
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """What a converter board is asked; a high-speed board sends by itself."""
+        return () if self._board is None else self._board.polls
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the board what is attached to it.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("Paxini's boards tell what is attached to them only on request: listening is not enough")
+        self._board, self._is_asking = None, True  # nothing else is asked meanwhile
+        try:
+            board = await self._find(link)
+            self.change_framing(board.framing)
+            patches = await board.describe(link)
+        finally:
+            self._is_asking = False
+        self.layout, self.geometry, self.period_s = board.layout, board.geometry, board.period_s
+        self._board = board
+        return patches
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """The version of the first sensor of a converter board, or of a high-speed board; both tell it at any time."""
+        for sensor in SENSORS:
+            try:
+                return f"Paxini sensor {sensor}: {await ask_version(link, sensor)}"
+            except HandshakeTimeout:
+                continue
+        return f"Paxini high-speed board {await _ask_high_speed(link)}"
+
+    async def start(self, link: Link) -> None:
+        """Have it send, if it can."""
+        await self._described.start(link)
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent."""
+        if self._board is not None:
+            await self._board.stop(link)
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether a silent patch answers, and is what it was; if nobody knows what is there, that is asked again."""
+        if self._board is not None:
+            return await self._board.probe(link, patch)
+        if not self._is_asking:
+            self.tell(patch, Notice.CHANGED)
+        return False
+
+    async def attend(self, link: Link) -> None:
+        """Hear what the board says beside its data, whichever it is."""
+        async with asyncio.TaskGroup() as attending:
+            for board in (self._converter, self._high_speed):
+                attending.create_task(board.attend(link))
+
+    async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:  # noqa: ARG002
+        """Ask what is attached now, and have it send again."""
+        patches = await self.describe(link)
+        await self.start(link)
+        return patches
+
+    @operation(sets_up=True)
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
+        """Take the present forces as zero; a high-speed board needs up to 10 s for it."""
+        await self._described.tare(link, patches)
+
+    @property
+    def _described(self) -> Board:
+        if self._board is None:
+            raise BusError("the board was not found yet")
+        return self._board
+
+    def _is_away(self) -> bool:
+        return self._line is not None and self._line.fileno() < 0
+
+    async def _find(self, link: Link) -> Board:
+        """The board that the options name, or that is there.
+
+        Raises:
+            HandshakeTimeout: neither is.
+        """
+        if self.options.board == "converter":
+            return self._converter
+        if self.options.board == "high_speed" or await self._high_speed.is_streaming(link, _LISTEN_S):
+            return self._high_speed
+        self.change_framing(_VERSIONS)
+        if await self._converter.is_there(link):
+            return self._converter
+        await _ask_high_speed(link)
+        return self._high_speed
+
+
+async def _ask_high_speed(link: Link) -> str:
+    question = paxini_high_speed.version_request()
+    reply = await link.request(0, question, _VERSION_OF_HIGH_SPEED, timeout_s=_TIMEOUT_S, tries=_TRIES)
+    return reply.payload[3:].rstrip(b"\0 ").decode("ascii", "replace")

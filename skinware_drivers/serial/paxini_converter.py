@@ -1,0 +1,254 @@
+"""Paxini's serial converter board, or a single sensor with a serial port: sensors that answer what they are asked.
+
+All numbers are little-endian; LRC is minus the sum of all bytes before it.
+
+* Request: ``55 AA | bytes from here to the LRC u16 | sensor | 00 | function | address u32 | count u16 | data | LRC``.
+  Functions: FB reads, 79 writes.
+* Reply: ``AA 55`` and the same up to the count, then a status u8, data, LRC. Function 7E is an error.
+* Addresses, decimal: 1008 the resultant, 3 bytes, then 27 bytes of something else, then the taxels, from 1038; 6100
+  100 characters with the part code; 3 write 1 to take the present forces as zero.
+
+This board puts status 1, which is an error of the length, into every good reply to a read. So the status of reads says
+nothing, that of writes does. It sends nothing by itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from skinware.errors import BusError, HandshakeTimeout
+from skinware_drivers.description import Patch
+from skinware_drivers.layout import Byte, Condition, Frame, Identifier, Layout
+from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
+from skinware_drivers.polling import Poll
+from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.paxini_board import Board
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, POINTS_OF_PART, TAXEL, model_of, module, values
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+SENSORS: Sequence[int] = range(9)
+"""Ids that sensors can have."""
+VERSION_BYTES = 100
+
+IDENTIFIER = Field(4, 4, mask=0x07_04_00_FF)
+"""The sensor, and those bits of function and address that are 0 in data, and not in any other reply that is expected:
+what is no data is of no module then, and reaches whoever waits for it."""
+
+_READ, _WRITE, _ERROR = 0xFB, 0x79, 0x7E
+_SENSOR_MASK, _ERROR_MASK = 0xFF, 0x04 << 16
+_ZERO, _DATA, _VERSION = 3, 1008, 6100
+_BEFORE_TAXELS = 30
+_BODY_HEADER = 9  # 00, function, address, count, status
+_RESULTANT_STEP = 1
+_TIMEOUT_S, _TRIES, _TIMEOUT_OF_ZERO_S = 0.1, 3, 2.0
+
+
+def read(sensor: int, address: int, count: int) -> bytes:
+    """The request for so many bytes, as it is sent."""
+    sent = b"\x55\xaa" + struct.pack("<HBBBIH", 9, sensor, 0, _READ, address, count)
+    return sent + LRC.to_bytes(sent)
+
+
+def write(sensor: int, address: int, value: int) -> bytes:
+    """The request to write one byte, as it is sent."""
+    sent = b"\x55\xaa" + struct.pack("<HBBBIHB", 10, sensor, 0, _WRITE, address, 1, value)
+    return sent + LRC.to_bytes(sent)
+
+
+def answer(sensor: int, function: int, address: int) -> Match:
+    """The reply to it, with this function."""
+    return Match(_identifier(sensor, function, address), prefix=struct.pack("<BBI", 0, function, address))
+
+
+def _identifier(sensor: int, function: int, address: int) -> int:
+    """Of a reply."""
+    return (sensor | function << 16 | (address & 0xFF) << 24) & IDENTIFIER.mask
+
+
+async def ask_version(link: Link, sensor: int, *, tries: int = 1) -> str:
+    """What a sensor says it is: ``PAXINI PXSR-STDDP03F-v1.0.5``.
+
+    Raises:
+        HandshakeTimeout: no such sensor.
+    """
+    question = read(sensor, _VERSION, VERSION_BYTES)
+    match = answer(sensor, _READ, _VERSION)
+    return version_in((await link.request(sensor, question, match, timeout_s=_TIMEOUT_S, tries=tries)).payload)
+
+
+def version_in(reply: bytes) -> str:
+    """What is printable in the reply to the question for the version."""
+    return "".join(c for c in reply[_BODY_HEADER:].decode("ascii", "replace") if c.isprintable()).strip()
+
+
+class Head(NamedTuple):
+    """What a reply begins with; -1 where it is too short to have one."""
+
+    function: int
+    address: int
+    status: int
+
+    @staticmethod
+    def of(payload: bytes) -> Head:
+        """Of the body of a frame."""
+        if len(payload) < _BODY_HEADER:
+            return Head(-1, -1, -1)
+        function, address, _, status = struct.unpack_from("<xBIHB", payload)
+        return Head(function, address, status)
+
+    def in_words(self, sensor: int) -> str:
+        """For people."""
+        return f"sensor {sensor} answers with function {self.function:#04x}, status {self.status}, at {self.address}"
+
+
+class ConverterBoard(Board):
+    """The sensors on one line. A sensor that fell silent is asked who it is, before it is asked for data again.
+
+    Args:
+        sensors: ids of those that must be there; none: all that answer.
+        points: taxels of each; 0: as their part codes say.
+        is_away: tells whether the line is closed.
+        how: see :class:`Board`; ``period_s`` is the time between two questions to the same sensor.
+    """
+
+    framing: Framing = Packet(
+        sync=(0xAA, 0x55, range(256), range(4), range(16), 0x00),
+        length=Length(Field(2, 2), more=5),
+        maximum=5 + _BODY_HEADER + 1 + _BEFORE_TAXELS + TAXEL * MOST_POINTS,
+        checksum=LRC,
+        identifier=IDENTIFIER,
+        header=5,
+    )
+
+    def __init__(self, sensors: Sequence[int], points: int, is_away: Callable[[], bool], **how: Any) -> None:
+        super().__init__(**how)
+        self._wanted, self._points = sensors, points
+        self._is_away = is_away
+        self._versions: dict[int, str] = {}
+        self._patches: dict[int, Patch] = {}
+        self._polls: dict[int, Poll] = {}
+        self._silent: set[int] = set()
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """The data of every sensor, or the version of one that fell silent."""
+        if self._is_away():  # what is plugged in next may be another one
+            self._silent = set(self._polls)
+        return [self._ask_who(sensor) if sensor in self._silent else poll for sensor, poll in self._polls.items()]
+
+    async def is_there(self, link: Link) -> bool:
+        """Whether one of its sensors answers."""
+        for sensor in self._wanted or SENSORS:
+            try:
+                await ask_version(link, sensor)
+            except HandshakeTimeout:
+                continue
+            return True
+        return False
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask for the sensors; each is a patch.
+
+        Raises:
+            BusError: nobody answers, one that must be there does not, or one says that it is a model that is not known.
+        """
+        found: dict[int, str] = {}
+        for sensor in self._wanted or SENSORS:
+            try:
+                found[sensor] = await ask_version(link, sensor, tries=_TRIES if self._wanted else 1)
+            except HandshakeTimeout:
+                if self._wanted:
+                    raise
+        if not found:
+            raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
+        points = {sensor: self._points_of(sensor, version) for sensor, version in found.items()}
+        for sensor, version in found.items():
+            log.info("%s: sensor %d is %s, %s", link.bus_name, sensor, model_of(points[sensor]), version)
+        self.layout = Layout([_frame(sensor, count) for sensor, count in points.items()])
+        self._polls = {sensor: self._ask_data(sensor, count) for sensor, count in points.items()}
+        self._patches = {
+            sensor: Patch(f"sensor {sensor}", [module(sensor, count)], sensor) for sensor, count in points.items()
+        }
+        self._versions, self._silent = found, set()
+        return list(self._patches.values())
+
+    async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
+        """Ask a silent sensor who it is from now on, in its turn: whoever waited for it would hold up the others."""
+        self._silent.add(patch.key)
+        return False
+
+    async def attend(self, link: Link) -> None:
+        """Hear who they are that were silent, and the errors that sensors answer with."""
+        error, of_function = "", IDENTIFIER.mask & ~_SENSOR_MASK
+        who = answer(0, _READ, _VERSION)._replace(mask=of_function)
+        with link.follow(who, Match(0, 0, bytes((0, _ERROR)))) as heard:
+            while True:
+                reply = await heard.get()
+                sensor = reply.identifier & _SENSOR_MASK
+                if reply.payload[1] != _ERROR:
+                    self._heard_who(link, sensor, version_in(reply.payload))
+                elif (told := Head.of(reply.payload).in_words(sensor)) != error:
+                    error = told
+                    log.warning("%s: %s", link.bus_name, told)
+
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:
+        """Have sensors take the present forces as zero, one after the other.
+
+        Raises:
+            BusError: one refuses, or does not answer.
+        """
+        for patch in patches:
+            sensor = patch.key
+            done_or_refused = Match(_identifier(sensor, _WRITE, _ZERO), IDENTIFIER.mask & ~_ERROR_MASK)
+            reply = await link.request(sensor, write(sensor, _ZERO, 1), done_or_refused, timeout_s=_TIMEOUT_OF_ZERO_S)
+            head = Head.of(reply.payload)
+            if (head.function, head.address, head.status) != (_WRITE, _ZERO, 0):
+                raise Refused(head.in_words(sensor), head.status)
+
+    def _heard_who(self, link: Link, sensor: int, version: str) -> None:
+        patch = self._patches.get(sensor)
+        if patch is None or sensor not in self._silent:
+            return
+        if version == self._versions[sensor]:
+            self._silent.discard(sensor)
+        else:
+            log.warning("%s: sensor %d is another one now: %s", link.bus_name, sensor, version)
+            del self._patches[sensor]  # said once
+            self.tell(patch, Notice.CHANGED)
+
+    def _points_of(self, sensor: int, version: str) -> int:
+        known = (points for code, points in POINTS_OF_PART.items() if code in version)
+        points = self._points or next(known, 0)
+        if not points:
+            raise BusError(
+                f"sensor {sensor} says that it is {version!r}: not a part code whose number of taxels is known; say it"
+                " with the option points"
+            )
+        return points
+
+    def _ask_data(self, sensor: int, points: int) -> Poll:
+        question = read(sensor, _DATA, _BEFORE_TAXELS + TAXEL * points)
+        return Poll(sensor, question, self.period_s, answer(sensor, _READ, _DATA))
+
+    def _ask_who(self, sensor: int) -> Poll:
+        question = read(sensor, _VERSION, VERSION_BYTES)
+        return Poll(sensor, question, self.period_s, answer(sensor, _READ, _VERSION))
+
+
+def _frame(sensor: int, points: int) -> Frame:
+    expected = answer(sensor, _READ, _DATA).prefix
+    when: list[Condition] = [Identifier(sensor), *(Byte(1 + at, byte) for at, byte in enumerate(expected[1:]))]
+    taxels_at = _BODY_HEADER + _BEFORE_TAXELS
+    where = values(points, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
+    return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor)
+
+
+__all__ = ["SENSORS", "VERSION_BYTES", "ConverterBoard", "ask_version", "read", "version_in", "write"]

@@ -1,0 +1,285 @@
+"""Paxini's high-speed board PXSR-STDOTO4B: up to 28 modules of a hand, all of them in every frame that it sends.
+
+All numbers are little-endian; LRC is minus the sum of all bytes before it.
+
+* Request: ``55 AA | 00 | function | register u16 | count u16 | data | LRC``. Functions: 03 reads 1 to 512 bytes, 10
+  writes 1 to 10, 17 calibrates. Reply: ``AA 55`` and the same; a function with bit 7 has the number of an error in the
+  other bits. The data of a reply to a write are a status, 0 if all is well.
+* Stream: ``AA 56 | 00 | bytes u16 | error u8 | data | LRC``; the bytes count error and data. Data: of each connected
+  slot, in order, the resultant (three u16, of which the low byte counts) and its taxels; of a module on the palm, nine
+  at most. How long a frame is follows from the slots and their numbers of taxels; both have to be asked for first.
+* Registers: 0000 version, 15 characters; 0010 to 0013 connected slots, one bit each, the lowest first; 0017 stream on
+  and off; 0030 and 0066 numbers of taxels, u16, of the slots of the fingers and of the palm.
+
+A program that ends without switching the stream off leaves the board sending. So it is switched off before anything is
+asked, what has come is dropped, and what is not answered is asked again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import struct
+from collections.abc import Callable, Sequence
+from itertools import accumulate
+from typing import Any
+
+from skinware.errors import BusError, HandshakeTimeout
+from skinware.realtime import NS_PER_S
+from skinware.status import Status
+from skinware_drivers.description import Patch
+from skinware_drivers.hand import Hand
+from skinware_drivers.layout import Flag, Frame, Identifier, Layout
+from skinware_drivers.link import Link, Match, Reply
+from skinware_drivers.notice import Notice
+from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.checksums import LRC
+from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.packets import Length, LengthTable, Packet
+from skinware_drivers.serial.parts import Part, Parts
+from skinware_drivers.serial.paxini_board import Board
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, Slot, module, nominal_places, values
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+VERSION_BYTES = 15
+STRANGE = 0x57
+"""Identifier of what is streamed and not as long as it should be; those of slots are their numbers."""
+
+_REPLY, _STREAM = 0x55, 0x56
+_READ, _WRITE, _CALIBRATE, _IS_ERROR = 0x03, 0x10, 0x17, 0x80
+_VERSION, _CONNECTED, _SWITCH, _CALIBRATION = 0x0000, 0x0010, 0x0017, 0x0002
+_POINTS_ON_FINGERS, _POINTS_ON_PALM = 0x0030, 0x0066
+_FINGER_SLOTS, _SLOTS, _BYTES_OF_MASK = 20, 28, 4
+_MOST_ON_PALM = 9
+_LENGTH_AND_ERROR, _RESULTANT, _RESULTANT_STEP = 3, 6, 2
+_LONGEST = 7 + _SLOTS * (_RESULTANT + TAXEL * MOST_POINTS)
+_TIMEOUT_S, _TRIES, _SWITCHES = 0.2, 3, 2
+_TIMEOUT_OF_CALIBRATION_S = 10.0
+_USUAL_HZ = 91.0
+_STRANGE_IN_A_ROW, _WITHIN_NS = 3, NS_PER_S
+
+
+def request(function: int, register: int, count: int, data: bytes = b"") -> bytes:
+    """A request as it is sent."""
+    sent = b"\x55\xaa\0" + struct.pack("<BHH", function, register, count) + data
+    return sent + LRC.to_bytes(sent)
+
+
+def version_request() -> bytes:
+    """The question for the version."""
+    return request(_READ, _VERSION, VERSION_BYTES)
+
+
+def framing_of(slots: Sequence[Slot]) -> Framing:
+    """Replies, and streamed frames divided into one for each of these slots."""
+    sizes = [_RESULTANT + TAXEL * slot.points for slot in slots]
+    *starts, size = accumulate(sizes, initial=_LENGTH_AND_ERROR)
+    parts = tuple(
+        Part(slot.number, start, start + size) for slot, start, size in zip(slots, starts, sizes, strict=True)
+    )
+    return Packet(
+        sync=(0xAA, (_REPLY, _STREAM), 0x00),
+        length=LengthTable(1, {_REPLY: Length(Field(6, 2), more=9), _STREAM: Length(Field(3, 2), more=6)}),
+        maximum=_LONGEST,
+        checksum=LRC,
+        identifier=Field(1),
+        header=3,
+        parts=Parts(_STREAM, size if slots else -1, parts, _LENGTH_AND_ERROR, STRANGE),
+    )
+
+
+UNKNOWN_SLOTS: Framing = framing_of(())
+"""All streamed frames are strange, as long as nobody knows what is in them."""
+
+
+class HighSpeedBoard(Board):
+    """One board: a patch with a module for each connected slot.
+
+    Args:
+        hand: whose modules they are, for their places.
+        how: see :class:`Board`.
+    """
+
+    def __init__(self, hand: Hand, **how: Any) -> None:
+        super().__init__(1 / _USUAL_HZ, **how)
+        self._hand = hand
+        self.framing: Framing = UNKNOWN_SLOTS
+        self._slots: list[Slot] = []
+        self._patch: Patch | None = None
+        self._streams = False
+
+    async def is_streaming(self, link: Link, duration_s: float) -> bool:
+        """Whether frames come that only this board sends; nothing is asked."""
+        self._streams = False
+        self.use(UNKNOWN_SLOTS)
+        return any(heard.identifier == STRANGE for heard in await link.listen(duration_s))
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the board for its modules; it may still be sending for somebody before us.
+
+        Raises:
+            BusError: it does not answer, nothing is connected to it, or it says what cannot be.
+        """
+        self.framing = UNKNOWN_SLOTS
+        self.use(self.framing)
+        await self.stop(link)
+        self.use(self.framing)
+        version = (await self._read(link, _VERSION, VERSION_BYTES)).rstrip(b"\0 ").decode("ascii", "replace")
+        self._slots = await self._ask_slots(link)
+        if not self._slots:
+            raise BusError(f"the board {version} says that no module is connected to it")
+        log.info(
+            "%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in self._slots)
+        )
+        self.framing, self.geometry = framing_of(self._slots), nominal_places(self._slots, self._hand)
+        self.use(self.framing)
+        self.layout = Layout([_frame(slot) for slot in self._slots])
+        modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in self._slots]
+        self._patch = Patch("hand", modules)
+        return [self._patch]
+
+    async def start(self, link: Link) -> None:
+        """Have it send by itself. That it does, its data show; not every version of it acknowledges it."""
+        self._streams = True
+        if not await self._switch(link, on=True):
+            log.debug("%s: the board does not acknowledge that it streams", link.bus_name)
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent, and wait until it says so."""
+        self._streams = False
+        if not await self._switch(link, on=False):
+            log.debug("%s: the board does not acknowledge that it is silent", link.bus_name)
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and has the modules that it had: then it was reset, and does not send any more."""
+        if await self._ask_slots(link, tries=1) == self._slots:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
+
+    async def attend(self, link: Link) -> None:
+        """Notice that what it streams is of another length: modules were connected or came off."""
+        times_ns: list[int] = []
+        with link.follow(Match(STRANGE)) as heard:
+            while True:
+                reply = await heard.get()
+                times_ns = [*times_ns, reply.time_ns][-_STRANGE_IN_A_ROW:] if self._streams else []
+                enough = len(times_ns) == _STRANGE_IN_A_ROW and times_ns[-1] - times_ns[0] < _WITHIN_NS
+                if enough and self._patch is not None:
+                    log.warning("%s: the board streams other modules than before; asking which", link.bus_name)
+                    times_ns, self._streams = [], False
+                    self.tell(self._patch, Notice.CHANGED)
+
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
+        """Calibrate the board, which sends nothing meanwhile.
+
+        Raises:
+            BusError: it refuses, or does not answer within 10 s.
+        """
+        await self.stop(link)
+        try:
+            status = await self._exchange(
+                link,
+                request(_CALIBRATE, _CALIBRATION, 1, b"\1"),
+                lambda frame: _data_of(frame, _CALIBRATE, _CALIBRATION, 1),
+                _TIMEOUT_OF_CALIBRATION_S,
+                tries=1,
+            )
+            if status is None:
+                raise HandshakeTimeout(
+                    f"the board does not say that it has calibrated, for {_TIMEOUT_OF_CALIBRATION_S:g} s"
+                )
+            _check_status("calibrate", status)
+        finally:
+            await self.start(link)
+
+    async def _ask_slots(self, link: Link, tries: int = _TRIES) -> list[Slot]:
+        mask = b"".join([await self._read(link, _CONNECTED + at, 1, tries) for at in range(_BYTES_OF_MASK)])
+        connected = int.from_bytes(mask, "little")
+        slots = []
+        for number in (number for number in range(_SLOTS) if connected >> number & 1):
+            is_on_finger = number < _FINGER_SLOTS
+            first = _POINTS_ON_FINGERS if is_on_finger else _POINTS_ON_PALM - 2 * _FINGER_SLOTS
+            points = int.from_bytes(await self._read(link, first + 2 * number, 2, tries), "little")
+            slot = Slot(number, points if is_on_finger else min(points, _MOST_ON_PALM))
+            if points > MOST_POINTS:
+                raise BusError(f"the board says that {slot.name} has {points} taxels: that cannot be")
+            slots.append(slot)
+        return slots
+
+    async def _switch(self, link: Link, *, on: bool) -> bool:
+        """Switch the stream on or off; whether that was acknowledged, by a reply or an empty streamed frame."""
+        sent = request(_WRITE, _SWITCH, 1, bytes([on]))
+
+        def take(frame: Reply) -> bytes | None:
+            status = frame.payload[2:] if _is_empty(frame) else _data_of(frame, _WRITE, _SWITCH, 1)
+            _check_status("stream", status or b"")
+            return status
+
+        return await self._exchange(link, sent, take, _TIMEOUT_S, _SWITCHES) is not None
+
+    async def _read(self, link: Link, register: int, count: int, tries: int = _TRIES) -> bytes:
+        sent = request(_READ, register, count)
+        data = await self._exchange(
+            link, sent, lambda frame: _data_of(frame, _READ, register, count), _TIMEOUT_S, tries
+        )
+        if data is None:
+            raise HandshakeTimeout(f"{link.bus_name}: no answer to [{sent.hex(' ').upper()}], {tries} times")
+        return data
+
+    async def _exchange(
+        self, link: Link, sent: bytes, take: Callable[[Reply], bytes | None], timeout_s: float, tries: int
+    ) -> bytes | None:
+        """What ``take`` makes of the first frame that is an answer to it; None if none comes, however often it is sent.
+
+        What is half received is dropped before it is sent again: it may be a beginning that is none, and the answer be
+        taken for more of it.
+        """
+        with link.follow(Match(_REPLY), Match(STRANGE)) as heard:
+            for _ in range(tries):
+                await link.send(0, sent)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(timeout_s):
+                        while (taken := take(await heard.get())) is None:
+                            pass
+                        return taken
+                self.use(self.framing)
+        return None
+
+
+def _frame(slot: Slot) -> Frame:
+    taxels_at = _LENGTH_AND_ERROR + _RESULTANT
+    where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
+    has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
+    when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
+    return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error])
+
+
+def _is_empty(frame: Reply) -> bool:
+    """Whether it is a streamed frame that has an error byte and nothing else."""
+    return frame.identifier == STRANGE and len(frame.payload) == _LENGTH_AND_ERROR
+
+
+def _data_of(frame: Reply, function: int, register: int, count: int) -> bytes | None:
+    """What the reply to such a request says; None if it is none.
+
+    Raises:
+        Refused: it is an error.
+    """
+    if frame.identifier != _REPLY:
+        return None
+    said, at, size = struct.unpack_from("<BHH", frame.payload)
+    if at == register and said & _IS_ERROR:
+        error = said & ~_IS_ERROR
+        raise Refused(f"the board answers with error {error} at register {register:#06x}", error)
+    return frame.payload[5:] if (said, at, size) == (function, register, count) else None
+
+
+def _check_status(what: str, data: bytes) -> None:
+    if data[:1] not in (b"", b"\0"):
+        raise Refused(f"the board refuses to {what} with status {data[0]}", data[0])
+
+
+__all__ = ["STRANGE", "VERSION_BYTES", "HighSpeedBoard", "framing_of", "request", "version_request"]

@@ -1,0 +1,235 @@
+"""Weiss Robotics' DSACON32m, the controller of the tactile matrices of Schunk's hand SDH (six DSA matrices).
+
+Wire format: the makers' SDHLibrary (dsa.h and dsa.cpp, Schunk 2008 to 2010, as in github.com/skyellen/robwork-mirror).
+115200 baud. Frames: ``AA AA AA | command | length u16 LE | payload | CRC u16 LE`` over command, length and payload,
+with the CRC of the WTS; a frame without payload has none. An answer begins with an error u16 LE.
+
+* ``02`` -> error, matrices u16, 8 more bytes. ``0B | matrix`` -> 52 bytes: error, width and height of a cell (mm,
+  float32), columns u16, rows u16, ...
+* ``03 | flags | frames per second u16`` -> error. Flags: 80 acquire, 01 run lengths. Any rate above 0 is the highest.
+* Data: command 0, time in ms u32, flags, cells u16 of 12 bits: matrix by matrix, row by row.
+
+What is not known, and what is done about it: two programs disagree on where run-length coded data begin, so they are
+asked for only if ``rle_offset`` says it. Counts are raw: the library's factor to N/mm2 is that of one measurement.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import BusError
+from skinware.geometry import Geometry
+from skinware.sensor_types import PRESSURE, SensorType
+from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
+from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.answers import Answers, Refused
+from skinware_drivers.serial.checksums import CRC16_WEISS
+from skinware_drivers.serial.framing import Encoding, Field, Framing
+from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.splitting import Split
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_DATA, _CONTROLLER, _SENSOR, _ACQUIRE, _MATRIX = 0x00, 0x01, 0x02, 0x03, 0x0B
+_ON, _RLE = 0x80, 0x01
+_PART, _TORN = 0x100, 0x200  # what the frame of a matrix is called, plus its number; and of data that fit none
+_HEADER, _TIME = 5, 4
+_MOST_MATRICES, _MOST_CELLS = 16, 4096
+_TIMEOUT_S, _TRIES = 1.0, 4  # it is silent for some 8 s after power-up
+_FULL = 0xFFF
+_PARTS = ("proximal", "distal")
+_ANSWERS = Answers("controller", {}, dtype="<u2")
+_WHOLE = Packet(
+    sync=(0xAA, 0xAA, 0xAA),
+    length=Length(Field(4, 2), more=8),
+    maximum=8 + _HEADER + 2 * _MOST_CELLS,
+    checksum=CRC16_WEISS,
+    covers=(3, -2),
+    bare_when_empty=True,
+    identifier=Field(3),
+)
+
+
+class WeissDsaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    rle_offset: Annotated[
+        Literal[5, 11] | None,
+        Meta(description="have data run-length coded, and take them from this byte of the payload on: not certain"),
+    ] = None
+    period_ms: Annotated[
+        int, Meta(ge=10, le=1000, description="time between two frames that is to be expected, ms")
+    ] = 100
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class _Matrix(NamedTuple):
+    columns: int
+    rows: int
+    width_mm: float
+    height_mm: float
+
+    @property
+    def cells(self) -> int:
+        """How many."""
+        return self.columns * self.rows
+
+    @property
+    def grid(self) -> Grid:
+        """Its cells; with the pitch that it tells, if that can be."""
+        told = math.sqrt(self.width_mm * self.height_mm) / 1e3 if self.width_mm * self.height_mm > 0 else 0.0
+        return Grid(self.rows, self.columns, told if 0.0005 <= told <= 0.05 else PITCH_M)
+
+
+class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
+    """One controller; uid = matrix << 12 | cell, row by row."""
+
+    framing: Framing = _WHOLE
+    commands: Encoding | None = _WHOLE
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL),)
+    dtype: npt.DTypeLike = np.uint16
+    layout: Layout
+
+    def __init__(self, options: WeissDsaOptions) -> None:
+        super().__init__(options)
+        self.period_s: float = options.period_ms / 1e3
+        self.geometry: Geometry | None = None
+        self._matrices: tuple[_Matrix, ...] = ()
+
+    @property
+    def payload_size(self) -> int:
+        """Of the most cells: how many there are is known only when it was asked."""
+        return -(-_WHOLE.maximum_body // 8) * 8
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the controller for its matrices; it may still be sending for somebody before us.
+
+        Raises:
+            BusError: it does not answer, says what cannot be, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a DSA controller reports its matrices only on request: listening is not enough")
+        self.change_framing(_WHOLE)
+        await self.stop(link)
+        matrices = await self._ask_matrices(link)
+        log.info("%s: matrices of %s cells", link.bus_name, ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
+        time, frames, modules, places = DeviceTime(0, "<u4", 1e-3), [], [], []
+        for number, matrix in enumerate(matrices):
+            name, first = f"finger {number // 2 + 1} {_PARTS[number % 2]}", number << 12
+            modules.append(
+                Module(taxels(matrix.cells, first_uid=first), number, f"{matrix.rows}x{matrix.columns}", name)
+            )
+            cells = Values(_TIME, "<u2", matrix.cells)
+            frames.append(Frame(name, [Identifier(_PART | number)], [cells.end], cells, module=number, time=time))
+        for finger in range(min(len(FINGERS), -(-len(matrices) // 2))):
+            of_finger = list(enumerate(matrices))[2 * finger : 2 * finger + 2][::-1]  # the distal one is above
+            centres = Hand().down(FINGERS[finger], [matrix.grid for _, matrix in of_finger])
+            for (number, matrix), centre in zip(of_finger, centres, strict=True):
+                uids = range(number << 12, (number << 12) + matrix.cells)
+                places.append(matrix.grid.at(centre, ["pressure"], uids))
+        self.layout, self.geometry, self._matrices = Layout(frames), Geometry.joined(places), matrices
+        self.change_framing(self.split())
+        return [Patch("DSA", modules)]
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """How many matrices it has; nothing that it is asked stops one that sends."""
+        matrices = await cls._ask_matrices(link)
+        return f"Weiss DSA controller with {len(matrices)} matrices"
+
+    async def start(self, link: Link) -> None:
+        """Have it send, as fast as it can."""
+        flags = _ON | (0 if self.options.rle_offset is None else _RLE)
+        await self._ask(link, _ACQUIRE, struct.pack("<BH", flags, 30))
+
+    async def stop(self, link: Link) -> None:
+        """Make it silent."""
+        try:
+            await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
+        except Refused as error:
+            log.debug("%s: %s", link.bus_name, error)
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
+        if await self._ask_matrices(link, tries=1) == self._matrices:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
+
+    @operation(looks=True)
+    async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002
+        """Serial number, hardware and software of the controller."""
+        answer = await self._ask(link, _CONTROLLER, size=7)
+        serial_number, hardware, software = struct.unpack_from("<IBH", answer)
+        return {"serial_number": serial_number, "hardware": hardware, "software": software}
+
+    def split(self) -> Split:
+        """How the frames of this controller lie in the stream."""
+        return Split(_WHOLE, self._split)
+
+    def _split(self, identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+        """Data become a frame for each matrix, with the time."""
+        if identifier != _DATA or len(body) < _HEADER:
+            return [(identifier, body)]
+        cells = body[_HEADER:]
+        if body[_TIME] & _RLE:
+            cells = _expanded(body[self.options.rle_offset or _HEADER :])
+        ends = np.cumsum([2 * matrix.cells for matrix in self._matrices]).tolist()
+        if len(cells) != ends[-1]:
+            return [(_TORN, body)]
+        starts = [0, *ends[:-1]]
+        return [
+            (_PART | number, body[:_TIME] + cells[start:end])
+            for number, (start, end) in enumerate(zip(starts, ends, strict=True))
+        ]
+
+    @classmethod
+    async def _ask_matrices(cls, link: Link, *, tries: int = _TRIES) -> tuple[_Matrix, ...]:
+        [count] = struct.unpack_from("<H", await cls._ask(link, _SENSOR, size=2, tries=tries))
+        if not 1 <= count <= _MOST_MATRICES:
+            raise BusError(f"the controller says it has {count} matrices: that cannot be")
+        found = []
+        for number in range(count):
+            answer = await cls._ask(link, _MATRIX, bytes([number]), size=12, tries=tries)
+            width, height, columns, rows = struct.unpack_from("<ffHH", answer)
+            found.append(_Matrix(columns, rows, width, height))
+        if not all(found_one.cells for found_one in found) or sum(one.cells for one in found) > _MOST_CELLS:
+            raise BusError(f"the controller says it has matrices of {found}: that cannot be")
+        return tuple(found)
+
+    @classmethod
+    async def _ask(
+        cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int = _TRIES
+    ) -> bytes:
+        reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S, tries=tries)
+        return _ANSWERS.result(command, reply.payload, size)
+
+
+def _expanded(coded: bytes) -> bytes:
+    """Run lengths: how often in the upper four bits of each u16, what in the lower twelve."""
+    units = np.frombuffer(coded[: len(coded) // 2 * 2], "<u2")
+    return np.repeat(units & _FULL, units >> 12).astype("<u2").tobytes()
+
+
+__all__ = ["WeissDsaDriver", "WeissDsaOptions"]

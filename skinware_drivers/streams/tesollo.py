@@ -1,0 +1,301 @@
+"""Tesollo's hands DG-3F-M, DG-4F, DG-5F and DG-5F-S, with tactile or force sensors in their fingertips.
+
+Wire format: the maker's program dg_tcp_comm (github.com/tesollodelto/dg_tcp_comm, BSD-3), commits of 2026. TCP port
+502, but no Modbus. Everything is big-endian: ``length u16 of all | command u8 | ...``. There is no checksum.
+
+* ``00 03 08`` -> ``00 09 08 | model u16 | firmware 2 bytes | kind of sensors u8 | fingers that have one u8``; firmware
+  before that: ``00 07 08 | model u16 | firmware``.
+* ``length 01 | what ...`` with what = 1 joints, 2 currents, 3 temperatures, 4 velocities, 5 fingertips, 6 GPIO ->
+  ``length 01 | 8 bytes for each motor | each finger's sensor | GPIO``. The program always asks for 1 to 4, or 1 to 5.
+* ``00 03 0B``: the force sensors take what they feel as zero; the program waits for no answer.
+
+Where it contradicts itself: one commit (8c85809) expects bytes of all fingers, another (0ea90ef) only of those that
+have a sensor. The length tells which, so both are read.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.errors import BusError
+from skinware.geometry import Geometry
+from skinware.sensor_types import FORCE, PRESSURE, SensorType
+from skinware.status import Status
+from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.hand import FINGERS, Grid, Hand
+from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.link import Link, Match
+from skinware_drivers.notice import Notice
+from skinware_drivers.operations import operation
+from skinware_drivers.options import check_options
+from skinware_drivers.polling import Poll
+from skinware_drivers.serial.adapter import SerialAdapter
+from skinware_drivers.serial.framing import Encoding, Field, Framing
+from skinware_drivers.serial.length_first import LengthFirst
+from skinware_drivers.serial.splitting import Part, Split, by_length
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_ASK, _VERSION, _OFFSET = 0x01, 0x08, 0x0B
+_FINGERTIPS = 5
+_EVERYTHING = bytes((1, 2, 3, 4, _FINGERTIPS))
+_FINGER = 0x100  # what the frame of a finger is called, plus its number from 0
+_HEADER, _MOTOR = 3, 8
+_VERSIONS = frozenset({(_VERSION, 7), (_VERSION, 9)})
+_TIMEOUT_S, _TRIES = 1.0, 3
+_MOST_BODY = 20 * _MOTOR + 5 * 36
+_VENDOR = 0x7E5
+_TORQUE = tuple(
+    SensorType(f"torque_{axis}", _VENDOR << 12 | number, "N m", scale=1e-3) for number, axis in enumerate("xyz", 1)
+)
+_AXES = (*(force.measured(scale=0.1) for force in FORCE), *_TORQUE)
+Axis = Literal["force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z"]
+
+
+class _Model(NamedTuple):
+    name: str
+    motors: int
+    fingers: int
+    side: Literal["right", "left"] = "right"
+
+
+_MODELS = {
+    0x1F02: _Model("DG-1F", 3, 1),
+    0x2F03: _Model("DG-2F", 6, 2),
+    0x3F02: _Model("DG-3F-M", 12, 3),
+    0x4F02: _Model("DG-4F", 18, 4),
+    0x5F02: _Model("DG-5F", 20, 5),
+    0x5F12: _Model("DG-5F left", 20, 5, "left"),
+    0x5F22: _Model("DG-5F right", 20, 5),
+    0x5F14: _Model("DG-5F-S left", 20, 5, "left"),
+    0x5F24: _Model("DG-5F-S right", 20, 5),
+    0x5F34: _Model("DG-5F-S15 left", 15, 5, "left"),
+    0x5F44: _Model("DG-5F-S15 right", 15, 5),
+}
+
+
+class _Tip(NamedTuple):
+    """A fingertip: cells in a grid, or (without one) axes of a force sensor."""
+
+    name: str
+    dtype: str
+    values: int
+    grid: Grid | None = None
+
+    @property
+    def size(self) -> int:
+        """Bytes that a finger sends."""
+        return np.dtype(self.dtype).itemsize * self.values
+
+
+_TIPS = {
+    1: _Tip("six axes", ">i2", 6),
+    2: _Tip("three axes", ">i2", 6),
+    3: _Tip("TACTILE_M", "u1", 15, Grid(3, 5)),
+    4: _Tip("four axes", ">i2", 6),
+    5: _Tip("TACTILE_S", ">u2", 18, Grid(3, 6)),
+}
+_THREE_AXES, _FOUR_AXES = 2, 4
+
+
+class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two questions, ms")] = 10
+    timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
+    ask: Annotated[
+        Literal["everything", "fingertips"],
+        Meta(description="everything, as the maker's program does; or fingertips alone: not documented, but shorter"),
+    ] = "everything"
+    sensors: Annotated[
+        Literal[0, 1, 2, 3, 4, 5],
+        Meta(description="kind of sensors, of hands whose firmware does not tell; 0: the hand tells"),
+    ] = 0
+    cells: Annotated[
+        Literal["by_row", "by_column"], Meta(description="order in which a grid's cells are sent: not documented")
+    ] = "by_row"
+    four_axes: Annotated[
+        tuple[Axis, ...], Meta(description="what four-axis sensors measure: not documented; the others are left out")
+    ] = ()
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class _Hand(NamedTuple):
+    """What the hand says it is."""
+
+    model: int
+    firmware: bytes
+    sensors: int
+    fitted: tuple[int, ...]
+
+
+class TesolloDriver(SerialAdapter[TesolloOptions]):
+    """One hand; uid = finger << 8 | cell, or finger << 8 for the axes of a force sensor."""
+
+    framing: Framing = LengthFirst(length=Field(0, 2, "big"), identifier=Field(2), answers=_VERSIONS)
+    commands: Encoding | None = framing
+    baudrate: int = 100_000_000  # Ethernet
+    dtype: npt.DTypeLike = np.uint8
+    layout: Layout
+
+    def __init__(self, options: TesolloOptions) -> None:
+        super().__init__(options)
+        self.period_s: float = options.period_ms / 1e3
+        self.geometry: Geometry | None = None
+        self._hand: _Hand | None = None
+
+    @property
+    def payload_size(self) -> int:
+        """Of the longest answer: which hand it is, is known only when it was asked."""
+        return -(-_MOST_BODY // 8) * 8
+
+    @property
+    def polls(self) -> Sequence[Poll]:
+        """The one question."""
+        what = _EVERYTHING if self.options.ask == "everything" else bytes([_FINGERTIPS])
+        return [Poll(_ASK, what, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """Ask the hand which model it is, and which sensors it has.
+
+        Raises:
+            BusError: it does not answer, has no sensors, is not known, or must not be asked.
+        """
+        if link.listen_only:
+            raise BusError("a hand of Tesollo only answers: listening is not enough")
+        self.change_framing(type(self).framing)
+        self._hand = hand = await self._ask_version(link)
+        model, tip = _MODELS[hand.model], _TIPS[hand.sensors]
+        log.info("%s: %s, firmware %s, %s", link.bus_name, model.name, hand.firmware.hex("."), tip.name)
+        self.dtype = np.dtype(tip.dtype).newbyteorder("=")
+        self.types, names = self._channels(hand.sensors)
+        modules = [
+            Module(
+                [
+                    None if name is None else Sensor(name, finger << 8 | (cell if tip.grid else 0))
+                    for cell, name in enumerate(names)
+                ],
+                key=finger,
+                kind=f"{tip.grid.rows}x{tip.grid.columns}" if tip.grid else "force",
+                name=f"{_name_of(model, finger)} tip",
+            )
+            for finger in hand.fitted
+        ]
+        self.geometry = _geometry(model, tip, hand.fitted, [kind.name for kind in self.types])
+        self.layout = _layout(hand, tip, self._order(tip))
+        self.change_framing(self._framing(hand))
+        return [Patch(model.name, modules)]
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
+        """Its model; the question disturbs nothing."""
+        hand = await cls(TesolloOptions(sensors=1))._ask_version(link)  # noqa: SLF001
+        return f"Tesollo {_MODELS[hand.model].name}"
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Whether it answers, and still is what it was."""
+        if await self._ask_version(link, tries=1) == self._hand:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
+
+    @operation(sets_up=True)
+    async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
+        """Have the force sensors take what they feel as zero; tactile sensors have no such command."""
+        if self._hand is None or _TIPS[self._hand.sensors].grid is not None:
+            raise BusError("only hands with force sensors can be tared")
+        await link.send(_OFFSET, b"")
+
+    async def _ask_version(self, link: Link, tries: int = _TRIES) -> _Hand:
+        body = (await link.request(_VERSION, b"", Match(_VERSION), timeout_s=_TIMEOUT_S, tries=tries)).payload
+        model = int.from_bytes(body[:2], "big")
+        if model not in _MODELS:
+            raise BusError(f"the hand says it is of model {model:04X}, which is not known to have sensors")
+        sensors, fitted = (body[4], body[5]) if len(body) >= 6 else (self.options.sensors, 0xFF)
+        fingers = tuple(finger for finger in range(_MODELS[model].fingers) if fitted >> finger & 1)
+        name = f"the hand ({_MODELS[model].name})"
+        if len(body) < 6 and not sensors:
+            raise BusError(f"{name} has a firmware that does not tell which sensors it has: say sensors")
+        if sensors not in _TIPS or not fingers:
+            raise BusError(f"{name} says it has no sensors in its fingertips")
+        return _Hand(model, body[2:4], sensors, fingers)
+
+    def _channels(self, sensors: int) -> tuple[Sequence[SensorType], list[str | None]]:
+        """The types of a fingertip, and which of them each of its values is; None: what it does not measure."""
+        tip = _TIPS[sensors]
+        if tip.grid is not None:
+            most = np.iinfo(np.dtype(tip.dtype)).max
+            return (PRESSURE.measured(unit="counts", minimum=0, maximum=most),), ["pressure"] * tip.values
+        names: Sequence[str] = [axis.name for axis in _AXES]
+        if sensors == _THREE_AXES:
+            names = names[:3]
+        elif sensors == _FOUR_AXES:
+            if not self.options.four_axes:
+                raise BusError(
+                    "which four axes its sensors have is not documented: look which values stay 0, and say four_axes"
+                )
+            names = self.options.four_axes
+        types = [axis for axis in _AXES if axis.name in names]
+        return types, [axis.name if axis.name in names else None for axis in _AXES]
+
+    def _order(self, tip: _Tip) -> Sequence[int]:
+        """Channel of each value as it is sent."""
+        if tip.grid is None or self.options.cells == "by_row":
+            return range(tip.values)
+        rows, columns = tip.grid.rows, tip.grid.columns
+        return [columns * row + column for column in range(columns) for row in range(rows)]
+
+    def _framing(self, hand: _Hand) -> Framing:
+        """The answers of this hand: with bytes of all its fingers, or only of those that have a sensor."""
+        model, tip = _MODELS[hand.model], _TIPS[hand.sensors]
+        start = _MOTOR * model.motors if self.options.ask == "everything" else 0
+        answers = {}
+        for present in (hand.fitted, tuple(range(model.fingers))):
+            places = {finger: start + tip.size * place for place, finger in enumerate(present)}
+            answers[_ASK, start + tip.size * len(present)] = [
+                Part(_FINGER | finger, places[finger], places[finger] + tip.size) for finger in hand.fitted
+            ]
+        known = _VERSIONS | {(_OFFSET, _HEADER)} | {(command, _HEADER + size) for command, size in answers}
+        whole = LengthFirst(length=Field(0, 2, "big"), identifier=Field(2), answers=known)
+        return Split(whole, by_length(answers))
+
+
+def _layout(hand: _Hand, tip: _Tip, order: Sequence[int]) -> Layout:
+    most = np.iinfo(np.dtype(tip.dtype)).max
+    saturated = (Sentinel(Status.OUT_OF_RANGE, most),) if tip.grid else ()
+    values = Values(0, tip.dtype, tip.values, to=order)
+    frames = [
+        Frame(f"finger {number}", [Identifier(_FINGER | number)], [tip.size], values, module=number, flags=saturated)
+        for number in hand.fitted
+    ]
+    return Layout(frames)
+
+
+def _name_of(model: _Model, finger: int) -> str:
+    return FINGERS[finger] if model.fingers == len(FINGERS) else f"finger {finger + 1}"
+
+
+def _geometry(model: _Model, tip: _Tip, fitted: Sequence[int], type_names: Sequence[str]) -> Geometry:
+    """Nominal places: the fingers of a hand that has fewer are the first ones of a human's."""
+    grid = tip.grid or Grid(1, 1)
+    places = []
+    for finger in fitted:
+        [centre] = Hand(model.side).down(FINGERS[finger], [grid])
+        places.append(grid.at(centre, type_names, [finger << 8 | cell for cell in range(grid.rows * grid.columns)]))
+    return Geometry.joined(places)
+
+
+__all__ = ["TesolloDriver", "TesolloOptions"]

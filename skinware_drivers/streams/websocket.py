@@ -1,0 +1,188 @@
+"""A websocket server as a bus that is only read: each of its messages is a line of a stream."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from urllib.parse import urlsplit
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
+from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import Bus, FrameBatch
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.streams.address import parse_address
+
+if TYPE_CHECKING:
+    from skinware_drivers.streams.websocket_port import WebSocketPort
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_HTTP = 80
+_MOST_MESSAGES = 256
+"""Messages of a take, before other buses have their turn."""
+
+
+class WebSocketOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a bus over a websocket."""
+
+    patience_s: Annotated[
+        int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
+    ] = 5
+    silence_s: Annotated[
+        float, Meta(ge=0, le=3600, description="seconds without a message until it is connected anew; 0: never")
+    ] = 5.0
+
+
+def split_url(channel: str) -> str:
+    """Host and port of a URL.
+
+    Raises:
+        ConfigurationError: it is none of a websocket without encryption.
+    """
+    parts = urlsplit(channel)
+    if parts.scheme != "ws":
+        raise ConfigurationError(f"bus websocket:{channel}: write websocket:ws://HOST:PORT (there is no wss)")
+    return parts.netloc
+
+
+def _need_package(name: str) -> None:
+    if find_spec("websockets") is None:
+        raise ConfigurationError(f"{name}: needs the package websockets: pip install 'skinware[websocket]'")
+
+
+def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
+    """A server; see :class:`skinware_drivers.streams.websocket_serving.WebSocketServerBus`."""
+    _need_package(f"bus websocket:{channel}")
+    from skinware_drivers.streams.websocket_serving import WebSocketServerBus
+
+    return WebSocketServerBus(channel, options, **more)
+
+
+class WebSocketBus(SerialBus):
+    """A connection to a websocket server. Its name is ``websocket:ws://HOST:PORT/PATH?key=value``.
+
+    A framing finds frames in its messages, each of which ends with an end of line (those within it become spaces).
+    Messages of 64 KiB and more, and what is left of one when the connection breaks, are counted as refused. A server
+    that closes the connection, or sends no message for ``silence_s``, is connected to again, after growing pauses.
+
+    Args:
+        channel: the URL.
+        options: see :class:`WebSocketOptions`.
+        payload_size: longest body that fits into a batch.
+        listen_only: makes no difference: nothing is ever sent.
+
+    Raises:
+        ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.
+    """
+
+    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        _need_package(self.name)
+        self._options = options_from_strings(WebSocketOptions, options or {})
+        self._address = parse_address("ws", split_url(channel), default_port=_HTTP)
+        self._web: WebSocketPort | None = None
+        self._heard_ns = 0
+        self._unusable = 0
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus websocket:{self.channel}"
+
+    @property
+    def baudrate(self) -> int:
+        """0: a network has none."""
+        return 0
+
+    @property
+    def reads_natively(self) -> bool:
+        """No: the protocol is spoken in Python."""
+        return False
+
+    def open(self) -> None:
+        """Connect; a message that came with the server's greeting is read at once.
+
+        Raises:
+            BusNotAvailable: nobody answers there, or no websocket server.
+        """
+        super().open()
+        self._heard_ns = now_ns()
+        self._stay_readable(self._web is not None and self._web.waiting > 0)
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append the frames of the messages that have arrived, at most ``batch.free``.
+
+        Raises:
+            BusNotAvailable: the connection is closed; the message says by whom, and with which code.
+        """
+        taken, more = 0, True
+        for _ in range(_MOST_MESSAGES):
+            bytes_before = self.counters.framing.bytes_in
+            try:
+                taken += super().receive(batch, ordinal)
+            except BusNotAvailable:
+                self._count_unusable()
+                if not taken:
+                    raise
+                break  # the next take says it again
+            more = self.counters.framing.bytes_in != bytes_before
+            if not batch.free or not more:
+                break
+        self._count_unusable()
+        self._stay_readable(more or not batch.free)
+        return taken
+
+    def check(self) -> None:
+        """Whether the server still says something.
+
+        Raises:
+            BusNotAvailable: it has not for too long.
+        """
+        super().check()
+        silence_s = self._options.silence_s
+        if self._port is not None and silence_s and now_ns() - self._heard_ns > silence_s * NS_PER_S:
+            raise BusNotAvailable(f"{self.name}: connected, but no message for {silence_s:g} s; connecting anew")
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        """Refuse: a server is only read.
+
+        Raises:
+            BusSendError: always.
+        """
+        self.counters.send_failures += 1
+        raise BusSendError(f"{self.name} is only read ({identifier:#x}, {len(payload)} bytes)")
+
+    def _open_port(self) -> Port:
+        from skinware_drivers.streams.websocket_port import WebSocketPort
+
+        self._web = WebSocketPort(self.channel, self._address, self._options.patience_s)
+        return self._web
+
+    def _read(self, port: Port) -> None:
+        """One message."""
+        if message := port.read(0):
+            self._heard_ns = now_ns()
+            self._hear(message, self._heard_ns)
+
+    def _count_unusable(self) -> None:
+        if self._web is None or not self._web.unusable:
+            return
+        self.counters.refused += self._web.unusable
+        self._web.unusable = 0
+        if not self._unusable:
+            log.warning("%s: messages that are too long, or broke off, are left out (logged once)", self.name)
+        self._unusable += 1
+
+
+__all__ = ["WebSocketBus", "WebSocketOptions", "split_url"]

@@ -1,0 +1,67 @@
+"""Emulated skin boards behind an Ethernet board of iCub: its datagrams.
+
+Source: robotology/icub-firmware-shared; the vectors in tests/streams/test_icub_eth.py. A device is a skin board.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
+
+_ROOM = 24
+
+
+def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_us: int) -> bytes:
+    """One signal of a skin, with all its room, in a frame; another variable comes before it, as in real ones."""
+    items = b"".join(struct.pack("<H8s", len(data) << 12 | can, data) for can, data in records)
+    array = struct.pack("<BBBB", _ROOM, 10, len(records), 0) + items.ljust(10 * _ROOM, b"\0")
+    joint = struct.pack("<BBHI", 0, 4, 5, 0x0100_0004) + b"joint".ljust(8, b"\0")
+    signal = joint + struct.pack("<BBHI", 0, 4, len(array), 0x0300_0002 | skin << 8) + array
+    return struct.pack("<IHHQQ", 0x12345678, len(signal), 2, time_us, number) + signal + struct.pack("<I", 0x87654321)
+
+
+class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Which boards there are."""
+
+    boards: Annotated[tuple[int, ...], Meta(description="addresses of the skin boards")] = (1,)
+    triangles: Annotated[int, Meta(ge=1, le=12, description="triangles of each board")] = 12
+    skin: Annotated[int, Meta(ge=0, le=1, description="CAN port of the Ethernet board that they are on")] = 0
+    period_ms: Annotated[float, Meta(ge=1, le=255, description="time between two updates of a board, ms")] = 50
+
+
+class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
+    """One Ethernet board; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+
+    full_scale = 255
+    rest = 240
+    swing = -150
+    speed_mbit_s = 100
+
+    def __init__(self, options: EmulatedIcubEthOptions, **more: object) -> None:
+        self.numbers = options.boards
+        super().__init__(options, **more)
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All channels, thermal ones too."""
+        return on_a_grid(12 * self.options.triangles, 12)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """The robot's program has started it."""
+        self.start(device, now_ns)
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        """One datagram with both halves of every triangle."""
+        records = []
+        for triangle in range(self.options.triangles):
+            can = 0x400 | device.number << 4 | triangle
+            twelve = bytes(values[12 * triangle : 12 * triangle + 12])
+            records += [(can, b"\x40" + twelve[:7]), (can, b"\xc0" + twelve[7:] + b"\0\0")]
+        return [datagram(self.options.skin, records, device.cycle, device.sampled_ns // 1000)]

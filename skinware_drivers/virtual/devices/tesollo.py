@@ -1,0 +1,95 @@
+"""An emulated hand of Tesollo: its bytes on a TCP connection.
+
+Source: the maker's program dg_tcp_comm; the vectors in tests/streams/test_tesollo.py.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+
+_MOTORS_AND_FINGERS = {"1f": (3, 1), "2f": (6, 2), "3f": (12, 3), "4f": (18, 4), "5f": (20, 5), "5f15": (15, 5)}
+_MODEL = {"1f": 0x1F02, "2f": 0x2F03, "3f": 0x3F02, "4f": 0x4F02, "5f": 0x5F22, "5f15": 0x5F44}
+
+
+class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the hand is."""
+
+    hand: Annotated[Literal["1f", "2f", "3f", "4f", "5f", "5f15"], Meta(description="model")] = "5f"
+    tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes"], Meta(description="kind of sensors")] = "tactile_m"
+    fitted: Annotated[int, Meta(ge=1, le=31, description="fingers that have one, as bits")] = 31
+    pads: Annotated[bool, Meta(description="send zeros for fingers that have none")] = False
+    old: Annotated[bool, Meta(description="firmware that does not tell which sensors there are")] = False
+
+
+class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
+    """One hand, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+
+    full_scale = 250
+    swing = 220
+    speed_mbit_s = 100
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All cells of all fingers that have sensors."""
+        return on_a_grid(len(self._fitted) * self._each_has, self._each_has)
+
+    def boot(self, device: Device, now_ns: int) -> None:
+        """Wait to be asked."""
+
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """Questions say how long they are."""
+        return cut_packets(heard, b"\0", lambda part: max(3, part[1]) if len(part) > 1 else 0)
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        """What was asked for."""
+        if command[2] == 8:
+            return self._version()
+        if command[2] == 1 and 5 in command[3:]:
+            device.memory["asked"] = command[3:]
+            self.burst(device, now_ns)
+            return b""
+        if command[2] == 11:
+            device.memory["offset"] = True
+            return b""
+        return None
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        """The answer to the question that wanted them."""
+        motors, _ = _MOTORS_AND_FINGERS[self.options.hand]
+        body = b""
+        if 1 in device.memory["asked"]:
+            body += b"".join(struct.pack(">BhhhB", motor + 1, 10 * motor, -motor, 305, 0) for motor in range(motors))
+        told = iter(values)
+        for finger in range(_MOTORS_AND_FINGERS[self.options.hand][1]):
+            if finger in self._fitted:
+                body += struct.pack(self._form, *[next(told) for _ in range(self._each_has)])
+            elif self.options.pads:
+                body += bytes(struct.calcsize(self._form))
+        return [struct.pack(">HB", len(body) + 3, 1) + body]
+
+    @property
+    def _fitted(self) -> list[int]:
+        _, fingers = _MOTORS_AND_FINGERS[self.options.hand]
+        return [finger for finger in range(fingers) if self.options.fitted & 1 << finger]
+
+    @property
+    def _each_has(self) -> int:
+        return {"tactile_m": 15, "tactile_s": 18, "six_axes": 6}[self.options.tips]
+
+    @property
+    def _form(self) -> str:
+        return {"tactile_m": ">15B", "tactile_s": ">18H", "six_axes": ">6h"}[self.options.tips]
+
+    def _version(self) -> bytes:
+        model, kind = _MODEL[self.options.hand], {"tactile_m": 3, "tactile_s": 5, "six_axes": 1}[self.options.tips]
+        if self.options.old:
+            return struct.pack(">HBHBB", 7, 8, model, 1, 5)
+        return struct.pack(">HBHBBBB", 9, 8, model, 1, 5, kind, self.options.fitted)

@@ -1,0 +1,104 @@
+"""An emulated DSACON32m with the six matrices of a hand SDH: its bytes on the line.
+
+Source: the makers' SDHLibrary; the vectors in tests/serial/test_weiss_dsa.py.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device, on_a_grid
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+
+_OK, _WRONG = 0, 1
+
+
+def crc(data: bytes) -> int:
+    """Bit by bit: the polynomial of the CCITT, shifted the other way."""
+    state = 0xFFFF
+    for byte in data:
+        entry = ((state ^ byte) & 0xFF) << 8
+        for _ in range(8):
+            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
+        state = entry ^ state >> 8
+    return state
+
+
+def message(command: int, payload: bytes) -> bytes:
+    """A message as it goes over the line: without payload it has no checksum."""
+    said = struct.pack("<BH", command, len(payload)) + payload
+    return b"\xaa\xaa\xaa" + said + (struct.pack("<H", crc(said)) if payload else b"")
+
+
+class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the controller has."""
+
+    fingers: Annotated[int, Meta(ge=1, le=3, description="fingers, of two matrices each")] = 3
+    period_ms: Annotated[float, Meta(ge=10, le=1000, description="time between two frames, ms")] = 100
+
+
+class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
+    """One controller, device number 1; see :class:`skinware_drivers.virtual.serial_device.SerialEmulator`."""
+
+    full_scale = 4095
+    swing = 3500
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """All cells."""
+        return on_a_grid(sum(6 * rows for rows in self._rows), 6)
+
+    def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
+        """Commands say how long they are."""
+
+        def size(part: bytes) -> int:
+            if len(part) < 6:
+                return 0
+            length = int.from_bytes(part[4:6], "little")
+            return 8 + length if length else 6
+
+        return cut_packets(heard, b"\xaa\xaa\xaa", size)
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        """An error, and what was asked for."""
+        number, arguments = command[3], command[6:-2]
+        if arguments and crc(command[3:-2]) != int.from_bytes(command[-2:], "little"):
+            return message(number, struct.pack("<H", _WRONG))
+        if number == 0x01:
+            return message(number, struct.pack("<HIBHBBBBIH", _OK, 4711, 2, 0x0102, 0, 0, 0, 0, 0, 0)[:18])
+        if number == 0x02:
+            return message(number, struct.pack("<HHHBIB", _OK, len(self._rows), 0, 1, 42, 0))
+        if number == 0x0B and len(arguments) == 1 and arguments[0] < len(self._rows):
+            told = struct.pack("<HffHH6s2sB", _OK, 3.4, 3.4, 6, self._rows[arguments[0]], b"ABCDEF", b"", 1)
+            return message(number, told + struct.pack("<7fB", 0, 0, 0, 0, 0, 0, 4095, 0))
+        if number == 0x03 and len(arguments) == 3:
+            self.stop(device)
+            device.memory["runs"] = bool(arguments[0] & 1)
+            if arguments[0] & 0x80 and any(arguments[1:]):
+                self.start(device, now_ns)
+            return message(number, struct.pack("<H", _OK))
+        return None
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        """One message with all cells."""
+        uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000 & 0xFFFF_FFFF
+        if not device.memory.get("runs"):
+            return [message(0x00, struct.pack(f"<IB{len(values)}H", uptime_ms, 0, *values))]
+        units: list[list[int]] = []
+        for value in values:
+            if units and units[-1][1] == value and units[-1][0] < 15:
+                units[-1][0] += 1
+            else:
+                units.append([1, value])
+        coded = [times << 12 | value for times, value in units]
+        return [message(0x00, struct.pack(f"<IB{len(coded)}H", uptime_ms, 1, *coded))]
+
+    @property
+    def _rows(self) -> list[int]:
+        """Of each matrix: those near the palm are longer."""
+        return [14, 13] * self.options.fingers

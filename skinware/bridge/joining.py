@@ -49,6 +49,8 @@ _TICK_S = 0.02
 _SERVICES_NS = NS_PER_S
 """Between two questions for all services: what is told unasked may not arrive."""
 _ANSWER_S = 1.0
+_FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
+"""A large structure takes its time on a slow link: each time that none comes, it gets twice as long."""
 _CALL_S = 30.0
 _PATIENCE_NS = 3 * NS_PER_S
 """With nobody there, until it is looked at why, and until it is looked at again."""
@@ -82,12 +84,14 @@ class _Mirrored:
         pacing: how its frames come.
         generation: of which frames can be read, None before the first is known.
         held: the newest frame, where its generation or the robot's clock is not known yet.
-        asked: number of the generation that was asked for, and when.
+        asked: number of the generation that was asked for, and until when its answer may come.
+        patience_s: how long such an answer may take.
         count: the robot's number of the frame that was published last, over generations.
         newest: position of that frame.
         heard_ns: when its last frame came.
         silence: ends the subscription to its frames.
         pull_until_ns: until when an answer to the question for the newest frame may come, 0 if none is open.
+        probe_until_ns: likewise, to one for a frame as it would be pushed.
         trouble: why it is not here, if somebody was told.
     """
 
@@ -97,11 +101,13 @@ class _Mirrored:
     decoder: Decoder | None = None
     held: bytes = b""
     asked: tuple[int, int] = (0, 0)
+    patience_s: float = _FIRST_GENERATION_S
     count: int | None = None
     newest: tuple[int, int] = (0, 0)
     heard_ns: int = 0
     silence: Callable[[], None] | None = None
     pull_until_ns: int = 0
+    probe_until_ns: int = 0
     traffic: Traffic = field(default_factory=Traffic)
     trouble: str = ""
 
@@ -272,7 +278,6 @@ class Joiner:
             if told.state == "closed":
                 return
             mirrored = self._services[name] = _Mirrored(told, Pacing(0, self._mode))
-            self._listen_to(name, mirrored)
         before, mirrored.told = mirrored.told, told
         if told.generation and (mirrored.generation is None or mirrored.generation.generation != told.generation):
             self._ask_generation(name, mirrored, told.generation)
@@ -318,8 +323,16 @@ class Joiner:
             self._asking_why, self._next_why_ns = True, time_ns + _PATIENCE_NS
             threading.Thread(target=self._ask_why, name="skinware bridge diagnosis", daemon=True).start()
         for name, mirrored in self._services.items():
-            if mirrored.pacing.pulls and self._connected and time_ns > mirrored.pull_until_ns:
+            if not self._connected or mirrored.generation is None or not self.clock.is_known:
+                continue
+            if mirrored.pacing.pulls and time_ns > mirrored.pull_until_ns:
                 self._pull(name, mirrored)
+            if (
+                mirrored.pacing.wants_probe(time_ns)
+                and time_ns > mirrored.probe_until_ns
+                and mirrored.count is not None
+            ):
+                self._probe(name, mirrored)
 
     def _ask_why(self) -> None:
         why = self._why_not()
@@ -361,20 +374,25 @@ class Joiner:
 
     def _ask_generation(self, name: str, mirrored: _Mirrored, number: int) -> None:
         time_ns = now_ns()
-        if mirrored.asked[0] == number and time_ns < mirrored.asked[1] + _ANSWER_S * NS_PER_S:
+        if mirrored.asked[0] == number and time_ns < mirrored.asked[1]:
             return
-        mirrored.asked = number, time_ns
+        mirrored.asked = number, time_ns + round(mirrored.patience_s * NS_PER_S)
         self._link.ask(
             self._keys.of(name, "generation"),
-            lambda reply: self._soon(lambda: self._take_generation(name, reply.payload)),
-            timeout_s=2 * _ANSWER_S,
+            lambda reply: self._soon(lambda: self._take_generation(name, number, reply.payload)),
+            timeout_s=mirrored.patience_s,
             priority=Priority.CALLS,
             parameters={"number": number},
         )
 
-    def _take_generation(self, name: str, payload: bytes | None) -> None:
+    def _take_generation(self, name: str, number: int, payload: bytes | None) -> None:
         mirrored = self._services.get(name)
-        if mirrored is None or payload is None:
+        if mirrored is None:
+            return
+        if mirrored.asked[0] == number:
+            mirrored.asked = 0, 0
+        if payload is None:
+            mirrored.patience_s = min(2 * mirrored.patience_s, _LAST_GENERATION_S)
             return
         self._heard()
         try:
@@ -385,9 +403,10 @@ class Joiner:
             return
         if mirrored.generation is not None and generation.generation < mirrored.generation.generation:
             return
-        mirrored.generation, mirrored.decoder = generation, None
-        if mirrored.pacing.mode != "pull":
+        before, mirrored.generation, mirrored.decoder = mirrored.generation, generation, None
+        if before is None or before.period_ns != generation.period_ns:
             mirrored.pacing = Pacing(generation.period_ns, self._mode)
+            self._listen_to(name, mirrored)
         self._mirror.operations[name] = about.operations
         held, mirrored.held = mirrored.held, b""
         if held:
@@ -433,6 +452,37 @@ class Joiner:
                 "base": 0 if decoder is None else decoder.sequence,
             },
         )
+
+    def _probe(self, name: str, mirrored: _Mirrored) -> None:
+        """Ask for a frame as it would be pushed, and look how long it is on its way."""
+        asked_ns = now_ns()
+        mirrored.probe_until_ns = asked_ns + round(2 * _ANSWER_S * NS_PER_S)
+
+        def came(reply: Reply) -> None:
+            took_ns = now_ns() - asked_ns
+            self._soon(lambda: self._take_probe(name, took_ns, reply.payload))
+
+        self._link.ask(
+            self._keys.of(name, "newest"),
+            came,
+            timeout_s=2 * _ANSWER_S,
+            priority=Priority.PULLED,
+            parameters={"form": RAW},
+        )
+
+    def _take_probe(self, name: str, took_ns: int, message: bytes | None) -> None:
+        mirrored = self._services.get(name)
+        if mirrored is None:
+            return
+        mirrored.probe_until_ns = 0
+        if message is not None:
+            self._heard()
+        if mirrored.pacing.probed(now_ns(), took_ns - self.clock.round_trip_ns):
+            self._changed_mode(name, mirrored)
+
+    def _changed_mode(self, name: str, mirrored: _Mirrored) -> None:
+        self._tell({"event": "mode", "service": name, "mode": mirrored.pacing.mode})
+        self._listen_to(name, mirrored)
 
     def _take_pulled(self, name: str, message: bytes | None) -> None:
         mirrored = self._services.get(name)
@@ -498,9 +548,8 @@ class Joiner:
         mirrored.count, mirrored.newest, mirrored.heard_ns = count, frame.position, now_ns()
         mirrored.traffic.frames += 1
         mirrored.traffic.ages_ns.append(age_ns)
-        if mirrored.pacing.saw(now_ns(), age_ns, count):
-            self._tell({"event": "mode", "service": name, "mode": mirrored.pacing.mode})
-            self._listen_to(name, mirrored)
+        if mirrored.pacing.saw(now_ns(), age_ns):
+            self._changed_mode(name, mirrored)
 
     # -- requests -------------------------------------------------------------------------------------------------
 

@@ -6,11 +6,11 @@ Keys of robot R: ``skinware/1/R/``...
 ``clock``               question; answer: two i64, CLOCK_MONOTONIC ns when it came and when it was answered
 ``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes
 ``S/generation``        question with ``number``; answer: u4 size of JSON, :class:`About` as JSON, the service's file in
-                        shared memory up to its slots
+                        shared memory up to its slots, packed (zlib)
 ``S/frame``             every frame: ``RAW`` below
 ``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``: that
                         frame's sequence if the asker still has it, else 0; answered with the newest frame as soon as
-                        there is one, with nothing after half a second: ``CODED`` below
+                        there is one, with nothing after half a second: ``CODED`` below, ``RAW`` with ``form=0``
 ``S/call/OPERATION``    question with arguments as JSON; answer: :class:`Answered` as JSON
 ======================  ===============================================================================================
 
@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import re
 import struct
+import zlib
 
 import msgspec
 import numpy as np
@@ -185,7 +186,7 @@ def coded_part(message: bytes) -> memoryview:
 def generation_message(about: About, head: bytes) -> bytes:
     """What a generation is, for the link."""
     text = msgspec.json.encode(about)
-    return _SIZE.pack(len(text)) + text + head
+    return _SIZE.pack(len(text)) + text + zlib.compress(head)
 
 
 def split_generation(message: bytes) -> tuple[About, bytes]:
@@ -197,6 +198,6 @@ def split_generation(message: bytes) -> tuple[About, bytes]:
     try:
         (size,) = _SIZE.unpack_from(message)
         begin = _SIZE.size + size
-        return msgspec.json.decode(message[_SIZE.size : begin], type=About), message[begin:]
-    except (struct.error, msgspec.MsgspecError, UnicodeDecodeError) as error:
+        return msgspec.json.decode(message[_SIZE.size : begin], type=About), zlib.decompress(message[begin:])
+    except (struct.error, msgspec.MsgspecError, UnicodeDecodeError, zlib.error) as error:
         raise BridgeError(f"what a generation is cannot be read ({error})") from None

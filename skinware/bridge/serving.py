@@ -15,6 +15,7 @@ import msgspec
 from skinware.bridge.link import Link, Question
 from skinware.bridge.messages import (
     CLOCK,
+    RAW,
     About,
     Answered,
     Keys,
@@ -241,6 +242,9 @@ class Server:
 
     def _give(self, served: _Served, frame: Frame, question: Question) -> None:
         """A frame to who asked for one."""
+        if question.parameters.get("form") == str(RAW):
+            question.reply(raw_message(frame))
+            return
         who = question.parameters.get("who", "")
         base = _number(question, "base")
         puller = served.pullers.get(who)

@@ -19,6 +19,7 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
+from skinware.realtime import now_ns
 
 if TYPE_CHECKING:
     from skinware.bridge import Joiner, Server
@@ -223,7 +224,11 @@ class _Joined:
             self._known[name] = state, mode
         if self._as_json:
             clock = joiner.clock
-            told = {"error_ms": clock.error_ns / 1e6, "round_trip_ms": clock.round_trip_ns / 1e6}
+            told = {
+                "offset_ms": clock.offset_ns(now_ns()) / 1e6,
+                "error_ms": clock.error_ns / 1e6,
+                "round_trip_ms": clock.round_trip_ns / 1e6,
+            }
             print_json(
                 {
                     "event": "status",

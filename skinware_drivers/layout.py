@@ -103,6 +103,14 @@ class Sentinel:
 
 
 @dataclass(frozen=True)
+class Above:
+    """A limit that no true value exceeds: each value greater than it sets a status bit of its sensor."""
+
+    status: Status
+    limit: float
+
+
+@dataclass(frozen=True)
 class StatusBytes:
     """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
 
@@ -113,6 +121,9 @@ class StatusBytes:
 
     offset: int
     mask: Status
+
+
+AnyFlag = Flag | Sentinel | Above | StatusBytes
 
 
 @dataclass(frozen=True)
@@ -157,7 +168,7 @@ class Frame:
     values: Values | Sequence[Values] | Expand = ()
     patch: Bits | int | None = None
     module: Bits | int | None = None
-    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
+    flags: Sequence[AnyFlag] = ()
     sequence: SequenceNumber | None = None
     time: DeviceTime | None = None
     stamp: InitVar[SequenceNumber | None] = None
@@ -352,6 +363,8 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "MOST_FRAMES",
+    "Above",
+    "AnyFlag",
     "Bits",
     "Byte",
     "Condition",

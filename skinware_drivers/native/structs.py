@@ -73,7 +73,7 @@ class Flag(ctypes.Structure):
     _fields_ = [
         *_fields("form status offset type is_swapped mask n_each"),
         *_fields("each", _POINTER),
-        *_fields("is_float is_possible integer"),
+        *_fields("is_float integer"),
         *_fields("real", _REAL),
     ]
 
@@ -191,7 +191,7 @@ class Words(ctypes.Structure):
 
     _fields_ = _fields(
         "fixed_ns carried n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
-        " hastened store sequence must_leave expects_data entry kind ring read_ns"
+        " hastened store sequence must_leave expects_data entry kind ring read_ns sees_all"
     )
 
 

@@ -18,6 +18,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import (
+    Above,
     Bits,
     Byte,
     Cycle,
@@ -227,6 +228,25 @@ def test_sentinels_and_flags() -> None:
     payload = np.array([np.nan, 0.5], "<f4").tobytes()
     decoder = decode(nan, [Module(taxels(2))], "<f4", [(0x100, payload)])
     assert decoder.state.status.tolist() == [int(Status.NOT_CONNECTED), 0]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "limit", "values", "flagged"),
+    [
+        ("<u2", 4096, [4095, 4096, 4097, 65535], [0, 0, 1, 1]),
+        ("<u2", 70_000, [0, 65535], [0, 0]),
+        ("<u2", -1, [0, 65535], [1, 1]),
+        ("<i2", -5, [-6, -5, -4, 0], [0, 0, 1, 1]),
+        ("<i2", 1.5, [1, 2], [0, 1]),
+        ("<f4", 0.5, [0.5, 0.75, np.nan, np.inf], [0, 1, 0, 1]),
+    ],
+)
+def test_values_above_a_limit(dtype: str, limit: float, values: list[float], flagged: list[int]) -> None:
+    n = len(values)
+    payload = np.array(values, dtype).tobytes()
+    layout = one(Values(0, dtype, n), len(payload), flags=[Above(Status.SUSPECT, limit)])
+    decoder = decode(layout, [Module(taxels(n))], dtype, [(0x100, payload)])
+    assert decoder.state.status.tolist() == [int(Status.SUSPECT) * one_of for one_of in flagged]
 
 
 def test_flags_in_the_upper_half_of_a_long_word() -> None:

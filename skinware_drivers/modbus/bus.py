@@ -34,6 +34,8 @@ from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 DEFAULT_PORT = 502
 _TCP = "tcp://"
 _SILENT_CHARACTERS, _BITS_PER_CHARACTER = 3.5, 11
+_FRAME_BYTES = 3
+"""Around a message on a line: unit and checksum."""
 
 
 class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,6 +155,21 @@ class ModbusBus(KernelBus):
         self._wanted = replace(wanted, byte_order=byte_order, word_order=word_order)
         if self._port is not None:
             self._begin_anew()
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:
+        """How long the bytes of a cycle are on a serial line, and the silence between them, s; 0 over TCP.
+
+        Args:
+            wanted: which registers.
+            baudrate: unless the bus' name says another.
+        """
+        if self._address is not None:
+            return 0.0
+        characters = sum(
+            len(read.question) + wire.reply_size(read.question) + 2 * (_FRAME_BYTES + _SILENT_CHARACTERS)
+            for read in wanted.reads()
+        )
+        return characters * _BITS_PER_CHARACTER / (self._serial_options.baudrate or baudrate)
 
     def open(self) -> None:
         """Connect, or open the line for us alone.

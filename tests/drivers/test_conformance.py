@@ -18,6 +18,7 @@ from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
@@ -46,6 +47,7 @@ from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
+from skinware_drivers.virtual.devices.inspire import EmulatedInspire
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
@@ -337,6 +339,11 @@ class TestPaxiniHighSpeed(DriverConformance):
     def shown(self, felt: Sequence[int]) -> Sequence[int]:
         edges = np.cumsum([0, 75, 75, 27, 27])
         return [value for a, b in pairwise(edges) for value in with_resultant(felt[a:b])]
+
+
+class TestInspire(DriverConformance):
+    driver = InspireDriver
+    emulator = EmulatedInspire
 
 
 def test_every_driver_that_ships_is_here() -> None:

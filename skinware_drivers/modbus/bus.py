@@ -256,13 +256,13 @@ class ModbusBus(KernelBus):
             return False
         if self._epoll is None or self._timer is None:  # a thread is opening it
             return False
-        if self._unsent or self._left or self.tap.is_open:  # C would keep nothing of what it sends
+        if self._unsent or self._left:
             return False
         address = talk.hand_over(port.fileno())
         if address is None:
             return False
         self._timer.wake_at(None)  # C looks at the time itself
-        source.fd, source.asker = self.fileno(), address
+        source.fd, source.asker, source.tap = self.fileno(), address, self.tap.address
         return True
 
     def take_back(self, source: Source) -> None:  # noqa: ARG002

@@ -270,7 +270,7 @@ class Asker(ctypes.Structure):
     """A Modbus master."""
 
     _fields_ = [
-        *_fields("fd is_tcp is_stuck n_reads most_blocks"),
+        *_fields("fd guests_fd is_tcp is_stuck n_reads most_blocks"),
         *_fields("reads", _POINTER),
         *_fields("open next number cycle until_ns free_ns cycle_ns deadline_ns timeout_ns turnaround_ns period_ns"),
         *_fields("sent polls_missed frames bytes_in frame_bytes found"),

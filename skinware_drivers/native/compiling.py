@@ -20,7 +20,6 @@ _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _PACKED = len(_TYPES)
 _ORDERS = ("given", "any", "ends_with")
 _SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
-_MOST_MEMBERS = 32
 
 
 def why_not(decoder: Decoder) -> str:
@@ -37,9 +36,6 @@ def why_not(decoder: Decoder) -> str:
             return f"frame {frame.name!r}: floats where the driver has integers"
         if runs and runs[0].kind != "f" and np.result_type(*runs).kind == "f":
             return f"frame {frame.name!r}: values of 64 bits with and without a sign"
-    for cycle in decoder.cycles:
-        if len(cycle.members) > _MOST_MEMBERS:
-            return f"a cycle of more than {_MOST_MEMBERS} frames"
     return ""
 
 

@@ -140,6 +140,15 @@ class TestLinkerHandFingers(DriverConformance):
     emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "fingers_90"}
 
 
+class TestLinkerHandWhole(DriverConformance):
+    """Matrices in runs of five, those of the palm longer than those of the fingers."""
+
+    driver = LinkerHandDriver
+    emulator = EmulatedLinkerHand
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": True}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "hand_12x6", "palm": True}
+
+
 class TestAllegroV5(DriverConformance):
     driver = AllegroV5Driver
     emulator = EmulatedAllegroV5

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from skinware_drivers.bus import EXTENDED_FLAG
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.layout import (
+        Above,
         Bits,
         Byte,
         Cycle,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EXTENDED_FLAG",
+    "Above",
     "Bits",
     "Byte",
     "Cycle",

@@ -23,6 +23,8 @@ from skinware_drivers.numbering import DeviceTime, SequenceNumber
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can tell apart, over all its buses."""
+MOST_MEMBERS, MOST_IN_ANY_ORDER = 128, 32
+"""Frames of a cycle: in a given order, and in any other."""
 _KEY_BITS = 29
 _FEWEST_COUNTS = 4
 
@@ -103,6 +105,14 @@ class Sentinel:
 
 
 @dataclass(frozen=True)
+class Above:
+    """A limit that no true value exceeds: each value greater than it sets a status bit of its sensor."""
+
+    status: Status
+    limit: float
+
+
+@dataclass(frozen=True)
 class StatusBytes:
     """A byte of status bits for each value, in the order of the values; a frame that ends before them sets none.
 
@@ -113,6 +123,9 @@ class StatusBytes:
 
     offset: int
     mask: Status
+
+
+AnyFlag = Flag | Sentinel | Above | StatusBytes
 
 
 @dataclass(frozen=True)
@@ -157,7 +170,7 @@ class Frame:
     values: Values | Sequence[Values] | Expand = ()
     patch: Bits | int | None = None
     module: Bits | int | None = None
-    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
+    flags: Sequence[AnyFlag] = ()
     sequence: SequenceNumber | None = None
     time: DeviceTime | None = None
     stamp: InitVar[SequenceNumber | None] = None
@@ -238,12 +251,18 @@ class Cycle:
 class Layout:
     """All frames of a device, and the cycle that some of them form.
 
+    Attributes:
+        frames: kinds of frame.
+        cycle: of some of them; None: each is shown by itself.
+        more_cycles: of others of them, where not all modules send the same frames.
+
     Raises:
         ConfigurationError: what it says cannot be decoded; the message names the frame.
     """
 
     frames: Sequence[Frame]
     cycle: Cycle | None = None
+    more_cycles: Sequence[Cycle] = ()
 
     def __post_init__(self) -> None:
         names = [frame.name for frame in self.frames]
@@ -253,15 +272,29 @@ class Layout:
             _check_frame(frame)
         if len({(frame.time.unit_s, frame.time.turn) for frame in self.frames if frame.time is not None}) > 1:
             raise ConfigurationError("the frames of a device tell the time of one clock: give one unit and one modulo")
-        if self.cycle is not None:
-            members = list(self.cycle.members)
+        taken: set[str] = set()
+        for cycle in self.cycles:
+            members = list(cycle.members)
             if len(set(members)) < len(members) or not set(members) <= set(names) or len(members) < 2:
                 raise ConfigurationError(f"cycle of {members}: name at least two different frames of {names}")
-            _check_counters(self.cycle, [self.frames[names.index(name)] for name in members])
+            if taken & set(members):
+                raise ConfigurationError(f"frames {sorted(taken & set(members))} are members of two cycles")
+            most = MOST_MEMBERS if cycle.order == "given" else MOST_IN_ANY_ORDER
+            if len(members) > most:
+                raise ConfigurationError(
+                    f"a cycle of {len(members)} frames: in the order {cycle.order!r} give at most {most}"
+                )
+            taken |= set(members)
+            _check_counters(cycle, [self.frames[names.index(name)] for name in members])
+
+    @property
+    def cycles(self) -> Sequence[Cycle]:
+        """All of them; empty without one."""
+        return (*(() if self.cycle is None else (self.cycle,)), *self.more_cycles)
 
     @property
     def cycle_length(self) -> int:
-        """Number of frames in a cycle; 1 without one."""
+        """Number of frames in the cycle; 1 without one."""
         return len(self.cycle.members) if self.cycle else 1
 
     @property
@@ -352,6 +385,8 @@ def __getattr__(name: str) -> Any:
 
 __all__ = [
     "MOST_FRAMES",
+    "Above",
+    "AnyFlag",
     "Bits",
     "Byte",
     "Condition",

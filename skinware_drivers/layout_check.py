@@ -27,9 +27,9 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
     Raises:
         ConfigurationError: it does not fit; the message says what to do.
     """
-    if layout.cycle is not None:
-        _check_age(layout.cycle, layout.cycle.period_s or period_s)
-        _check_members([frame for frame in layout.frames if frame.name in layout.cycle.members])
+    for cycle in layout.cycles:
+        _check_age(cycle, cycle.period_s or period_s)
+        _check_members([frame for frame in layout.frames if frame.name in cycle.members])
     n_channels = [len(module.channels) for patch in patches for module in patch.modules]
     names = [patch.name for patch in patches for _ in patch.modules]
     addresses = Addresses(layout.frames, [range(len(layout.frames))], tables)

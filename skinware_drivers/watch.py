@@ -15,14 +15,20 @@ class Watch:
 
     Attributes:
         module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
+        sees_all: ``look`` is called with all updates; it may be set to False as soon as that is not needed any more.
     """
+
+    sees_all: bool = False
 
     def __init__(self, tables: SkinTables) -> None:
         self.tables = tables
         self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
 
     def look(self, updates: Updates) -> None:
-        """Called with updates that were just shown, if the wire may have flagged one of them."""
+        """Called with updates that were just shown, if the wire may have flagged one of them, or it ``sees_all``.
+
+        Of an update, what has no sensor (``updates.sensors`` is ``n_sensors``) has no meaning.
+        """
 
     def suspect(self, patch: int) -> None:
         """Called when a patch reports an error."""

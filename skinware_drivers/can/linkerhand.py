@@ -1,14 +1,17 @@
-"""LinkerHand L6, L7, L10, L20, L21, L25 and O6 on CAN: matrices or values of touch at each finger.
+"""LinkerHand L6, L7, L10, L20, G20, L21, L25 and O6 on CAN: matrices or values of touch at each finger.
 
 Wire format: the maker's linkerhand-python-sdk, and linkerhand-ros2-sdk with its table of commands. Classic CAN, 1
 Mbit/s. A hand has one identifier, a right one 0x27 and a left one 0x28, for all that is said to it and by it. Byte 0 is
 a command; alone it is a question, which the hand answers with the same byte and data within a millisecond. What it does
 not know it ignores.
 
-* ``B0``: kind of touch (0 none, 1 values of each finger, 2 to 4 matrices, 5 and 7 the whole hand, 6 not over CAN).
+* ``B0``: kind of touch (0 none, 1 values of each finger, 2 to 4 matrices, 5 and 7 those of the whole hand, 6 not over
+  CAN).
 * ``C0``: serial number, in frames ``C0 k`` with six characters each.
 * ``B1 C6`` to ``B5 C6``, thumb to little finger, ``B6 C6`` the palm: twelve rows of six, a frame each: ``B1 r0`` with r
   the row, and its values. ``A4`` instead of ``C6``: ten rows of four. A hand knows one of the two.
+* ``B1 17 09 01`` to ``B5 17 09 01``, ``B6 1C 14 01`` (G20, kind 5): matrices of 23 x 9 and 28 x 20 in runs of five:
+  ``B1 row column`` and values, at last ``B1 FF`` with sums. Kind 7: ``0C 06`` and ``0E 10``, 12 x 6 and 14 x 16.
 * ``20`` to ``23`` (L21, L25: ``90`` to ``93``): normal force, tangential force, its direction (255: none), proximity,
   of the five fingers.
 
@@ -32,7 +35,7 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, parts_heard
+from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
 from skinware_drivers.conditions import Identifier
 from skinware_drivers.description import Patch
 from skinware_drivers.hand import FINGERS, Hand
@@ -46,15 +49,15 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 RIGHT, LEFT = 0x27, 0x28
 _KIND_OF_TOUCH, _SERIAL_NUMBER = 0xB0, 0xC0
-_CANDIDATES = {1: ("fingers", "fingers_90"), **dict.fromkeys((2, 3, 4), ("12x6", "10x4"))}
-_UNREADABLE = {
-    0: "it has none",
-    5: "the whole hand in one matrix",
-    6: "not over CAN",
-    7: "the whole hand in one matrix",
+_CANDIDATES = {
+    1: ("fingers", "fingers_90"),
+    **dict.fromkeys((2, 3, 4), ("12x6", "10x4")),
+    5: ("hand_23x9",),
+    7: ("hand_12x6",),
 }
-_ANSWER_S, _REPLY_S, _SERIAL_S = 0.03, 0.02, 0.05
-_TRIES = 2
+_UNREADABLE = {0: "it has none", 6: "not over CAN"}
+_ANSWER_S, _SERIAL_S = 0.03, 0.05
+_TRIES, _LONGEST_QUESTION = 2, 5
 
 
 class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,13 +67,19 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
         tuple[int, ...], msgspec.Meta(description="identifiers of the hands; default: 0x27 and 0x28, as far as there")
     ] = ()
     touch: Annotated[
-        Literal["auto", "12x6", "10x4", "fingers", "fingers_90"],
-        msgspec.Meta(description="matrices of this size, or values of each finger (commands 20 or 90); auto: find out"),
+        Literal["auto", "12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],
+        msgspec.Meta(
+            description="matrices of this size, values of each finger (commands 20 or 90), or matrices of the whole"
+            " hand with fingers of this size; auto: find out"
+        ),
     ] = "auto"
     ask: Annotated[
         bool, msgspec.Meta(description="ask the hands for their touch; only where no other program does")
     ] = False
-    period_ms: Annotated[int, msgspec.Meta(description="time between two updates, ms", ge=20, le=2000)] = 50
+    period_ms: Annotated[
+        Annotated[int, msgspec.Meta(ge=20, le=2000)] | None,
+        msgspec.Meta(description="time between two updates, ms; default: 50, of the whole hand 100"),
+    ] = None
     learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns who is there, s", gt=0)] = 1.0
 
     def __post_init__(self) -> None:
@@ -107,6 +116,8 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         super().__init__(options)
         usual = "12x6" if options.touch == "auto" else options.touch
         self._take({hand: _Found(usual, FINGERS) for hand in self._wanted})
+        if options.touch == "auto":
+            self.layout = every_layout(Identifier.covering(self._wanted))
 
     @property
     def _wanted(self) -> Sequence[int]:
@@ -117,11 +128,10 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         """All parts of all hands, each when the reply before has ended; nothing, if another program asks."""
         if not self.options.ask:
             return ()
-        timeout_s = min(_REPLY_S, self.period_s)
         return [
-            Poll(hand, payload, self.period_s, Match(hand, prefix=last, shortest=shortest), timeout_s)
+            Poll(hand, one.payload, self.period_s, _end_of_answer(hand, one), min(one.patience_s, self.period_s))
             for hand, questions in self._questions.items()
-            for payload, last, shortest in questions
+            for one in questions
         ]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -191,6 +201,8 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         self._found = dict(found)
         self._questions = {hand: touch.questions(of.parts) for hand, of in found.items()}
         self.types = touch.types
+        if self.options.period_ms is None:
+            self.period_s = touch.period_s
         self.layout = touch.layout(Identifier.covering(list(found)))
         self.patches = [Patch(_name(hand), touch.modules(hand, of.parts), hand) for hand, of in found.items()]
         self.geometry = Geometry.joined([touch.geometry(hand, of.parts, _side(hand)) for hand, of in found.items()])
@@ -207,16 +219,12 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         """The hands that told of touch; of one that told of it in several ways, what was told most."""
         found = {}
         for hand in wanted:
-            frames = [(one.first_byte, one.length, n) for one, n in heard.items() if one.identifier == hand]
-            told = {
-                name: sum(n for first, length, n in frames if touch.knows(first, length))
-                for name, touch in TOUCH.items()
-            }
-            name = max(told, key=lambda name: told[name]) if self.options.touch == "auto" else self.options.touch
-            if told[name]:
-                found[hand] = _Found(
-                    name, parts_heard(TOUCH[name], {first for first, length, _ in frames if length > 2})
-                )
+            frames = {(one.first_byte, one.length): n for one, n in heard.items() if one.identifier == hand}
+            known = {name: touch.known(frames) for name, touch in TOUCH.items()}
+            name = max(known, key=lambda name: known[name]) if self.options.touch == "auto" else self.options.touch
+            if known[name]:
+                commands = {first for first, length in frames if length > _LONGEST_QUESTION}
+                found[hand] = _Found(name, parts_heard(TOUCH[name], commands))
         return found
 
     async def _ask_hand(self, link: Link, hand: int) -> _Found | None:
@@ -259,12 +267,16 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
 
 async def _answers(link: Link, hand: int, question: Question) -> bool:
     """Whether a hand answers a question for touch to the end."""
-    last = Match(hand, prefix=question.last, shortest=question.shortest)
+    last, timeout_s = _end_of_answer(hand, question), max(_ANSWER_S, question.patience_s)
     try:
-        await link.request(hand, question.payload, last, timeout_s=_ANSWER_S, tries=_TRIES)
+        await link.request(hand, question.payload, last, timeout_s=timeout_s, tries=_TRIES)
     except HandshakeTimeout:
         return False
     return True
+
+
+def _end_of_answer(hand: int, question: Question) -> Match:
+    return Match(hand, prefix=question.last, shortest=question.shortest)
 
 
 def _name(hand: int) -> str:

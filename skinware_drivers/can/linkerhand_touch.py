@@ -6,7 +6,7 @@ All that is said to a hand and by it has one identifier; byte 0 tells what it is
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,14 +15,18 @@ from skinware.sensor_types import PRESSURE, PROXIMITY, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Sensor, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Bits, Byte, Cycle, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Bits, Byte, Condition, Cycle, Frame, Identifier, Layout, Sentinel, Values
 
 PARTS = (*FINGERS, "palm")
+Beginnings = Mapping[tuple[int, int], int]
+"""How many frames of a hand begin with this byte and have this length."""
 MATRIX = 0xB1
 """Command for the thumb's matrix; the next ones are for the others of ``PARTS``."""
 NO_DIRECTION = 255
 _HAND, _COMMAND = Bits(0, 11), Bits(0, 8, byte=0)
-_LONGEST_REPLY_S = 0.008
+_LONGEST_REPLY_S, _LONGEST_RUNS_S, _RUNS_WAIT_S = 0.008, 0.02, 0.05
+_RUN, _SUMS, _ASKS_FOR_RUNS = 5, 0xFF, 4
+_DENSE_PITCH_M = 0.0015
 _VENDOR = 0x27027 << 12
 TANGENTIAL = SensorType("tangential_force", _VENDOR | 1, "counts", minimum=0, maximum=255)
 DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0, maximum=254)
@@ -36,11 +40,13 @@ class Question(NamedTuple):
         payload: of the question.
         last: how the last frame of the reply begins.
         shortest: bytes of that frame, at least: more than other programs' questions have.
+        patience_s: how long the reply is waited for.
     """
 
     payload: bytes
     last: bytes
     shortest: int
+    patience_s: float = 0.02
 
 
 class Touch(ABC):
@@ -48,9 +54,11 @@ class Touch(ABC):
 
     Attributes:
         types: of the sensors.
+        period_s: a usual time between two updates.
     """
 
     types: Sequence[SensorType]
+    period_s = 0.05
 
     @abstractmethod
     def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
@@ -69,8 +77,8 @@ class Touch(ABC):
         """Nominal places of a hand's sensors."""
 
     @abstractmethod
-    def knows(self, first_byte: int, length: int) -> bool:
-        """Whether a frame that begins so is told in this way."""
+    def known(self, heard: Beginnings) -> int:
+        """How many of a hand's frames are told in this way."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +106,7 @@ class Matrices(Touch):
         """A matrix is shown when all its rows have come, the first one first."""
         rows = [
             Frame(
-                f"row {row}",
+                f"row {row} of {self.rows}",
                 [identifier, Byte(1, row << 4)],
                 [2 + self.columns],
                 Values(2, "u1", self.columns, to=range(row * self.columns, (row + 1) * self.columns)),
@@ -122,13 +130,83 @@ class Matrices(Touch):
         centres = [side.down(part, [grid])[0] for part in parts]
         return Geometry.joined([grid.at(c, [FORCE.name], uid) for c, uid in zip(centres, uids, strict=True)])
 
-    def knows(self, first_byte: int, length: int) -> bool:
-        """Rows."""
-        return MATRIX <= first_byte < MATRIX + len(PARTS) and length == 2 + self.columns
+    def known(self, heard: Beginnings) -> int:
+        """Rows; none if a program asks for runs, which look like rows of six."""
+        return 0 if _of_matrices(heard, _ASKS_FOR_RUNS) else _of_matrices(heard, 2 + self.columns)
 
     @property
     def _kind(self) -> str:
         return f"{self.rows}x{self.columns}"
+
+
+@dataclass(frozen=True)
+class RunMatrices(Touch):
+    """A matrix for each part, in runs of five values that go on from one row to the next (third generation, G20).
+
+    Attributes:
+        finger: rows and columns of a finger's.
+        palm: rows and columns of the palm's.
+    """
+
+    finger: tuple[int, int]
+    palm: tuple[int, int]
+    types = (FORCE,)
+    period_s = 0.1
+
+    def modules(self, hand: int, parts: Sequence[str]) -> list[Module]:
+        """One for each part."""
+        found = []
+        for part in parts:
+            rows, columns = self._size(part)
+            sensors = taxels(rows * columns, first_uid=_uid(hand, part))
+            found.append(Module(sensors, MATRIX + PARTS.index(part), f"{rows}x{columns}", part))
+        return found
+
+    def layout(self, identifier: Identifier) -> Layout:
+        """A matrix is shown when all its runs have come, the first one first. Frames of sums are passed over."""
+        is_palm = Byte(0, MATRIX + PARTS.index("palm"))
+        fingers = self._runs("finger", [identifier], *self.finger)
+        palm = self._runs("palm", [identifier, is_palm], *self.palm)
+        of_finger = Cycle([run.name for run in fingers], _LONGEST_RUNS_S)
+        of_palm = Cycle([run.name for run in palm], 2 * _LONGEST_RUNS_S)
+        return Layout([_other(identifier), *fingers, *palm], of_finger, [of_palm])
+
+    def questions(self, parts: Sequence[str]) -> list[Question]:
+        """One for each part, with the byte that makes the hand end its answer with sums."""
+        questions = []
+        for part in parts:
+            command = MATRIX + PARTS.index(part)
+            questions.append(Question(bytes((command, *self._size(part), 1)), bytes((command, _SUMS)), 4, _RUNS_WAIT_S))
+        return questions
+
+    def geometry(self, hand: int, parts: Sequence[str], side: Hand) -> Geometry:
+        """A grid on each part."""
+        found = []
+        for part in parts:
+            rows, columns = self._size(part)
+            grid, first = Grid(rows, columns, _DENSE_PITCH_M), _uid(hand, part)
+            found.append(grid.at(side.down(part, [grid])[0], [FORCE.name], range(first, first + rows * columns)))
+        return Geometry.joined(found)
+
+    def known(self, heard: Beginnings) -> int:
+        """Runs, if they are about as many for each question as those of a finger; a sum may look like a question."""
+        runs, questions = _of_matrices(heard, 3 + _RUN), _of_matrices(heard, _ASKS_FOR_RUNS)
+        of_finger = self.finger[0] * self.finger[1] // _RUN
+        return runs if 0.4 * of_finger * questions <= runs <= 1.1 * of_finger * questions else 0
+
+    def _size(self, part: str) -> tuple[int, int]:
+        return self.palm if part == "palm" else self.finger
+
+    @staticmethod
+    def _runs(name: str, when: Sequence[Condition], rows: int, columns: int) -> list[Frame]:
+        count = rows * columns
+        found = []
+        for first in range(0, count, _RUN):
+            row, column = divmod(first, columns)
+            values = Values(3, "u1", min(_RUN, count - first), to=range(first, min(first + _RUN, count)))
+            at = Byte(1, row), Byte(2, column)
+            found.append(Frame(f"{name} {row}, {column}", [*when, *at], [values.end], values, _HAND, _COMMAND))
+        return found
 
 
 @dataclass(frozen=True)
@@ -159,8 +237,10 @@ class FingerValues(Touch):
         return Layout(
             [
                 _other(identifier),
-                Frame("values", is_reply, lengths, values, _HAND, _COMMAND),
-                Frame("directions", (*is_reply, is_direction), lengths, values, _HAND, _COMMAND, [none]),
+                Frame(f"values {self.command:X}", is_reply, lengths, values, _HAND, _COMMAND),
+                Frame(
+                    f"directions {self.command:X}", (*is_reply, is_direction), lengths, values, _HAND, _COMMAND, [none]
+                ),
             ]
         )
 
@@ -176,9 +256,10 @@ class FingerValues(Touch):
         fingers = [part for part in parts if part in FINGERS]
         return Geometry.joined([grid.at(side.down(f, [grid])[0], names, [_uid(hand, f)]) for f in fingers])
 
-    def knows(self, first_byte: int, length: int) -> bool:
+    def known(self, heard: Beginnings) -> int:
         """Values of five or six fingers."""
-        return self.command <= first_byte < self.command + len(self.types) and length in (6, 7)
+        commands = range(self.command, self.command + len(self.types))
+        return sum(n for (first, length), n in heard.items() if first in commands and length in (6, 7))
 
 
 TOUCH: dict[str, Touch] = {
@@ -186,8 +267,22 @@ TOUCH: dict[str, Touch] = {
     "10x4": Matrices(10, 4),
     "fingers": FingerValues(0x20),
     "fingers_90": FingerValues(0x90),
+    "hand_23x9": RunMatrices((23, 9), (28, 20)),
+    "hand_12x6": RunMatrices((12, 6), (14, 16)),
 }
 """By the names of the option ``touch``."""
+
+
+def every_layout(identifier: Identifier) -> Layout:
+    """All frames that make a hand known, whatever its touch is like: to hold against what is heard, not to decode."""
+    layouts = [touch.layout(identifier) for touch in TOUCH.values() if not isinstance(touch, RunMatrices)]
+    frames = [frame for layout in layouts for frame in layout.frames[1:]]
+    return Layout([_other(identifier), *frames], None, [cycle for layout in layouts for cycle in layout.cycles])
+
+
+def _of_matrices(heard: Beginnings, length: int) -> int:
+    """How many frames of this length are about the matrices of fingers."""
+    return sum(heard.get((MATRIX + at, length), 0) for at in range(len(FINGERS)))
 
 
 def parts_heard(touch: Touch, commands: Collection[int]) -> list[str]:
@@ -214,9 +309,12 @@ __all__ = [
     "PARTS",
     "TANGENTIAL",
     "TOUCH",
+    "Beginnings",
     "FingerValues",
     "Matrices",
     "Question",
+    "RunMatrices",
     "Touch",
+    "every_layout",
     "parts_heard",
 ]

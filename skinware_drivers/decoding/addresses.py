@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Bits, Frame, Identifier
+from skinware_drivers.layout import Bits, Byte, Frame, Identifier
 
 STANDARD_IDENTIFIERS = 1 << 11
 _FIELD_BITS = 29  # of a patch's or module's key
@@ -89,7 +89,13 @@ class Addresses:
         byte = frame.module_byte
         if byte is None:
             return sorted(entry for entry in found if entry < self._n_modules)
-        keys = range(1 << byte.width)
+        same_byte = [c for c in frame.when if isinstance(c, Byte) and c.offset == byte.byte]
+        field = (1 << byte.width) - 1 << byte.shift
+        keys = [
+            key
+            for key in range(1 << byte.width)
+            if not any((key << byte.shift ^ condition.value) & condition.mask & field for condition in same_byte)
+        ]
         return sorted(
             module
             for (patch, key), module in self._tables.module_key.items()

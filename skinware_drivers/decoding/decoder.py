@@ -27,7 +27,7 @@ from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
 from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import MOST_FRAMES, Byte, Frame, Layout
+from skinware_drivers.layout import MOST_FRAMES, Byte, Cycle, Frame, Layout
 from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.samples import Samples
 
@@ -223,21 +223,20 @@ class Decoder:
     # -- compiling ----------------------------------------------------------------------------------------------
 
     def _compile_assemblies(self, layouts: Sequence[tuple[Layout, float | None, int]]) -> None:
-        members_of: list[list[int]] = []
-        for layout, _, first in layouts:
-            names = [frame.name for frame in layout.frames]
-            members_of.append([first + names.index(name) for name in layout.cycle.members] if layout.cycle else [])
-        in_cycles = {number for members in members_of for number in members}
+        cycles: list[tuple[Cycle, list[int], float | None]] = []
+        for layout, period_s, first in layouts:
+            number_of = {frame.name: first + number for number, frame in enumerate(layout.frames)}
+            cycles += [(cycle, [number_of[name] for name in cycle.members], period_s) for cycle in layout.cycles]
+        in_cycles = {number for _, members, _ in cycles for number in members}
         alone = [number for number in range(len(self.frames)) if number not in in_cycles]
-        groups = [[number] for number in alone] + [members for members in members_of if members]
+        groups = [[number] for number in alone] + [members for _, members, _ in cycles]
         width = max((sum(len(self.kinds[number].channels) for number in group) for group in groups), default=0)
         made = [Assembly([self.kinds[n] for n in group], self.tables, width) for group in groups]
         self.alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
         self.cycles = [
-            CompiledCycle(layout.cycle, self.frames, members, next(of_cycles), self.tables, period_s)
-            for (layout, period_s, _), members in zip(layouts, members_of, strict=True)
-            if layout.cycle is not None
+            CompiledCycle(cycle, self.frames, members, next(of_cycles), self.tables, period_s)
+            for cycle, members, period_s in cycles
         ]
         self.width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
@@ -360,7 +359,7 @@ class Decoder:
 
     def _carry(self, batch: FrameBatch, rows: Indices) -> None:
         kept = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]
-        if self._carried is not None:  # of another layout's cycle, that is to say of another bus
+        if self._carried is not None:  # of another cycle, that is to say of other modules
             wire, time_ns, bus = self._carried
             kept = np.concatenate([wire, kept[0]]), np.concatenate([time_ns, kept[1]]), np.concatenate([bus, kept[2]])
         self._carried = kept

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware_drivers.description import SkinTables
-from skinware_drivers.layout import Expand, Flag, Frame, Packed, Sentinel, StatusBytes, Values
+from skinware_drivers.layout import Above, Expand, Flag, Frame, Packed, Sentinel, StatusBytes, Values
 
 log: logging.Logger = logging.getLogger("skinware.driver.expand")
 
@@ -137,9 +137,8 @@ class FrameKind:
         """
         words: dict[tuple[int, str], tuple[Indices, Words]] = {}  # several flags share one
         for flag in self.frame.flags:
-            if isinstance(flag, Sentinel):
-                hit = np.isnan(raw) if flag.value != flag.value else raw == flag.value
-                status[:, columns] |= np.where(hit, np.uint8(flag.status), np.uint8(0))
+            if isinstance(flag, Sentinel | Above):
+                status[:, columns] |= np.where(_hit(flag, raw), np.uint8(flag.status), np.uint8(0))
                 continue
             if isinstance(flag, StatusBytes):
                 end = flag.offset + raw.shape[1]
@@ -161,6 +160,15 @@ def _read_run(run: Values, payload: Bytes) -> npt.NDArray[Any]:
         return _unpack(data, run.count, run.dtype)
     dtype = np.dtype(run.dtype)
     return data if dtype == np.uint8 else np.ascontiguousarray(data).view(dtype)
+
+
+def _hit(flag: Sentinel | Above, raw: npt.NDArray[Any]) -> Flags:
+    """Which values a flag means."""
+    if isinstance(flag, Above):
+        above: Flags = raw > flag.limit
+        return above
+    equal: Flags = np.isnan(raw) if flag.value != flag.value else raw == flag.value
+    return equal
 
 
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, Words]:

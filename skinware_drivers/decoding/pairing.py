@@ -83,13 +83,22 @@ class Pairing:
             judged = self._punctuality.judge(kinds, time_ns[members])
             soon[members], doubtful[members] = judged.soon, judged.doubtful
             out_of_time[members] = judged.soon | judged.held_up
-        starts, untrusted = self._find_cycles(shared, place, out_of_time, doubtful)
+        if self.order == "given":
+            begun = self._find_begun(shared, place)
+            starts, untrusted = self._trust(np.flatnonzero(begun & (place == n - 1)) - n + 1, out_of_time, doubtful)
+        else:
+            starts, untrusted = self._find_cycles(shared, place, out_of_time, doubtful)
         in_time = time_ns[starts + n - 1] - time_ns[starts] <= self.maximum_age_ns
         used = np.zeros(len(order), bool)
         late, starts = np.union1d(starts[~in_time], untrusted), self._apart(starts[in_time])
         windows = starts[:, None] + np.arange(n)
         used[windows] = True
-        waiting = self._still_hoping(shared, place, group, used)
+        ends = np.flatnonzero(np.append(group[1:] != group[:-1], True)) if len(group) else np.zeros(0, np.int64)
+        if self.order == "given":
+            ends = ends[begun[ends] & (place[ends] < n - 1)]
+            waiting = np.concatenate([np.arange(end - int(place[end]), end + 1) for end in ends.tolist()] or [ends])
+        else:
+            waiting = self._still_hoping(shared, place, ends, used)
         is_orphan = is_member & ~used
         is_orphan[waiting] = False
         late = self._apart(late[is_orphan[late[:, None] + np.arange(n)].all(axis=1)])
@@ -107,32 +116,40 @@ class Pairing:
         rows = np.concatenate([rows, np.repeat(orphans[:, None], n, axis=1)])[by_arrival]
         return Pairs(rows, by_arrival < len(last), order[late], np.sort(order[waiting]), order[soon & is_orphan])
 
+    def _find_begun(self, shared: Indices, place: Places) -> Flags:
+        """(m,) bool: right before a member stand all those that come before it in the given order."""
+        at = np.arange(len(place))
+        follows = np.zeros(len(place), bool)
+        follows[1:] = (place[1:] == place[:-1] + 1) & (shared[1:] == shared[:-1])
+        chain = np.maximum.accumulate(np.where(follows, 0, at))  # where the chain of each begins
+        return (place < self._n) & (at - place >= chain)
+
+    def _trust(self, starts: Indices, out_of_time: Flags, doubtful: Flags) -> tuple[Indices, Indices]:
+        """Of the cycles that begin there, those that can be trusted; and those whose frames came out of time."""
+        out, doubts = (np.append(0, np.cumsum(flags)) for flags in (out_of_time, doubtful))
+        untrusted = out[starts + self._n] > out[starts]
+        untrusted |= doubts[starts + self._n] - doubts[starts] == self._n
+        return starts[~untrusted], starts[untrusted]
+
     def _find_cycles(
         self, shared: Indices, place: Places, out_of_time: Flags, doubtful: Flags
     ) -> tuple[Indices, Indices]:
-        """First rows of runs of n frames that are a whole cycle; only those of order ``any`` can overlap.
+        """First rows of runs of n frames that are a whole cycle, in an order that is not given; they can overlap.
 
         Returns:
             Those that can be trusted; and those whose frames came out of time.
         """
         n = self._n
         m = max(0, len(shared) - n + 1)
-        whole, all_doubtful, some_out = np.ones(m, bool), np.ones(m, bool), np.zeros(m, bool)
+        whole = np.ones(m, bool)
         seen = np.zeros(m, np.uint32)
         for j in range(n):
             whole &= shared[j : m + j] == shared[:m]
-            some_out |= out_of_time[j : m + j]
-            all_doubtful &= doubtful[j : m + j]
-            if self.order == "given":
-                whole &= place[j : m + j] == j
-            else:
-                seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
-        if self.order != "given":
-            whole &= seen == (1 << n) - 1
+            seen |= np.left_shift(np.uint32(1), place[j : m + j].astype(np.uint32))
+        whole &= seen == (1 << n) - 1
         if self.order == "ends_with":
             whole &= place[n - 1 : m + n - 1] == n - 1
-        untrusted = some_out | all_doubtful
-        return np.flatnonzero(whole & ~untrusted), np.flatnonzero(whole & untrusted)
+        return self._trust(np.flatnonzero(whole), out_of_time, doubtful)
 
     def _apart(self, starts: Indices) -> Indices:
         """Of runs that overlap, the first."""
@@ -144,12 +161,9 @@ class Pairing:
                 chosen.append(start)
         return np.array(chosen, np.int64)
 
-    def _still_hoping(self, shared: Indices, place: Places, group: Groups, used: npt.NDArray[np.bool_]) -> Indices:
-        """Rows at the end of each group that may become a cycle with what comes next."""
+    def _still_hoping(self, shared: Indices, place: Places, ends: Indices, used: npt.NDArray[np.bool_]) -> Indices:
+        """Rows at the end of each group that may become a cycle with what comes next, in an order that is not given."""
         n = self._n
-        if not len(shared):
-            return np.zeros(0, np.int64)
-        ends = np.concatenate([np.flatnonzero(group[1:] != group[:-1]), [len(group) - 1]])
         ends = ends[(place[ends] < n) & ~used[ends]]
         if not len(ends):
             return np.zeros(0, np.int64)
@@ -161,8 +175,6 @@ class Pairing:
             for j in range(length):
                 at = np.maximum(first + j, 0)
                 fits &= (shared[at] == shared[ends]) & ~used[at] & (place[at] < n)
-                if self.order == "given":
-                    fits &= place[at] == j
                 bit = np.left_shift(np.uint32(1), place[at].astype(np.uint32))
                 fits &= (seen & bit) == 0
                 seen |= bit

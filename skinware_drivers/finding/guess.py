@@ -141,7 +141,7 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
     layout: Layout | None = getattr(adapter, "layout", None)
     if layout is None or not len(wire):
         return None
-    members = set(layout.cycle.members) if layout.cycle else set()
+    cycles = [set(cycle.members) for cycle in layout.cycles]
     without_values = {frame.name for frame in layout.frames if _has_no_values(frame)}
     heard: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
     bits = 0.0
@@ -151,18 +151,15 @@ def _match(name: str, adapter: AnyAdapter, wire: npt.NDArray[Any]) -> _Match | N
         keys = _patch_keys(frame, wire["identifier"])
         for key in np.unique(keys[rows]).tolist():
             heard.setdefault(key, {})[frame.name] = rows & (keys == key)
-    whole = {
-        key: frames
-        for key, frames in heard.items()
-        if members <= set(frames) or (set(frames) - members - without_values)
-    }
+    whole: dict[int, dict[str, npt.NDArray[np.bool_]]] = {}
+    for key, frames in heard.items():
+        lacking = {name for members in cycles if not members <= frames.keys() for name in members}
+        known = {name: rows for name, rows in frames.items() if name not in lacking}
+        if known.keys() - without_values:
+            whole[key] = known
     if not whole:
         return None
-    rows = np.zeros(len(wire), bool)
-    for frames in whole.values():
-        for name_of_frame, of_frame in frames.items():
-            if name_of_frame not in members or members <= set(frames):
-                rows |= of_frame
+    rows = np.logical_or.reduce([of_frame for frames in whole.values() for of_frame in frames.values()])
     return _Match(name, adapter, rows, frozenset(whole), bits / len(wire))
 
 

@@ -13,7 +13,7 @@ from skinware.errors import BusError, ConfigurationError
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.conditions import Identifier
-from skinware_drivers.layout import Flag, Frame, Layout, Sentinel, StatusBytes, Values
+from skinware_drivers.layout import AnyFlag, Frame, Layout, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.bus import ModbusBus
@@ -23,6 +23,8 @@ from skinware_drivers.options import OptionsT
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
 
 _MOST_BLOCKS = 200
+_UNHURRIED = 1.25
+"""Of the time that bytes take: devices take some before they answer."""
 
 
 class ModbusException(BusError):
@@ -53,11 +55,12 @@ class ModbusAdapter(Adapter[OptionsT]):
         address_step: by how much the address grows from one register to the next: 2 where addresses count bytes.
         largest_gap: registers that nobody wants, but that are read along rather than ask twice.
         most_registers: of a read.
+        follows_line: on a serial line that is too slow for ``period_s``, take as long as it needs.
     """
 
     medium: ClassVar[str] = "modbus"
     registers: Sequence[Registers] = ()
-    flags: Sequence[Flag | Sentinel | StatusBytes] = ()
+    flags: Sequence[AnyFlag] = ()
     timeout_s: float = 0.1
     turnaround_s: float | None = None
     baudrate: int = DEFAULT_BAUDRATE
@@ -66,6 +69,7 @@ class ModbusAdapter(Adapter[OptionsT]):
     address_step: int = 1
     largest_gap: int = 16
     most_registers: int = wire.MOST_REGISTERS
+    follows_line: bool = False
     _line: ModbusBus | None = None
 
     def __init__(self, options: OptionsT) -> None:
@@ -120,6 +124,8 @@ class ModbusAdapter(Adapter[OptionsT]):
         if registers:
             self.layout = self._layout()
         if self._line is not None:
+            if self.follows_line:
+                self.period_s = max(self.period_s, _UNHURRIED * self._line.cycle_s(self.wanted, self.baudrate))
             self._line.use(self.wanted, self.period_s, self.timeout_s, self.turnaround_s, self.baudrate)
 
     async def probe(self, link: Link, patch: object) -> bool:  # noqa: ARG002

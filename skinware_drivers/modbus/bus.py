@@ -34,6 +34,8 @@ from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 DEFAULT_PORT = 502
 _TCP = "tcp://"
 _SILENT_CHARACTERS, _BITS_PER_CHARACTER = 3.5, 11
+_FRAME_BYTES = 3
+"""Around a message on a line: unit and checksum."""
 
 
 class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -154,6 +156,21 @@ class ModbusBus(KernelBus):
         if self._port is not None:
             self._begin_anew()
 
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:
+        """How long the bytes of a cycle are on a serial line, and the silence between them, s; 0 over TCP.
+
+        Args:
+            wanted: which registers.
+            baudrate: unless the bus' name says another.
+        """
+        if self._address is not None:
+            return 0.0
+        characters = sum(
+            len(read.question) + wire.reply_size(read.question) + 2 * (_FRAME_BYTES + _SILENT_CHARACTERS)
+            for read in wanted.reads()
+        )
+        return characters * _BITS_PER_CHARACTER / (self._serial_options.baudrate or baudrate)
+
     def open(self) -> None:
         """Connect, or open the line for us alone.
 
@@ -239,13 +256,13 @@ class ModbusBus(KernelBus):
             return False
         if self._epoll is None or self._timer is None:  # a thread is opening it
             return False
-        if self._unsent or self._left or self.tap.is_open:  # C would keep nothing of what it sends
+        if self._unsent or self._left:
             return False
         address = talk.hand_over(port.fileno())
         if address is None:
             return False
         self._timer.wake_at(None)  # C looks at the time itself
-        source.fd, source.asker = self.fileno(), address
+        source.fd, source.asker, source.tap = self.fileno(), address, self.tap.address
         return True
 
     def take_back(self, source: Source) -> None:  # noqa: ARG002

@@ -19,7 +19,7 @@ from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import CRC16_MODBUS
 
 _MOST_BLOCKS = 32
-"""Frames that one reply may complete: a batch has room for them."""
+"""Frames that end in one read: a batch has room for them."""
 _ROOM = 1024
 
 
@@ -55,7 +55,7 @@ class NativeMaster(Master):
         if not self._can or asks_otherwise or self._holds_back or (self._open is not None and self._open.read < 0):
             return None
         asker, counters = self._asker, self._counters
-        asker.fd, asker.is_stuck, asker.size = fd, 0, 0
+        asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, -1, 0, 0
         asker.open, asker.next = -1, self._next
         if self._open is not None:
             asker.open, asker.until_ns = self._open.read, self._open.until_ns
@@ -100,7 +100,7 @@ class NativeMaster(Master):
                 identifier=number,
             )
             for number, begin, block in area.blocks
-            if begin < read.first + read.count and begin + block.count > read.first
+            if read.first < begin + block.count <= read.first + read.count
         ]
         n_blocks, address = self._arrays.structs(structs.AskedBlock, blocks)
         return structs.AskedRead(

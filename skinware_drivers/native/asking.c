@@ -2,6 +2,7 @@
 #include "flow.h"
 
 #include <errno.h>
+#include <poll.h>
 #include <unistd.h>
 
 enum { ROOM = 1024, CRC_BYTES = 2 };
@@ -20,8 +21,9 @@ static uint16_t crc_of(const uint32_t *table, const uint8_t *at, int64_t n)
     return (uint16_t)state;
 }
 
-static void ask(struct asker *asker, int64_t time_ns)
+static void ask(const struct source *source, int64_t time_ns)
 {
+    struct asker *asker = source->asker;
     struct asked_read *read = &asker->reads[asker->next];
     if (asker->is_tcp) {
         asker->number = asker->number % 0xFFFF + 1;
@@ -31,7 +33,10 @@ static void ask(struct asker *asker, int64_t time_ns)
     asker->open = asker->next++;
     asker->until_ns = time_ns + asker->timeout_ns;
     asker->sent++;
-    if (write((int)asker->fd, read->question, (size_t)read->question_bytes) != read->question_bytes)
+    ssize_t written = write((int)asker->fd, read->question, (size_t)read->question_bytes);
+    if (source->tap && written > 0)
+        keep_bytes(source->tap, read->question, written, time_ns, true);
+    if (written != read->question_bytes)
         leave_to_python(asker); /* to which it looks as if no reply came */
 }
 
@@ -46,8 +51,9 @@ static void begin_cycle(struct asker *asker, int64_t time_ns)
 }
 
 /* Ask what is due. */
-static void say(struct asker *asker, int64_t time_ns)
+static void say(const struct source *source, int64_t time_ns)
 {
+    struct asker *asker = source->asker;
     if (asker->open >= 0) {
         if (time_ns >= asker->until_ns)
             leave_to_python(asker);
@@ -60,7 +66,7 @@ static void say(struct asker *asker, int64_t time_ns)
             return;
         begin_cycle(asker, time_ns);
     }
-    ask(asker, time_ns);
+    ask(source, time_ns);
 }
 
 /* Whether the reply is whole; what cannot be the reply is left to Python. */
@@ -125,6 +131,13 @@ static bool take_reply(struct path *path, struct source *source, int64_t time_ns
     return true;
 }
 
+/* Whether somebody else wants to ask. */
+static bool has_guests(const struct asker *asker)
+{
+    struct pollfd guests = {.fd = (int)asker->guests_fd, .events = POLLIN};
+    return asker->guests_fd >= 0 && poll(&guests, 1, 0) > 0;
+}
+
 /* Take the reply to what was asked, and ask what is next; whether a reply was whole. */
 bool receive_asked(struct path *path, struct source *source)
 {
@@ -135,12 +148,16 @@ bool receive_asked(struct path *path, struct source *source)
         return false;
     ssize_t n = read((int)asker->fd, asker->buffer + asker->size, (size_t)(ROOM - asker->size));
     if (n > 0) {
+        if (source->tap)
+            keep_bytes(source->tap, asker->buffer + asker->size, n, time_ns, false);
         asker->size += n;
         is_taken = asker->open >= 0 ? take_reply(path, source, time_ns) : leave_to_python(asker);
     } else if (!(n < 0 && (errno == EAGAIN || errno == EINTR)))
         return leave_to_python(asker); /* which reads it again */
+    if (has_guests(asker))
+        leave_to_python(asker);
     if (!asker->is_stuck)
-        say(asker, time_ns);
+        say(source, time_ns);
     return is_taken;
 }
 

@@ -46,7 +46,7 @@ static void copy_values(const struct path *path, int64_t number)
 void show(struct path *path, const int64_t *updates, int64_t n)
 {
     const struct plan *plan = path->plan;
-    bool any_flagged = false;
+    bool is_to_see = n && path->words->sees_all;
     for (int64_t i = 0; i < n; i++) {
         const struct update *update = update_at(path, updates[i]);
         plan->touched[update->module] = 1;
@@ -56,11 +56,11 @@ void show(struct path *path, const int64_t *updates, int64_t n)
         plan->module_time_ns[update->module] = update->oldest_ns;
         plan->updated[update->module] = 1;
         plan->patch_time_ns[plan->module_patch[update->module]] = update->newest_ns;
-        any_flagged |= update->is_flagged;
+        is_to_see |= update->is_flagged;
     }
     if (n && update_at(path, updates[n - 1])->newest_ns > path->words->newest_ns)
         path->words->newest_ns = update_at(path, updates[n - 1])->newest_ns;
-    if (any_flagged && plan->hooks.look) {
+    if (is_to_see && plan->hooks.look) {
         path->words->store = (int64_t)(intptr_t)path->store;
         plan->hooks.look(updates, n);
     }

@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
+from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
-from skinware_drivers.layout import Byte, Expand, Frame, Packed, Sentinel, StatusBytes
+from skinware_drivers.layout import Above, Byte, Expand, Frame, Packed, Sentinel, StatusBytes
 from skinware_drivers.native import structs
 from skinware_drivers.numbering import SequenceNumber
 
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _PACKED = len(_TYPES)
 _ORDERS = ("given", "any", "ends_with")
-_SENTINEL, _STATUS_BYTES, _WORD = range(3)
-_MOST_MEMBERS = 32
+_SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
 
 
 def why_not(decoder: Decoder) -> str:
@@ -35,9 +36,6 @@ def why_not(decoder: Decoder) -> str:
             return f"frame {frame.name!r}: floats where the driver has integers"
         if runs and runs[0].kind != "f" and np.result_type(*runs).kind == "f":
             return f"frame {frame.name!r}: values of 64 bits with and without a sign"
-    for cycle in decoder.cycles:
-        if len(cycle.members) > _MOST_MEMBERS:
-            return f"a cycle of more than {_MOST_MEMBERS} frames"
     return ""
 
 
@@ -187,7 +185,9 @@ def _place_runs(kind: structs.Kind, column: int) -> None:
 
 def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:
     if isinstance(flag, Sentinel):
-        return _sentinel(flag, values)
+        return _compared(_SENTINEL, flag.status, flag.value, values)
+    if isinstance(flag, Above):
+        return _compared(_ABOVE, flag.status, flag.limit, values)
     if isinstance(flag, StatusBytes):
         return structs.Flag(form=_STATUS_BYTES, offset=flag.offset, mask=int(flag.mask))
     dtype, is_swapped = _type(flag.dtype)
@@ -196,18 +196,18 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
     return structs.Flag(form=_WORD, status=int(flag.status), n_each=n_each, each=each, **word)
 
 
-def _sentinel(flag: Sentinel, values: np.dtype[Any]) -> structs.Flag:
+def _compared(form: int, status: Status, number: float, values: np.dtype[Any]) -> structs.Flag:
     """Compared as numpy compares an array of ``values`` with the number."""
-    found = structs.Flag(form=_SENTINEL, status=int(flag.status), is_possible=True)
-    value = flag.value.item() if isinstance(flag.value, np.generic) else flag.value
+    found = structs.Flag(form=form, status=int(status))
+    number = number.item() if isinstance(number, np.generic) else number
     if values.kind == "f":
-        found.real = float(values.type(value))
-    elif isinstance(value, float):
-        found.is_float, found.real = True, value
+        found.real = float(values.type(number))
+    elif isinstance(number, float):
+        found.is_float, found.real = True, number
+    elif not np.iinfo(values).min <= number <= np.iinfo(values).max:
+        found.is_float, found.real = True, math.copysign(math.inf, number)
     else:
-        limits = np.iinfo(values)
-        found.is_possible = limits.min <= value <= limits.max
-        found.integer = value if value < 1 << 63 else value - (1 << 64)
+        found.integer = number if number < 1 << 63 else number - (1 << 64)
     return found
 
 

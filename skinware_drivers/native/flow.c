@@ -130,13 +130,30 @@ static bool is_any_silent(const struct flow *flow, int64_t time_ns, int64_t *unt
     return any;
 }
 
+/* What is waited for beside the loop: of a few buses each one, which costs less than through an epoll. */
+static nfds_t find_awaited(struct flow *flow, struct pollfd *fds)
+{
+    nfds_t n = 0;
+    if (flow->has_others || flow->n_sources > FEW) {
+        fds[0] = (struct pollfd){.fd = (int)flow->epoll_fd, .events = POLLIN};
+        return 1;
+    }
+    for (const struct source *source = flow->sources; source < flow->sources + flow->n_sources; source++) {
+        const struct asker *asker = source->fd >= 0 ? source->asker : NULL;
+        bool is_bare = asker && asker->guests_fd < 0;
+        fds[n++] = (struct pollfd){.fd = (int)(is_bare ? asker->fd : source->fd), .events = POLLIN};
+    }
+    return n;
+}
+
 /* Sleep until then, or until Python has something to do (true), or, if it may, a bus. */
 static bool sleep_until(struct flow *flow, int64_t until_ns, int64_t time_ns, bool is_resting)
 {
-    struct pollfd fds[] = {{.fd = (int)flow->loop_fd, .events = POLLIN}, {.fd = (int)flow->epoll_fd, .events = POLLIN}};
+    struct pollfd fds[1 + FEW] = {{.fd = (int)flow->loop_fd, .events = POLLIN}};
+    nfds_t n_fds = 1 + (is_resting ? 0 : find_awaited(flow, fds + 1));
     int64_t left_ns = until_ns > time_ns ? until_ns - time_ns : 0;
     struct timespec timeout = {.tv_sec = left_ns / 1000000000, .tv_nsec = left_ns % 1000000000};
-    int n = ppoll(fds, is_resting ? 1 : 2, &timeout, NULL);
+    int n = ppoll(fds, n_fds, &timeout, NULL);
     return n < 0 || fds[0].revents;
 }
 

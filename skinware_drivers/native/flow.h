@@ -20,12 +20,13 @@ struct asked_read { /* one question, and the beginning of its reply, both with r
     uint8_t *question, *reply, *registers;
     int64_t question_bytes, reply_head, reply_bytes, count, n_blocks;
     int64_t *heard_ns;
-    const struct asked_block *blocks;
+    const struct asked_block *blocks; /* those that end in this read */
 };
 
 struct asker { /* a Modbus master */
-    int64_t fd, is_tcp, is_stuck; /* is_stuck: Python has to go on */
-    int64_t n_reads, most_blocks; /* of a cycle; blocks that a reply can complete */
+    int64_t fd, guests_fd, is_tcp, is_stuck; /* guests_fd: readable when others want to ask, -1: none can; is_stuck:
+                                                Python has to go on */
+    int64_t n_reads, most_blocks; /* of a cycle; blocks that end in one read */
     struct asked_read *reads;
     int64_t open, next, number, cycle; /* open: the read whose reply is awaited, -1: none */
     int64_t until_ns, free_ns, cycle_ns, deadline_ns; /* timeout; earliest next question; of the cycle: begun, next */
@@ -60,7 +61,7 @@ struct flow {
 bool receive(struct path *path, struct source *source);
 bool receive_line(struct path *path, struct source *source);
 void keep_frames(const struct path *path, const struct source *source, int64_t first, int64_t n);
-void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns);
+void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns, bool is_sent);
 bool receive_asked(struct path *path, struct source *source);
 int64_t asker_due_ns(const struct asker *asker);
 

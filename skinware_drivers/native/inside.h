@@ -20,6 +20,7 @@ struct words { /* what Python sees and sets between calls */
     int64_t entry, kind;           /* addresses of what is known of the rows */
     int64_t ring;                  /* address of the ring's end: another one if somebody removed its file */
     int64_t read_ns;               /* all that arrived until then was taken */
+    int64_t sees_all;              /* the watch wants to look at all updates */
 };
 
 struct update { /* followed by int32_t sensors[width], values[width], uint8_t status[width] */

@@ -25,7 +25,7 @@ static bool read_chunk(struct path *path, struct source *source)
     if (total) {
         int64_t time_ns = path_time_ns(path);
         if (source->tap)
-            keep_bytes(source->tap, at, total, time_ns);
+            keep_bytes(source->tap, at, total, time_ns, false);
         end_chunk(stream, total, time_ns);
     }
     return total > 0;

@@ -57,12 +57,13 @@ static void judge(struct path *path, const struct cycle *cycle, int64_t m)
 /* Whether the n frames from i on are a whole cycle. */
 static bool is_cycle(const struct path *path, const struct cycle *cycle, int64_t i)
 {
-    uint32_t seen = 0;
+    uint32_t seen = 0; /* of an order that is not given */
     for (int64_t j = 0; j < cycle->n; j++) {
         int64_t place = path->place[i + j];
         if (place >= cycle->n || path->shared[i + j] != path->shared[i] || (cycle->order == GIVEN && place != j))
             return false;
-        seen |= UINT32_C(1) << place;
+        if (cycle->order != GIVEN)
+            seen |= UINT32_C(1) << place;
     }
     if (cycle->order == ENDS_WITH && path->place[i + cycle->n - 1] != cycle->n - 1)
         return false;
@@ -93,8 +94,8 @@ static void hope(struct path *path, const struct cycle *cycle, int64_t begin, in
         for (int64_t j = 0; fits && j < length; j++) {
             int64_t place = path->place[first + j];
             fits = place < cycle->n && !path->is_used[first + j] && path->shared[first + j] == path->shared[last] &&
-                   (cycle->order != GIVEN || place == j) && !(seen >> place & 1);
-            if (fits)
+                   (cycle->order == GIVEN ? place == j : !(seen >> place & 1));
+            if (fits && cycle->order != GIVEN)
                 seen |= UINT32_C(1) << place;
         }
         if (fits) {

@@ -15,7 +15,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 32, MUCH_HASTE = 200 };
+enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 128, MUCH_HASTE = 200 };
 #define NEVER_NS (-(INT64_C(1) << 62)) /* punctuality: none came yet */
 
 /* -- what a layout compiles to ------------------------------------------------------------------------------------- */
@@ -50,7 +50,7 @@ struct run { /* values that lie side by side in a payload; bits, is_little, is_s
     int64_t offset, count, type, is_swapped, column, bits, is_little, is_signed, skip;
 };
 
-enum flag_form { SENTINEL, STATUS_BYTES, WORD };
+enum flag_form { SENTINEL, ABOVE, STATUS_BYTES, WORD };
 
 struct channel_bit {
     int64_t channel, shift;
@@ -59,7 +59,7 @@ struct channel_bit {
 struct flag { /* mask: of a word, or of the status bytes */
     int64_t form, status, offset, type, is_swapped, mask, n_each;
     const struct channel_bit *each;
-    int64_t is_float, is_possible, integer; /* of a sentinel: how it is compared, and with what */
+    int64_t is_float, integer; /* of a sentinel or a limit: how values are compared, and with what */
     double real;
 };
 
@@ -112,7 +112,7 @@ struct hooks {             /* NULL: there is nothing to do */
     void (*offer)(const int64_t *rows, int64_t n); /* rows that are of no module of ours */
     void (*keep)(int64_t why, const int64_t *rows, int64_t n); /* rows that cannot be used, for the samples */
     void (*expand)(int64_t kind, const int64_t *updates, const int64_t *rows, uint8_t *has_failed, int64_t n);
-    void (*look)(const int64_t *updates, int64_t n); /* updates were shown, one of them is flagged */
+    void (*look)(const int64_t *updates, int64_t n); /* updates were shown; see words.sees_all */
     void (*published)(int64_t oldest_ns);
     int64_t (*sort_out)(int64_t bus, int64_t first, int64_t n); /* unusual rows are among these; how many are left */
     void (*lose)(int64_t bus, int64_t error);

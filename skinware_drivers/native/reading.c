@@ -115,23 +115,27 @@ static void read_run(const struct run *run, const uint8_t *payload, uint8_t *val
     }
 }
 
-static bool is_sentinel(const struct flag *flag, struct value value, int64_t type)
+/* Whether a flag means a value: it is equal to a sentinel, or above a limit. */
+static bool is_meant(const struct flag *flag, struct value value, int64_t type)
 {
-    if (type == F4 || type == F8)
-        return flag->real != flag->real ? value.real != value.real : value.real == flag->real;
-    if (!flag->is_possible)
-        return false;
-    if (flag->is_float)
-        return (type == U8 ? (double)(uint64_t)value.integer : (double)value.integer) == flag->real;
-    return value.integer == flag->integer;
+    bool is_above = flag->form == ABOVE, is_real = type == F4 || type == F8;
+    if (is_real || flag->is_float) {
+        double real = is_real ? value.real : type == U8 ? (double)(uint64_t)value.integer : (double)value.integer;
+        if (is_above)
+            return real > flag->real;
+        return is_real && flag->real != flag->real ? real != real : real == flag->real;
+    }
+    if (!is_above)
+        return value.integer == flag->integer;
+    return type == U8 ? (uint64_t)value.integer > (uint64_t)flag->integer : value.integer > flag->integer;
 }
 
-static void flag_sentinels(const struct path *path, const struct kind *kind, const struct flag *flag,
-                           const uint8_t *payload, const uint8_t *values, uint8_t *status)
+static void flag_values(const struct path *path, const struct kind *kind, const struct flag *flag,
+                        const uint8_t *payload, const uint8_t *values, uint8_t *status)
 {
     int64_t to = path->plan->value_type, size = path->plan->value_bytes;
     for (int64_t i = 0; kind->is_expanded && i < kind->width; i++)
-        if (is_sentinel(flag, read_value(values + (kind->column + i) * size, to, 0), to))
+        if (is_meant(flag, read_value(values + (kind->column + i) * size, to, 0), to))
             status[kind->column + i] |= (uint8_t)flag->status;
     for (const struct run *run = kind->runs; run < kind->runs + kind->n_runs; run++)
         for (int64_t i = 0; i < run->count; i++) {
@@ -140,7 +144,7 @@ static void flag_sentinels(const struct path *path, const struct kind *kind, con
                 value.integer = unpack(payload, run, i);
             else
                 value = read_value(payload + run->offset + i * bytes_of_type[run->type], run->type, run->is_swapped);
-            if (is_sentinel(flag, value, run->type == PACKED ? I8 : run->type))
+            if (is_meant(flag, value, run->type == PACKED ? I8 : run->type))
                 status[run->column + i] |= (uint8_t)flag->status;
         }
 }
@@ -171,8 +175,8 @@ static void apply_flags(const struct path *path, const struct kind *kind, int64_
     int64_t length = length_of(path->batch, row);
     uint8_t *status = status_of(path, number);
     for (const struct flag *flag = kind->flags; flag < kind->flags + kind->n_flags; flag++) {
-        if (flag->form == SENTINEL)
-            flag_sentinels(path, kind, flag, payload, values_of(path, number), status);
+        if (flag->form == SENTINEL || flag->form == ABOVE)
+            flag_values(path, kind, flag, payload, values_of(path, number), status);
         else if (flag->form == WORD)
             flag_word(path, &path->plan->assemblies[kind->assembly], flag, payload, length, status);
         else if (length >= flag->offset + kind->width)

@@ -73,7 +73,7 @@ class Flag(ctypes.Structure):
     _fields_ = [
         *_fields("form status offset type is_swapped mask n_each"),
         *_fields("each", _POINTER),
-        *_fields("is_float is_possible integer"),
+        *_fields("is_float integer"),
         *_fields("real", _REAL),
     ]
 
@@ -191,7 +191,7 @@ class Words(ctypes.Structure):
 
     _fields_ = _fields(
         "fixed_ns carried n_held newest_ns due_ns not_before_ns last_published_ns on_request wanted_ns"
-        " hastened store sequence must_leave expects_data entry kind ring read_ns"
+        " hastened store sequence must_leave expects_data entry kind ring read_ns sees_all"
     )
 
 
@@ -270,7 +270,7 @@ class Asker(ctypes.Structure):
     """A Modbus master."""
 
     _fields_ = [
-        *_fields("fd is_tcp is_stuck n_reads most_blocks"),
+        *_fields("fd guests_fd is_tcp is_stuck n_reads most_blocks"),
         *_fields("reads", _POINTER),
         *_fields("open next number cycle until_ns free_ns cycle_ns deadline_ns timeout_ns turnaround_ns period_ns"),
         *_fields("sent polls_missed frames bytes_in frame_bytes found"),

@@ -12,9 +12,9 @@ struct piece {
 };
 
 /* Begin a piece with so many bytes behind its head: where they go, NULL: there is no room. */
-static uint8_t *begin_piece(struct tap *tap, uint8_t form, int64_t count, int64_t n_bytes)
+static uint8_t *begin_piece(struct tap *tap, uint8_t form, int64_t count, int64_t n_bytes, bool is_sent)
 {
-    struct piece head = {.count = (uint32_t)count, .form = form};
+    struct piece head = {.count = (uint32_t)count, .form = form, .is_sent = is_sent};
     uint8_t *at = tap->bytes + tap->size;
     int64_t size = (int64_t)sizeof head + n_bytes;
     if (tap->size + size > tap->room) {
@@ -34,7 +34,8 @@ void keep_frames(const struct path *path, const struct source *source, int64_t f
     const struct mmsghdr *headers = (const struct mmsghdr *)(intptr_t)source->headers + first;
     int64_t known = batch->payload_size, size = known == CLASSIC_PAYLOAD ? HEADER + CLASSIC_PAYLOAD : FD_FRAME;
     size_t times = (size_t)n * sizeof *batch->time_ns;
-    uint8_t *at = begin_piece(source->tap, known == CLASSIC_PAYLOAD ? CLASSIC : FD, n, (int64_t)times + n * size);
+    uint8_t *at = begin_piece(source->tap, known == CLASSIC_PAYLOAD ? CLASSIC : FD, n, (int64_t)times + n * size,
+                              false);
     if (!at)
         return;
     memcpy(at, batch->time_ns + first, times);
@@ -51,11 +52,11 @@ void keep_frames(const struct path *path, const struct source *source, int64_t f
     }
 }
 
-void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns)
+void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns, bool is_sent)
 {
     for (; n > 0; n -= MOST_BYTES, bytes += MOST_BYTES) {
         int64_t some = n < MOST_BYTES ? n : MOST_BYTES, filled = (some + 7) / 8 * 8;
-        uint8_t *at = begin_piece(tap, BYTES, some, (int64_t)sizeof time_ns + filled);
+        uint8_t *at = begin_piece(tap, BYTES, some, (int64_t)sizeof time_ns + filled, is_sent);
         if (!at)
             continue;
         memcpy(at, &time_ns, sizeof time_ns);

@@ -155,7 +155,7 @@ class NativePath:
         self._words.wanted_ns = self._publisher.wanted_ns
         self._words.ring, self._words.sequence = self._publisher.ring_address or 0, self._publisher.sequence
         self._words.expects_data = self.expects_data
-        self._module_status[:] = self._publisher.watch.module_status
+        self._take_from_watch()
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in self.awaited]
         self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
         self._plan.n_awaited, self._plan.awaited = len(conditions), ctypes.addressof(self._awaited)
@@ -348,7 +348,12 @@ class NativePath:
         sensors[~whole] = self._plan.n_sensors
         parts = records["values"], records["status"], records["oldest_ns"], records["newest_ns"]
         self._publisher.look(Updates(records["module"], whole, sensors, *parts, True))
-        self._module_status[:] = self._publisher.watch.module_status
+        self._take_from_watch()
+
+    def _take_from_watch(self) -> None:
+        watch = self._publisher.watch
+        self._module_status[:] = watch.module_status
+        self._words.sees_all = watch.sees_all
 
     def _on_published(self, oldest_ns: int) -> None:
         self._publisher.answer(oldest_ns)

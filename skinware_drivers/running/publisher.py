@@ -249,11 +249,12 @@ class Publisher:
 
     def _show(self, updates: Updates) -> None:
         self._state.show(updates)
-        if updates.flagged and updates.status.any():  # not only others of the same batch
+        are_flagged = updates.flagged and updates.status.any()  # not only others of the same batch
+        if are_flagged or (self.watch.sees_all and len(updates)):
             self.look(updates)
 
     def look(self, updates: Updates) -> None:
-        """Let the watch look at updates that were shown, some of them flagged.
+        """Let the watch look at updates that were shown.
 
         Raises:
             DriverError: it raised something.

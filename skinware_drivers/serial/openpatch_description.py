@@ -19,6 +19,7 @@ from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, MAX_UNIT_BYTES, Sen
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import (
+    AnyFlag,
     Bits,
     DeviceTime,
     Flag,
@@ -310,7 +311,7 @@ def _check(found: Description) -> None:
 
 def _frame(number: int, kind: Kind) -> Frame:
     values = Values(_DATA_HEADER, kind.dtype, kind.n_values)
-    flags: list[Flag | Sentinel | StatusBytes] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
+    flags: list[AnyFlag] = [Flag(bit, 7, "u1", mask=int(bit)) for bit in _STATUS]
     lengths = [values.end]
     if values.end + kind.n_values <= MOST_PAYLOAD:
         lengths.append(values.end + kind.n_values)

@@ -105,6 +105,17 @@ class Marking(Watch):
         self.seen.append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
 
 
+class MarkingAll(Marking):
+    """Likewise, but it wants to be shown ten takes of updates also where none is flagged."""
+
+    sees_all = True
+
+    def look(self, updates: Updates) -> None:
+        """Mark, and have enough some time."""
+        super().look(updates)
+        self.sees_all = len(self.seen) < 10
+
+
 class _Lines(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
@@ -456,4 +467,4 @@ def why_python() -> str:
     return native.why_python() or skinware.native.why_python()
 
 
-__all__ = ["Marking", "Pair", "Publishing", "Way", "hand_clock", "require_same", "why_python"]
+__all__ = ["Marking", "MarkingAll", "Pair", "Publishing", "Way", "hand_clock", "require_same", "why_python"]

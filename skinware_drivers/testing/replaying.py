@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import gcd
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,8 +31,9 @@ _APART = 2 * BURSTS
 """Periods from one variant to the next."""
 _PACE_NS = 20_000
 """Between two frames of a sender that catches up."""
-_MOST_PLACES = 32
-"""So many frames of a long burst are tried as the first that is lost."""
+_MOST_PLACES, _MOST_FRAMES = 32, 1024
+"""So many frames of a long burst are tried as the first that is lost; fewer of a very long one, so that all variants of
+its frames are not too many."""
 
 
 class Recording(NamedTuple):
@@ -110,7 +112,7 @@ def record(
         bursts: how many of them.
     """
     # with a device's own time, it would be known when frames were sent; here they must be told apart without
-    layout = Layout([replace(frame, time=None) for frame in layout.frames], layout.cycle)
+    layout = replace(layout, frames=[replace(frame, time=None) for frame in layout.frames])
     decoder = Decoder([layout], tables)
     entry, kind, _ = decoder.name(_batch_of(decoder, wire, time_ns))
     own = np.flatnonzero((entry < tables.structure.n_modules) & (kind != 255))
@@ -147,7 +149,7 @@ def try_troubles(recording: Recording, with_period: bool = True) -> Outcome:
         with_period: False: as if nobody knew how often the device sends.
     """
     outcome = Outcome()
-    step = -(-recording.size // _MOST_PLACES)
+    step = _step(recording.size)
     for place in range(0, recording.size, step):
         troubles = list(_troubles_at(recording, _TROUBLE * recording.size + place, step))
         fresh, torn = find_torn(recording, *_suffer(recording, troubles), with_period=with_period)
@@ -158,6 +160,14 @@ def try_troubles(recording: Recording, with_period: bool = True) -> Outcome:
             number = (fresh.oldest_ns[torn][0] - recording.time_ns[0]) // _span_ns(recording)
             outcome.first = troubles[int(number)]
     return outcome
+
+
+def _step(size: int) -> int:
+    """From one place to be tried to the next; the places are at all distances from where modules begin."""
+    step = -(-size // min(_MOST_PLACES, max(1, _MOST_FRAMES // size)))
+    while gcd(step, size) > 1:
+        step += 1
+    return step
 
 
 def find_torn(

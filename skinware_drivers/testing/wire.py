@@ -17,6 +17,7 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus
 from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.testing.clock import HandClock, HandTimer
@@ -303,6 +304,10 @@ class EmulatedModbusBus(_OnLine, ModbusBus):
     def __init__(self, hardware: EmulatedHardware, clock: HandClock, payload_size: int, listen_only: bool) -> None:
         super().__init__("emulated", payload_size=payload_size, listen_only=listen_only, make_timer=clock.timer)
         self._line = _Line(hardware, clock)
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
+        """No time: it has no baud rate."""
+        return 0.0
 
 
 EmulatedBus = VirtualCanBus | EmulatedSerialBus | EmulatedModbusBus

@@ -9,6 +9,7 @@ import time
 
 from skinware_drivers.bus import Bus
 from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
@@ -72,6 +73,10 @@ class VirtualSerialBus(_EmulatedLine, SerialBus):
 
 class VirtualModbusBus(_EmulatedLine, ModbusBus):
     """Emulated Modbus devices as a bus; its name is as that of :class:`VirtualSerialBus`."""
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
+        """No time: it has no baud rate."""
+        return 0.0
 
 
 class _EmulatedPort(Port):

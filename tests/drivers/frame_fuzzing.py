@@ -19,7 +19,7 @@ from skinware_drivers.layout import Frame
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 
 _ROWS = 512
-_RIGHT, _WHOLE = 0.9, 0.3
+_RIGHT, _WHOLE, _IN_ORDER = 0.9, 0.3, 0.5
 _STEPS_NS = np.array([130_000, 130_000, 130_000, 130_000, 0, 2_000_000, 60_000_000, -500_000])
 
 
@@ -56,7 +56,7 @@ def fuzz(adapter: AnyAdapter, n_bytes: int, seed: int) -> Outcome:
             tables,
             [adapter.period_s],
             publishing,
-            rows=2 * _ROWS,
+            rows=4 * _ROWS,
             watch=adapter.watch,
             payload_size=adapter.payload_size,
         ) as pair,
@@ -64,8 +64,8 @@ def fuzz(adapter: AnyAdapter, n_bytes: int, seed: int) -> Outcome:
         assert not pair.why_not
         time_ns = clock.now_ns
         while fed < n_bytes:
-            wire = _frames(adapter, random)
-            steps = random.choice(_STEPS_NS, len(wire))
+            wire, in_order = _frames(adapter, random)
+            steps = np.where(in_order, _STEPS_NS[0], random.choice(_STEPS_NS, len(wire)))
             stamps = time_ns + np.cumsum(steps)
             time_ns = max(time_ns, int(stamps.max()))
             pair.pass_to(time_ns)
@@ -76,35 +76,35 @@ def fuzz(adapter: AnyAdapter, n_bytes: int, seed: int) -> Outcome:
         return Outcome(fed, int(state.patch_counters[:, 0].sum()), wrong)
 
 
-def _frames(adapter: AnyAdapter, random: np.random.Generator) -> npt.NDArray[np.void]:
-    """Some hundred frames."""
+def _frames(adapter: AnyAdapter, random: np.random.Generator) -> tuple[npt.NDArray[np.void], npt.NDArray[np.bool_]]:
+    """Some hundred frames; and which of them come right behind those before them, and are as they should be."""
     layout = adapter.layout
     kinds = {frame.name: frame for frame in layout.frames}
-    chosen: list[Frame] = []
+    cycles = [[kinds[name] for name in cycle.members] for cycle in layout.cycles]
+    chosen: list[tuple[Frame, int, bool]] = []
     while len(chosen) < _ROWS:
-        if layout.cycle is not None and random.random() < _WHOLE:
-            chosen += [kinds[name] for name in layout.cycle.members]
+        key = int(random.integers(8))
+        if cycles and random.random() < _WHOLE:
+            is_right = bool(random.random() < _IN_ORDER)
+            chosen += [(frame, key, is_right) for frame in cycles[key % len(cycles)]]
         else:
-            chosen.append(layout.frames[int(random.integers(len(layout.frames)))])
+            chosen.append((layout.frames[int(random.integers(len(layout.frames)))], key, False))
     wire = np.zeros(len(chosen), wire_dtype(adapter.payload_size))
-    key = 0
-    for row, frame in zip(wire, chosen, strict=True):
-        if layout.cycle is None or frame.name == layout.cycle.members[0]:
-            key = int(random.integers(8))
-        _fill(row, frame, adapter, key, random)
-    return wire
+    for row, (frame, key, is_right) in zip(wire, chosen, strict=True):
+        _fill(row, frame, adapter, key, 1.0 if is_right else _RIGHT, random)
+    return wire, np.array([is_right for _, _, is_right in chosen])
 
 
-def _fill(row: np.void, frame: Frame, adapter: AnyAdapter, key: int, random: np.random.Generator) -> None:
-    """Make a frame of a kind, or nearly."""
+def _fill(row: np.void, frame: Frame, adapter: AnyAdapter, key: int, right: float, random: np.random.Generator) -> None:
+    """Make a frame of a kind; each part of it is right with this probability."""
     patch = adapter.patches[key % len(adapter.patches)]
     module = patch.modules[key % len(patch.modules)]
     row["payload"] = random.integers(0, 256, row["payload"].shape, np.uint8)
     row["length"] = (
-        random.choice(frame.length) if random.random() < _RIGHT else random.integers(adapter.payload_size + 1)
+        random.choice(frame.length) if random.random() < right else random.integers(adapter.payload_size + 1)
     )
     row["identifier"] = random.integers(0x800)
-    if random.random() < _RIGHT:
+    if random.random() < right:
         row["identifier"] = 0
         for condition in frame.when:
             if isinstance(condition, Identifier):

@@ -23,6 +23,7 @@ FUZZED: Mapping[str, Callable[[], AnyAdapter]] = {
     "linkerhand-12x6": lambda: LinkerHandDriver(LinkerHandOptions(touch="12x6")),
     "linkerhand-10x4": lambda: LinkerHandDriver(LinkerHandOptions(touch="10x4")),
     "linkerhand-fingers": lambda: LinkerHandDriver(LinkerHandOptions(touch="fingers")),
+    "linkerhand-hand_23x9": lambda: LinkerHandDriver(LinkerHandOptions(touch="hand_23x9")),
     "allegro_v5-tips": lambda: allegro("tips"),
     "allegro_v5-sense": lambda: allegro("sense"),
     "allegro_v5-udp": lambda: AllegroV5UdpDriver(AllegroV5Options()),

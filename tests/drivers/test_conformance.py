@@ -18,6 +18,7 @@ from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
@@ -46,6 +47,7 @@ from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
+from skinware_drivers.virtual.devices.inspire import EmulatedInspire
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
@@ -136,6 +138,15 @@ class TestLinkerHandFingers(DriverConformance):
     emulator = EmulatedLinkerHand
     driver_options: ClassVar[Mapping[str, Any]] = {"ask": True, "touch": "fingers_90"}
     emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "fingers_90"}
+
+
+class TestLinkerHandWhole(DriverConformance):
+    """Matrices in runs of five, those of the palm longer than those of the fingers."""
+
+    driver = LinkerHandDriver
+    emulator = EmulatedLinkerHand
+    driver_options: ClassVar[Mapping[str, Any]] = {"ask": True}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"program_ms": 0, "touch": "hand_12x6", "palm": True}
 
 
 class TestAllegroV5(DriverConformance):
@@ -337,6 +348,11 @@ class TestPaxiniHighSpeed(DriverConformance):
     def shown(self, felt: Sequence[int]) -> Sequence[int]:
         edges = np.cumsum([0, 75, 75, 27, 27])
         return [value for a, b in pairwise(edges) for value in with_resultant(felt[a:b])]
+
+
+class TestInspire(DriverConformance):
+    driver = InspireDriver
+    emulator = EmulatedInspire
 
 
 def test_every_driver_that_ships_is_here() -> None:

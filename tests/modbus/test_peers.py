@@ -167,7 +167,7 @@ def test_values_follow_in_the_order_of_the_device(over: Any) -> None:
 
 
 def test_questions_and_replies_are_recorded(over: Any, tmp_path: Path) -> None:
-    """Also what C would ask: a wire that is wanted is asked in Python, and in C again when nobody wants it."""
+    """Whoever asks, C or Python."""
     file = tmp_path / "palm.mcap"
     with over(palm()) as name, driven(name) as (driving, reader):
         with recording(file, with_wires=True) as recorder:

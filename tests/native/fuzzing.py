@@ -81,6 +81,7 @@ def _made_up() -> dict[str, SkinDesign]:
         "cycle with an end": SkinDesign([_bus(_cycle("ends_with", None, "patch"))], "<f4"),
         "floats": SkinDesign([_bus(_floats())], "<f4"),
         "long": SkinDesign([_bus(_long())], "u1"),
+        "long cycles": SkinDesign([_bus(_long_cycles())], "u1"),
         "several": SkinDesign(
             [_bus(_headers()), BusDesign(None, [], 1.0), _bus(_cycle("given", None, "module"), 0.005)], "<u2"
         ),
@@ -159,6 +160,28 @@ def _long() -> Layout:
             Frame("function", [Identifier(2)], [1, 70, 257], Expand(nibbles), 1, 1, [StatusBytes(60, Status.MASKED)]),
         ]
     )
+
+
+def _long_cycles() -> Layout:
+    """Two cycles of one layout, one of more frames than a word has bits; what names no module is passed over."""
+
+    def rows(count: int, module: int) -> list[Frame]:
+        return [
+            Frame(
+                f"{module}, {row}",
+                [Identifier(0x100, 0x70F), Byte(0, module), Byte(1, row)],
+                [3, 4],
+                Values(2, "u1", 1, [row if row < 6 else None]),
+                Bits(4, 4),
+                Bits(0, 8, byte=0),
+            )
+            for row in range(count)
+        ]
+
+    long, short = rows(34, 0), rows(2, 1)
+    cycles = [Cycle([frame.name for frame in frames], 0.008) for frames in (long, short)]
+    other = Frame("other", [Identifier(0x100, 0x70F)], range(9), Values(0, "u1", 0), Bits(4, 4), Bits(0, 8, byte=0))
+    return Layout([other, *long, *short], cycles[0], cycles[1:])
 
 
 @functools.cache

@@ -19,6 +19,8 @@ from skinware.status import Status
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
 from skinware_drivers.layout import (
+    Above,
+    AnyFlag,
     Bits,
     Byte,
     Condition,
@@ -162,20 +164,20 @@ def _number(draw: st.DrawFn, shortest: int, fewest: int) -> SequenceNumber | Non
 
 
 @st.composite
-def _flags(draw: st.DrawFn, longest: int, n_channels: int) -> Sequence[Flag | Sentinel | StatusBytes]:
-    found: list[Flag | Sentinel | StatusBytes] = []
+def _flags(draw: st.DrawFn, longest: int, n_channels: int) -> Sequence[AnyFlag]:
+    found: list[AnyFlag] = []
     for _ in range(draw(st.sampled_from([0, 1, 2, 3]))):
         status = draw(st.sampled_from(_STATUS))
-        what = draw(st.sampled_from(["word", "sentinel", "bytes"]))
+        what = draw(st.sampled_from(["word", "sentinel", "above", "bytes"]))
         if what == "word":
             dtype = draw(st.sampled_from(_UNSIGNED))
             bits = 8 * np.dtype(dtype).itemsize
             each = draw(st.lists(st.tuples(st.integers(0, n_channels - 1), st.integers(0, bits - 1)), max_size=3))
             mask = draw(st.sampled_from([0, 1, 0x80, 1 << bits - 1, (1 << bits) - 1]))
             found.append(Flag(status, draw(st.integers(0, longest)), dtype, mask, each))
-        elif what == "sentinel":
+        elif what in ("sentinel", "above"):
             value = draw(st.sampled_from([0, 1, -1, 255, 65535, -32768, 1 << 40, 0.0, 1.5, float("nan"), float("inf")]))
-            found.append(Sentinel(status, value))
+            found.append(Sentinel(status, value) if what == "sentinel" else Above(status, value))
         else:
             mask_of_bytes = draw(st.sampled_from([Status.OUT_OF_RANGE, Status.NO_ACK | Status.MASKED]))
             found.append(StatusBytes(draw(st.integers(0, longest)), mask_of_bytes))

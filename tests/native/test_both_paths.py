@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
+from skinware_drivers.testing.both_paths import Marking, MarkingAll, Pair, Publishing, hand_clock
 from skinware_drivers.testing.clock import HandClock
 from tests.native import needs_native
 from tests.native.fuzzing import designs
@@ -52,9 +52,11 @@ def clock() -> Iterator[HandClock]:
 
 
 @contextmanager
-def playing(clock: HandClock, design: SkinDesign, publishing: Publishing) -> Iterator[Player]:
+def playing(
+    clock: HandClock, design: SkinDesign, publishing: Publishing, watch: type[Marking] = Marking
+) -> Iterator[Player]:
     """Both paths for such a skin, and who feeds them; where numpy alone can do it, there is nothing to compare."""
-    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing) as pair:
+    with Pair(clock, design.layouts, design.tables(), design.periods_s, publishing, watch=watch) as pair:
         event(pair.why_not or "both")
         assume(not pair.why_not)
         yield Player(design, pair)
@@ -62,9 +64,11 @@ def playing(clock: HandClock, design: SkinDesign, publishing: Publishing) -> Ite
 
 
 @examples(150)
-@given(design=skins(), publishing=publishings, script=scripts)
-def test_whatever_comes(clock: HandClock, design: SkinDesign, publishing: Publishing, script: Sequence[Event]) -> None:
-    with playing(clock, design, publishing) as player:
+@given(design=skins(), publishing=publishings, script=scripts, watch=st.sampled_from([Marking, MarkingAll]))
+def test_whatever_comes(
+    clock: HandClock, design: SkinDesign, publishing: Publishing, script: Sequence[Event], watch: type[Marking]
+) -> None:
+    with playing(clock, design, publishing, watch) as player:
         player.play(script)
 
 

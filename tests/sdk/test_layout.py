@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.layout import (
+    Above,
     Bits,
     Byte,
     Cycle,
@@ -32,6 +34,7 @@ from skinware_drivers.layout import (
     StatusBytes,
     Values,
 )
+from skinware_drivers.testing.both_paths import require_same
 
 TYPES = [PRESSURE.measured(unit="counts")]
 ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
@@ -97,6 +100,39 @@ def test_any_order_takes_each_frame_once() -> None:
     frames = quarters(0)
     decoder = decode(fingertip("any"), [Module(taxels(16))], "<u2", [*frames, *frames, *frames[:2]])
     assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("updates")] == 2
+
+
+def rows(module: int, count: int) -> tuple[list[Frame], Cycle]:
+    """A matrix of one column: a frame for each row, which the second byte numbers."""
+    frames = [
+        Frame(
+            f"module {module}, row {row}",
+            [Identifier(0x300), Byte(0, module), Byte(1, row)],
+            [3],
+            Values(2, "u1", 1, [row]),
+            module=Bits(0, 8, byte=0),
+        )
+        for row in range(count)
+    ]
+    return frames, Cycle([frame.name for frame in frames], maximum_age_s=0.1)
+
+
+@pytest.mark.parametrize("lost", [None, 0, 50, 120])
+def test_modules_whose_cycles_are_of_other_frames_and_long(lost: int | None) -> None:
+    (short, first), (long, second) = rows(1, 3), rows(2, 100)
+    layout = Layout([*short, *long], first, [second])
+    sent = [(0x300, bytes([1 + module, row, row])) for module, count in ((0, 3), (1, 100)) for row in range(count)]
+    mixed = [frame for pair in zip(sent[:3], sent[3:6], strict=True) for frame in pair] + sent[6:]
+    if lost is not None:
+        del mixed[min(lost, len(mixed) - 1)]
+    modules = [Module(taxels(3), key=1), Module(taxels(100, first_uid=3), key=2)]
+    decoder = decode(layout, modules, "u1", mixed, gap_ns=100_000)
+    whole = [lost != 0, lost in (None, 0)]
+    assert decoder.state.updated.tolist() == whole
+    shown = decoder.state.status == 0
+    assert shown.tolist() == [whole[0]] * 3 + [whole[1]] * 100
+    assert (decoder.state.values[3:][shown[3:]] == np.arange(100)[shown[3:]]).all()
+    require_same(layout, decoder.tables, 1.0, 8, [(at * 100_000, *frame) for at, frame in enumerate(mixed, 1)])
 
 
 def test_a_cycle_that_takes_too_long_is_not_shown() -> None:
@@ -227,6 +263,25 @@ def test_sentinels_and_flags() -> None:
     payload = np.array([np.nan, 0.5], "<f4").tobytes()
     decoder = decode(nan, [Module(taxels(2))], "<f4", [(0x100, payload)])
     assert decoder.state.status.tolist() == [int(Status.NOT_CONNECTED), 0]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "limit", "values", "flagged"),
+    [
+        ("<u2", 4096, [4095, 4096, 4097, 65535], [0, 0, 1, 1]),
+        ("<u2", 70_000, [0, 65535], [0, 0]),
+        ("<u2", -1, [0, 65535], [1, 1]),
+        ("<i2", -5, [-6, -5, -4, 0], [0, 0, 1, 1]),
+        ("<i2", 1.5, [1, 2], [0, 1]),
+        ("<f4", 0.5, [0.5, 0.75, np.nan, np.inf], [0, 1, 0, 1]),
+    ],
+)
+def test_values_above_a_limit(dtype: str, limit: float, values: list[float], flagged: list[int]) -> None:
+    n = len(values)
+    payload = np.array(values, dtype).tobytes()
+    layout = one(Values(0, dtype, n), len(payload), flags=[Above(Status.SUSPECT, limit)])
+    decoder = decode(layout, [Module(taxels(n))], dtype, [(0x100, payload)])
+    assert decoder.state.status.tolist() == [int(Status.SUSPECT) * one_of for one_of in flagged]
 
 
 def test_flags_in_the_upper_half_of_a_long_word() -> None:
@@ -420,6 +475,12 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: one(Values(0, Packed(12, skip=5), 5)), "values end at byte 9"),
         (lambda: Layout([]), "1 to 200 frames"),
         (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
+        (lambda: Layout(rows(1, 3)[0], rows(1, 3)[1], [rows(1, 3)[1]]), "are members of two cycles"),
+        (
+            lambda: Layout(rows(1, 129)[0], rows(1, 129)[1]),
+            "cycle of 129 frames: in the order 'given' give at most 128",
+        ),
+        (lambda: Layout(rows(1, 33)[0], replace(rows(1, 33)[1], order="any")), "in the order 'any' give at most 32"),
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
         (lambda: one(Values(0, "u1", 1), sequence=SequenceNumber(7, "<u2")), "sequence number is not in every"),
         (lambda: Layout([Frame("f", [Byte(9, 1)], (8,), Values(0, "u1", 1))]), "byte 9 is not in every"),

@@ -1,12 +1,14 @@
 """A hand of 1062 taxels behind a pymodbus server: our driver, pymodbus' own client, and a bare loop, in turns.
 
-    tools/bench modbus [tcp] [rtu] [--seconds 3] [--rounds 3]     default: both
+    tools/bench modbus [tcp] [rtu] [--turnaround-us US] [--seconds 3] [--rounds 3]     default: both
 
 The taxels are read in 9 reads of at most 125 registers, as fast as the server answers. The bare loop sends a question
 and waits for as many bytes as its reply has, without looking at them: what the server's turnaround allows. ``rtu`` is a
 line of two pseudo terminals, opened at 921,600 baud, with a process between them that carries the bytes; a pseudo
-terminal knows no baud rate. A line per way: hands a second and processor time per read, medians of the rounds, and what
-they are of the bare loop and of pymodbus' client. Processor time of our driver includes decoding and publishing.
+terminal knows no baud rate. On it, the driver and the bare loop are silent for 3.5 characters before each question
+(42 us), or for as long as is said; the bare loop counts that time busily, and so takes more processor time. A line per
+way: hands a second and processor time per read, medians of the rounds, and what they are of the bare loop and of
+pymodbus' client. Processor time of our driver includes decoding and publishing; it runs as with ``--realtime normal``.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from skinware import Namespace
+from skinware.realtime import Profile
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Module, NoOptions, Patch, taxels
 from skinware_drivers.modbus import ModbusAdapter, Registers, wire
@@ -43,6 +46,7 @@ from skinware_drivers.running.runner import Runner
 
 PARTS = ("tcp", "rtu")
 FIRST, N_TAXELS, BAUDRATE = 3000, 1062, 921_600
+SILENCE_US = 3.5 * 11 / BAUDRATE * 1e6
 READS = [(FIRST + at, min(125, N_TAXELS - at)) for at in range(0, N_TAXELS, 125)]
 _WARM_S = 0.7
 _FORK = multiprocessing.get_context("fork")
@@ -57,7 +61,7 @@ class Hand(ModbusAdapter[NoOptions]):
     dtype = np.uint16
     patches = (Patch("hand", [Module(taxels(N_TAXELS))]),)
     registers = (Registers(FIRST, N_TAXELS),)
-    period_s = 0.001
+    period_s = 0.0002  # shorter than any server takes for a hand
     timeout_s = 0.5
 
 
@@ -88,7 +92,7 @@ def carry(one: int, other: int) -> None:
             os.write(to[fd], os.read(fd, 4096))
 
 
-def ask_barely(where: str, seconds: float) -> Result:
+def ask_barely(where: str, seconds: float, silence_us: float) -> Result:
     """The bare loop."""
     is_line = where.startswith("/")
     with contextlib.ExitStack() as stack:
@@ -106,16 +110,22 @@ def ask_barely(where: str, seconds: float) -> Result:
             around = 5 if is_line else 9
             questions.append((wire.rtu_frame(message) if is_line else wire.tcp_frame(message), around + 2 * count))
 
+        silence_ns = round(1000 * silence_us) if is_line else 0
+
         def read_hand() -> None:
             for question, size in questions:
                 os.write(fd, question)
                 while size > 0:
                     size -= len(os.read(fd, 4096))
+                if silence_ns:
+                    end_ns = time.monotonic_ns() + silence_ns
+                    while time.monotonic_ns() < end_ns:
+                        pass
 
         return _measured(read_hand, seconds)
 
 
-def ask_by_pymodbus(where: str, seconds: float) -> Result:
+def ask_by_pymodbus(where: str, seconds: float, _silence_us: float) -> Result:
     """Its synchronous client, the faster of its two."""
     from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
@@ -136,7 +146,7 @@ def ask_by_pymodbus(where: str, seconds: float) -> Result:
         client.close()
 
 
-def ask_by_async_pymodbus(where: str, seconds: float) -> Result:
+def ask_by_async_pymodbus(where: str, seconds: float, _silence_us: float) -> Result:
     """Its client for asyncio."""
     from pymodbus import FramerType
     from pymodbus.client import AsyncModbusSerialClient, AsyncModbusTcpClient
@@ -167,9 +177,12 @@ def ask_by_async_pymodbus(where: str, seconds: float) -> Result:
     return asyncio.run(run())
 
 
-def ask_by_driver(where: str, seconds: float) -> Result:
+def ask_by_driver(where: str, seconds: float, silence_us: float) -> Result:
     """Our driver, from the question to the published frame."""
-    name = f"modbus:{where}?baudrate={BAUDRATE}" if where.startswith("/") else f"modbus:tcp://127.0.0.1:{where}"
+    name = f"modbus:tcp://127.0.0.1:{where}"
+    if where.startswith("/"):
+        name = f"modbus:{where}?baudrate={BAUDRATE}&turnaround_ms={silence_us / 1000}"
+    Profile.normal().apply()
     adapter = Hand(NoOptions())
     bus = make_bus(name, payload_size=adapter.payload_size)
     namespace = Namespace(f"bench-modbus-{os.getpid()}")
@@ -256,14 +269,14 @@ def _process(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
         process.join()
 
 
-def _report(pipe: Connection, way: str, where: str, seconds: float) -> None:
-    pipe.send(WAYS[way](where, seconds))
+def _report(pipe: Connection, way: str, *how: Any) -> None:
+    pipe.send(WAYS[way](*how))
 
 
-def measure(way: str, where: str, seconds: float) -> Result:
+def measure(way: str, *how: Any) -> Result:
     """One way, in a process of its own."""
     mine, theirs = _FORK.Pipe()
-    process = _FORK.Process(target=_report, args=(theirs, way, where, seconds))
+    process = _FORK.Process(target=_report, args=(theirs, way, *how))
     process.start()
     theirs.close()
     try:
@@ -280,13 +293,14 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="which wires; default: both")
     parser.add_argument("--seconds", type=float, default=3.0, help="of each way in each round")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--turnaround-us", type=float, default=SILENCE_US, help="silence before a question on a line")
     given = parser.parse_args()
     for part in given.parts or PARTS:
         with hand(part) as where:
             found: dict[str, list[Result]] = {way: [] for way in WAYS}
             for _ in range(given.rounds):
                 for way, results in found.items():
-                    results.append(measure(way, where, given.seconds))
+                    results.append(measure(way, where, given.seconds, given.turnaround_us))
         print(f"{part}: {N_TAXELS} taxels in {len(READS)} reads")
         for way, results in found.items():
             rate = statistics.median(one[0] for one in results)

@@ -79,7 +79,7 @@ def of_driver(suite: Suite) -> Recording | None:
     async def scenario(clock: HandClock) -> Recording | None:
         async with suite.running(clock) as rig:
             await rig.until_fresh()
-            if rig.adapter.layout.cycle is None:
+            if not rig.adapter.layout.cycles:
                 return None
             heard = Heard(rig)
             await rig.sleep((BURSTS + 4) * rig.adapter.period_s)

@@ -16,8 +16,9 @@ from msgspec import Meta
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 _SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
+_OF_HAND = {"hand_23x9": ((23, 9), (28, 20)), "hand_12x6": ((12, 6), (14, 16))}
 _FIRST = {"fingers": 0x20, "fingers_90": 0x90}
-_KINDS = {"12x6": 2, "10x4": 3, "fingers": 1, "fingers_90": 1}
+_KINDS = {"12x6": 2, "10x4": 3, "fingers": 1, "fingers_90": 1, "hand_23x9": 5, "hand_12x6": 7}
 _SERIAL = "LHL10-010-014-{}-B-1-A"
 _FELT, _WANTED = "felt", "wanted"  # in the memory of a device
 
@@ -27,7 +28,8 @@ class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fie
 
     hands: Annotated[tuple[int, ...], Meta(description="identifiers of the hands")] = (0x27,)
     touch: Annotated[
-        Literal["12x6", "10x4", "fingers", "fingers_90"], Meta(description="matrices, or values of each finger")
+        Literal["12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],
+        Meta(description="matrices, values of each finger, or matrices of the whole hand"),
     ] = "12x6"
     palm: Annotated[bool, Meta(description="whether the palm has a matrix, too")] = False
     program_ms: Annotated[
@@ -58,8 +60,8 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         """All matrices beside each other."""
         if self.options.touch in _FIRST:
             return on_a_grid(20, 5)
-        rows, columns = _SIZES[self.options.touch]
-        return on_a_grid(rows * columns * len(self._commands), len(self._commands) * columns)
+        cells = sum(rows * columns for rows, columns in map(self._size, self._commands))
+        return on_a_grid(cells, round(cells**0.5))
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Be asked, if there is a program."""
@@ -111,8 +113,16 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         """What makes a hand tell what this command is about; nothing does if it has no such command."""
         if command not in self._commands:
             return b""
+        if self.options.touch in _OF_HAND:
+            return bytes([command, *self._size(command), 1])
         sizes = {"12x6": "C6", "10x4": "A4"}
         return bytes([command]) + bytes.fromhex(sizes.get(self.options.touch, ""))
+
+    def _size(self, command: int) -> tuple[int, int]:
+        """Rows and columns of a matrix."""
+        if self.options.touch in _OF_HAND:
+            return _OF_HAND[self.options.touch][command == 0xB6]
+        return _SIZES[self.options.touch]
 
     def _told(self, device: Device, command: int) -> Iterator[CanFrame]:
         """The frames of an answer."""
@@ -120,10 +130,16 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         if self.options.touch in _FIRST:
             yield device.number, bytes([command, *values[5 * nth : 5 * nth + 5]])
             return
-        rows, columns = _SIZES[self.options.touch]
-        matrix = values[rows * columns * nth :]
-        for row in range(rows):
-            yield device.number, bytes([command, 16 * row, *matrix[row * columns : row * columns + columns]])
+        rows, columns = self._size(command)
+        before = sum(r * c for r, c in map(self._size, self._commands[:nth]))
+        matrix = values[before : before + rows * columns]
+        if self.options.touch in _SIZES:
+            for row in range(rows):
+                yield device.number, bytes([command, 16 * row, *matrix[row * columns : row * columns + columns]])
+            return
+        for at in range(0, len(matrix), 5):
+            yield device.number, bytes([command, at // columns, at % columns, *matrix[at : at + 5]])
+        yield device.number, bytes([command, 0xFF]) + (sum(matrix) & 0xFFFF).to_bytes(2, "little")
 
 
 __all__ = ["EmulatedLinkerHand", "EmulatedLinkerHandOptions"]

@@ -1,0 +1,169 @@
+"""Inspire Robots' RH56DFTP hand: 17 matrices with 1062 taxels, over Modbus TCP or RTU. The driver writes nothing.
+
+Source: the maker's manual PRJ-02-TS-U-010 V1.0.0 (and an older one, R1), and the bridge that Unitree publishes.
+
+Taxels are in the holding registers from 3000 on, one after the other. *Addresses count bytes*: the register after 3000
+is 3002. Fingers are row-major; the palm is column-major, each column from the last row up. Inferred, not documented:
+that addresses count bytes in all reads, and that a read may go over the border of two matrices; the option
+``by_matrix`` does without both.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware.geometry import Geometry
+from skinware.sensor_types import PRESSURE, SensorType
+from skinware.status import Status
+from skinware_drivers.decoding.skin_state import Updates
+from skinware_drivers.description import Module, Patch, SkinTables, taxels
+from skinware_drivers.hand import Grid, Hand
+from skinware_drivers.layout import Above, AnyFlag, Sentinel
+from skinware_drivers.modbus.adapter import ModbusAdapter
+from skinware_drivers.modbus.registers import Registers
+from skinware_drivers.options import check_options
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_FIRST, _BYTES = 3000, 2
+_FULL_SCALE = 4096
+
+
+class _Matrix(NamedTuple):
+    part: str
+    name: str
+    address: int
+    rows: int
+    columns: int
+
+
+_MATRICES = (
+    _Matrix("little", "tip", 3000, 3, 3),
+    _Matrix("little", "top", 3018, 12, 8),
+    _Matrix("little", "pad", 3210, 10, 8),
+    _Matrix("ring", "tip", 3370, 3, 3),
+    _Matrix("ring", "top", 3388, 12, 8),
+    _Matrix("ring", "pad", 3580, 10, 8),
+    _Matrix("middle", "tip", 3740, 3, 3),
+    _Matrix("middle", "top", 3758, 12, 8),
+    _Matrix("middle", "pad", 3950, 10, 8),
+    _Matrix("index", "tip", 4110, 3, 3),
+    _Matrix("index", "top", 4128, 12, 8),
+    _Matrix("index", "pad", 4320, 10, 8),
+    _Matrix("thumb", "tip", 4480, 3, 3),
+    _Matrix("thumb", "top", 4498, 12, 8),
+    _Matrix("thumb", "middle", 4690, 3, 3),
+    _Matrix("thumb", "pad", 4708, 12, 8),
+    _Matrix("palm", "", 4900, 8, 14),
+)
+
+
+class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of the driver.
+
+    Raises:
+        ConfigurationError: an option is out of its limits.
+    """
+
+    side: Annotated[Literal["right", "left"], Meta(description="which hand it is")] = "right"
+    unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; over TCP, the manual says 255")] = 1
+    period_ms: Annotated[
+        Annotated[float, Meta(ge=1, le=10_000)] | None,
+        Meta(description="time between two readings of the whole hand; default: 20, or what a serial line needs"),
+    ] = None
+    by_matrix: Annotated[
+        bool, Meta(description="read each matrix by itself: 17 questions instead of 9, right whatever addresses count")
+    ] = False
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
+class InspireWatch(ZeroWatch):
+    """Also tells what values mean that no taxel can have."""
+
+    _has_told = False
+
+    def look(self, updates: Updates) -> None:
+        """See whether values are above all that a taxel tells."""
+        super().look(updates)
+        if not self._has_told and (updates.status & Status.SUSPECT).any():
+            self._has_told = True
+            log.warning(
+                "values above %d, which no taxel has, are suspect; if there are many, the hand may send the bytes of"
+                " registers in the other order: add byte_order=little to the options of the bus",
+                _FULL_SCALE,
+            )
+
+
+class InspireDriver(ModbusAdapter[InspireOptions]):
+    """One hand."""
+
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL_SCALE),)
+    dtype: npt.DTypeLike = np.uint16
+    flags: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL_SCALE), Above(Status.SUSPECT, _FULL_SCALE))
+    address_step = _BYTES
+
+    def __init__(self, options: InspireOptions) -> None:
+        self.follows_line = options.period_ms is None
+        if options.by_matrix:  # no address is computed, and no two matrices are read together
+            self.address_step, self.largest_gap = 1, 0
+        self.registers = [_registers(options.unit, number) for number in range(len(_MATRICES))]
+        self.patches = [Patch(f"{options.side} hand", [_module(number) for number in range(len(_MATRICES))])]
+        self.geometry = _places(Hand(options.side))
+        super().__init__(options)
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Matrices that tell nothing but 0, and values that no taxel has."""
+        return InspireWatch(tables)
+
+
+def _channels(matrix: _Matrix) -> list[int]:
+    """Place of each register's taxel in its matrix, row by row."""
+    grid = np.arange(matrix.rows * matrix.columns).reshape(matrix.rows, matrix.columns)
+    order = grid[::-1].T if matrix.part == "palm" else grid
+    return [int(place) for place in order.ravel()]
+
+
+def _uids(matrix: _Matrix) -> list[int]:
+    """Number of the register of each taxel, from 3000 on, row by row."""
+    first = (matrix.address - _FIRST) // _BYTES
+    return [first + int(place) for place in np.argsort(_channels(matrix))]
+
+
+def _registers(unit: int, number: int) -> Registers:
+    matrix = _MATRICES[number]
+    return Registers(
+        matrix.address, matrix.rows * matrix.columns, unit=unit, to=_channels(matrix), patch=0, module=number
+    )
+
+
+def _module(number: int) -> Module:
+    matrix = _MATRICES[number]
+    sensors = [taxels(1, first_uid=uid)[0] for uid in _uids(matrix)]
+    name = f"{matrix.part} {matrix.name}".rstrip()
+    return Module(sensors, key=number, kind=f"{matrix.rows}x{matrix.columns}", name=name)
+
+
+def _places(hand: Hand) -> Geometry:
+    """Nominal ones: the manual gives no lengths."""
+    found = []
+    for part in dict.fromkeys(matrix.part for matrix in _MATRICES):
+        matrices = [matrix for matrix in _MATRICES if matrix.part == part]
+        grids = [Grid(matrix.rows, matrix.columns) for matrix in matrices]
+        for matrix, grid, centre in zip(matrices, grids, hand.down(part, grids), strict=True):
+            found.append(grid.at(centre, ["pressure"], _uids(matrix)))
+    return Geometry.joined(found)
+
+
+__all__ = ["InspireDriver", "InspireOptions"]

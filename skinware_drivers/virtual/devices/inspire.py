@@ -1,0 +1,85 @@
+"""An emulated RH56DFTP hand of Inspire Robots: its registers, whose addresses count bytes.
+
+Source: the maker's manual PRJ-02-TS-U-010 V1.0.0; the vectors in tests/modbus/test_inspire.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from skinware_drivers.virtual.emulator import Device
+from skinware_drivers.virtual.modbus_device import ModbusEmulator
+from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
+
+_FINGER = ((3, 3), (12, 8), (10, 8))
+_THUMB = ((3, 3), (12, 8), (3, 3), (12, 8))
+_PALM = (8, 14)
+_SHAPES = (*_FINGER * 4, *_THUMB, _PALM)
+"""Rows and columns, in the order of the registers: little, ring, middle, index finger, thumb, palm."""
+
+
+class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the hand is, and what is wrong with it."""
+
+    unit: Annotated[int, Meta(ge=0, le=255, description="its number")] = 1
+    zero: Annotated[
+        tuple[int, ...], Meta(description="matrices that tell nothing but 0: 1 to 17, the last is the palm")
+    ] = ()
+    swapped: Annotated[bool, Meta(description="send the low byte of a register first")] = False
+
+
+class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
+    """One hand. Values: those of the taxels, matrix by matrix, each row by row."""
+
+    full_scale = 4096
+    rest = 12
+    swing = 3000
+    speed_mbit_s = 100
+    step = 2
+
+    def __init__(self, options: EmulatedInspireOptions, **more: object) -> None:
+        self.numbers = (options.unit,)
+        super().__init__(options, **more)
+
+    def places(self) -> npt.NDArray[np.float64]:
+        """Fingers beside each other, the little one left, each from its tip down; the palm below."""
+        found = []
+        for finger in range(5):
+            shapes = _THUMB if finger == 4 else _FINGER
+            rows = sum(rows for rows, _ in shapes)
+            above = 0
+            for n_rows, n_columns in shapes:
+                found.append(_spread(n_rows, n_columns, (finger / 5, 0.7 * above / rows), (0.15, 0.7 * n_rows / rows)))
+                above += n_rows
+        found.append(_spread(*_PALM, (0.0, 0.72), (1.0, 0.28)))
+        return np.concatenate(found)
+
+    def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:  # noqa: ARG002
+        """From 3000 on, two addresses each."""
+        told: list[int] = []
+        for number, (rows, columns) in enumerate(_SHAPES, 1):
+            n = rows * columns
+            matrix = [0] * n if number in self.options.zero else list(values[len(told) : len(told) + n])
+            if (rows, columns) == _PALM:
+                matrix = [
+                    matrix[row * columns + column] for column in range(columns) for row in range(rows - 1, -1, -1)
+                ]
+            told += matrix
+        if self.options.swapped:
+            told = [value >> 8 | (value & 0xFF) << 8 for value in told]
+        return {3000 + 2 * number: value for number, value in enumerate(told)}
+
+
+def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[float, float]) -> npt.NDArray[np.float64]:
+    """(rows * columns, 2) places in a rectangle, row by row."""
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    share = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)
+    return np.array(corner) + share * size
+
+
+__all__ = ["EmulatedInspire", "EmulatedInspireOptions"]

@@ -40,6 +40,7 @@ _HEAD = struct.Struct("<B7xQ")
 _CODED_HEAD = struct.pack("<B7x", CODED)
 CLOCK = struct.Struct("<qq")
 _SIZE = struct.Struct("<I")
+_LONGEST_HEAD = 1 << 30
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
 
 
@@ -198,6 +199,7 @@ def split_generation(message: bytes) -> tuple[About, bytes]:
     try:
         (size,) = _SIZE.unpack_from(message)
         begin = _SIZE.size + size
-        return msgspec.json.decode(message[_SIZE.size : begin], type=About), zlib.decompress(message[begin:])
+        about = msgspec.json.decode(message[_SIZE.size : begin], type=About)
+        return about, zlib.decompressobj().decompress(message[begin:], _LONGEST_HEAD)
     except (struct.error, msgspec.MsgspecError, UnicodeDecodeError, zlib.error) as error:
         raise BridgeError(f"what a generation is cannot be read ({error})") from None

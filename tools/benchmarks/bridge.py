@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from processes import Processes, answer, own_namespace
@@ -80,7 +81,7 @@ class Command:
         cpu_s, begin_s = self._begin
         return (self._cpu_s() - cpu_s) / (time.monotonic() - begin_s)
 
-    def end(self) -> list[dict[str, object]]:
+    def end(self) -> list[dict[str, Any]]:
         """Its events."""
         self._process.send_signal(signal.SIGINT)
         out, _ = self._process.communicate(timeout=PATIENCE_S)
@@ -133,7 +134,7 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
     with ExitStack() as stack:
         namespace = stack.enter_context(own_namespace())
         stack.enter_context(driving(namespace.name, sensors, "analogue"))
-        receivers = {"fast": (None, "127.0.0.1")} if loopback else {}
+        receivers: dict[str, tuple[str | None, str]] = {"fast": (None, "127.0.0.1")} if loopback else {}
         if not loopback:
             receivers["fast"] = stack.enter_context(side("skin-fast", 1, None))
             if mbit is not None:
@@ -170,7 +171,8 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
         more = ""
         if name != "serve":
             service = last["services"]["large"]
-            more = f", {service['mode']}, {service['bytes_per_s'] / 1e6:.2f} MB/s, clock wrong by at most {last['clock']['error_ms']:.3f} ms"
+            wrong = f"clock wrong by at most {last['clock']['error_ms']:.3f} ms"
+            more = f", {service['mode']}, {service['bytes_per_s'] / 1e6:.2f} MB/s, {wrong}"
         print(f"    {name:<6} {100 * share:5.1f} % of a core{more}")
 
 

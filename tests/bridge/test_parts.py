@@ -1,0 +1,235 @@
+"""The parts of a bridge that are arithmetic: clocks, modes, messages, endpoints, and frames one after the other."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skinware import DriverReader, DriverWriter, Frame
+from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.diagnosis import why_unreachable
+from skinware.bridge.endpoints import endpoints
+from skinware.bridge.messages import (
+    CODED,
+    RAW,
+    About,
+    Keys,
+    coded_message,
+    form_of,
+    generation_message,
+    generation_of,
+    raw_message,
+    slot_of,
+    split_generation,
+)
+from skinware.bridge.pacing import Pacing
+from skinware.errors import BadRecording, BridgeError, ConfigurationError
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S
+from skinware.recording.codec import CodedColumn, Decoder, Encoder
+from skinware.service import ServiceReader
+from tests.bridge.rig import publish, structure
+from tests.streams.peers import free_port
+
+MS = 1_000_000
+
+
+# -- clock --------------------------------------------------------------------------------------------------------
+
+
+def asked(clock: PeerClock, seconds: float, offset_ns: float, drift: float, seed: int = 1) -> None:
+    """Ask for so long as a joiner does; round trips of 0.3 ms and more, most of it on one way or the other."""
+    generator = np.random.default_rng(seed)
+    at_ns = 5 * NS_PER_S
+    end_ns = at_ns + seconds * NS_PER_S
+
+    def other(ns: float) -> int:
+        return round(ns - offset_ns - drift * (ns - 5 * NS_PER_S))
+
+    while at_ns < end_ns:
+        there_ns, back_ns = 150_000 + generator.exponential(200_000, 2)
+        heard, returned = at_ns + there_ns, at_ns + there_ns + 20_000 + back_ns
+        clock.add(Sample.of(at_ns, other(heard), other(heard + 20_000), round(returned)))
+        at_ns += clock.pause_ns()
+
+
+@pytest.mark.parametrize("offset_ns", [0, 100 * MS, -3 * 3600 * NS_PER_S])
+@pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
+@pytest.mark.parametrize("seconds", [1, 4, 30, 300])
+def test_the_other_clock_is_found_and_its_error_told(offset_ns: float, drift: float, seconds: float) -> None:
+    clock = PeerClock()
+    asked(clock, seconds, offset_ns, drift)
+    now_ns = round((5 + seconds) * NS_PER_S)
+    wrong_ns = abs(clock.offset_ns(now_ns) - (offset_ns + drift * seconds * NS_PER_S))
+    assert wrong_ns <= clock.error_ns
+    if seconds >= 30:
+        assert wrong_ns < 100_000
+
+
+def test_a_clock_that_jumps_is_found_again() -> None:
+    clock = PeerClock()
+    asked(clock, 30, 0, 0)
+    for at_s in range(40, 44):
+        clock.add(Sample(at_s * NS_PER_S, 7 * NS_PER_S, 300_000))
+    assert abs(clock.offset_ns(44 * NS_PER_S) - 7 * NS_PER_S) <= clock.error_ns < MS
+
+
+# -- push or pull -------------------------------------------------------------------------------------------------
+
+PERIOD_NS = 10 * MS
+
+
+def test_it_begins_by_asking_and_is_pushed_where_the_link_is_fast() -> None:
+    pacing = Pacing(PERIOD_NS)
+    assert pacing.mode == "pull"
+    assert pacing.wants_probe(0)
+    assert pacing.probed(0, MS)
+    assert pacing.mode == "push"
+    assert not pacing.wants_probe(NS_PER_S)
+
+
+def test_a_slow_link_is_tried_again_ever_more_rarely() -> None:
+    pacing, at_ns, tried = Pacing(PERIOD_NS), 0, []
+    while at_ns < 1000 * NS_PER_S:
+        if pacing.wants_probe(at_ns):
+            assert not pacing.probed(at_ns, 90 * MS)
+            tried.append(at_ns)
+        at_ns += NS_PER_S // 4
+    assert pacing.mode == "pull"
+    gaps = np.diff(tried)
+    assert gaps.max() >= 300 * NS_PER_S
+    assert len(tried) < 25
+
+
+def test_one_slow_frame_of_three_tells_nothing() -> None:
+    pacing = Pacing(PERIOD_NS)
+    assert not pacing.probed(0, 80 * MS)
+    assert not pacing.probed(1, 70 * MS)
+    assert pacing.probed(2, 2 * MS)
+
+
+def test_pushed_frames_that_grow_old_are_asked_for() -> None:
+    pacing = Pacing(PERIOD_NS)
+    assert pacing.probed(0, MS)
+    at_ns = 0
+    while not pacing.saw(at_ns, 2 * MS) and at_ns < 10 * NS_PER_S:
+        at_ns += PERIOD_NS
+    assert pacing.mode == "push"
+    while not pacing.saw(at_ns, 50 * MS):
+        at_ns += PERIOD_NS
+        assert at_ns < 13 * NS_PER_S
+    assert pacing.mode == "pull"
+    assert not pacing.wants_probe(at_ns + NS_PER_S)
+
+
+@pytest.mark.parametrize("mode", ["push", "pull"])
+def test_a_mode_that_a_person_wants_stays(mode: str) -> None:
+    pacing = Pacing(PERIOD_NS, mode)
+    assert not pacing.wants_probe(0)
+    assert not any(pacing.saw(at_ns, NS_PER_S) for at_ns in range(0, 9 * NS_PER_S, PERIOD_NS))
+    assert pacing.mode == mode
+
+
+# -- messages -----------------------------------------------------------------------------------------------------
+
+
+def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
+    with DriverWriter("arm", structure(), namespace=namespace, rate_hz=50) as writer:
+        publish(writer, 7)
+        with ServiceReader("arm", namespace=namespace) as reader:
+            frame = reader.read()
+            message = raw_message(frame)
+            assert (form_of(message), generation_of(message)) == (RAW, frame.generation)
+            assert slot_of(message).tobytes() == bytes(frame.slot)
+            encoder = Encoder([CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
+            message = coded_message(encoder.encode(frame))
+            assert (form_of(message), generation_of(message)) == (CODED, frame.generation)
+    about = About({"tare": "Take the present load as none."})
+    assert split_generation(generation_message(about, b"head" * 1000)) == (about, b"head" * 1000)
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_are_refused_and_nothing_else(message: bytes) -> None:
+    for read in (form_of, split_generation):
+        with contextlib.suppress(BridgeError):
+            read(message)
+
+
+def test_frames_one_after_the_other_are_those_that_were_coded(namespace: Namespace) -> None:
+    generator = np.random.default_rng(2)
+    with DriverWriter("arm", structure(256), namespace=namespace, rate_hz=50) as writer:
+        publish(writer, 1)
+        with DriverReader("arm", namespace=namespace) as reader:
+            segment = reader._ring.segment
+            columns = [CodedColumn.of(column) for column in segment.layout.slot]
+            encoder, decoder = Encoder(columns), Decoder(columns, segment.layout.slot_stride)
+            for number in range(60):
+                frames = writer.begin(from_last=True)
+                frames["values"][:] = generator.integers(0, 65536, 256) if number % 3 else 5
+                frames["module_time_ns"][:] += generator.integers(0, 1 << 40)
+                writer.commit(1 + number)
+                frame = reader.read()
+                if number in (20, 21):
+                    encoder.next_is_key()
+                slot = decoder.decode(encoder.encode(frame))
+                assert slot.tobytes() == bytes(frame.slot)
+                assert decoder.sequence == frame.sequence
+            skipped = encoder.encode(_next(writer, reader))
+            assert skipped
+            with pytest.raises(BadRecording, match="which is not the last one"):
+                decoder.decode(encoder.encode(_next(writer, reader)))
+
+
+def _next(writer: DriverWriter, reader: DriverReader) -> Frame:
+    publish(writer)
+    return reader.read()
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "my robot", "x" * 48, "-r"])
+def test_what_is_no_name_of_a_robot_is_refused(name: str) -> None:
+    with pytest.raises(ConfigurationError, match="letters, digits"):
+        Keys(name)
+
+
+# -- endpoints ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text", ["192.168.1.1:7448", "tcp/host", "tcp/host:0", "tcp/host:99999", "udp/host:1", "tcp/a b:1"]
+)
+def test_what_is_no_endpoint_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError, match="give tcp/HOST:PORT"):
+        endpoints(connect=[text])
+
+
+@pytest.mark.parametrize(
+    "place", ["tcp/0.0.0.0:7448", "tcp/[::]:7448", "tcp/192.168.1.10:7448", "tcp/robot.local:7448"]
+)
+def test_nothing_listens_beyond_this_machine_without_a_word(place: str) -> None:
+    with pytest.raises(ConfigurationError, match="give --tls DIR, or --insecure"):
+        endpoints(listen=[place])
+    assert endpoints(listen=[place], insecure=True).listen == [place]
+
+
+@pytest.mark.parametrize("place", ["tcp/127.0.0.1:7448", "tcp/localhost:7448", "tcp/[::1]:7448"])
+def test_this_machine_may_always_be_listened_on(place: str) -> None:
+    assert endpoints(listen=[place]).listen == [place]
+
+
+def test_certificates_that_are_not_there_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"ca\.pem: No such file"):
+        endpoints(listen=["tcp/0.0.0.0:7448"], tls=tmp_path)
+    with pytest.raises(ConfigurationError, match="give --tls"):
+        endpoints(listen=["tls/0.0.0.0:7448"])
+    with pytest.raises(ConfigurationError, match="give --tls, too"):
+        endpoints(listen=["tcp/127.0.0.1:7448"], callers=["operator"])
+
+
+def test_why_nobody_is_reached() -> None:
+    assert "nothing listens there" in why_unreachable(f"tcp/127.0.0.1:{free_port()}", None)
+    assert "tcp/no.such.host.invalid:7448: " in why_unreachable("tcp/no.such.host.invalid:7448", None)

@@ -127,16 +127,20 @@ class HighSpeedBoard(Board):
         await self.stop(link)
         self.use(self.framing)
         version = (await self._read(link, _VERSION, VERSION_BYTES)).rstrip(b"\0 ").decode("ascii", "replace")
-        self._slots = await self._ask_slots(link)
-        if not self._slots:
+        slots = await self._ask_slots(link)
+        if not slots:
             raise BusError(f"the board {version} says that no module is connected to it")
-        log.info(
-            "%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in self._slots)
-        )
-        self.framing, self.geometry = framing_of(self._slots), nominal_places(self._slots, self._hand)
+        log.info("%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in slots))
+        patches = self.know(slots)
         self.use(self.framing)
-        self.layout = Layout([_frame(slot) for slot in self._slots])
-        modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in self._slots]
+        return patches
+
+    def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
+        """The patch of a board with modules in these slots."""
+        self._slots = list(slots)
+        self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
+        self.layout = Layout([_frame(slot) for slot in slots])
+        modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in slots]
         self._patch = Patch("hand", modules)
         return [self._patch]
 

@@ -55,8 +55,8 @@ _FINGER_SLOTS, _SLOTS, _BYTES_OF_MASK = 20, 28, 4
 _MOST_ON_PALM = 9
 _LENGTH_AND_ERROR, _RESULTANT, _RESULTANT_STEP = 3, 6, 2
 _LONGEST = 7 + _SLOTS * (_RESULTANT + TAXEL * MOST_POINTS)
-_MOST_OF_A_STRANGER = 64
-"""Bytes of it that are handed on, which are enough to see what it is."""
+_ENOUGH = 64
+"""Bytes of it that are handed on."""
 _TIMEOUT_S, _TRIES, _SWITCHES = 0.2, 3, 2
 _TIMEOUT_OF_CALIBRATION_S = 10.0
 _USUAL_HZ = 91.0
@@ -93,8 +93,8 @@ def framing_of(slots: Sequence[Slot]) -> Framing:
     def split(identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
         if identifier != _STREAM:
             return [(identifier, body)]
-        if not parts or len(body) != end:
-            return [(STRANGE, body[:_MOST_OF_A_STRANGER])]
+        if not parts or len(body) != end:  # its beginning is too short for the first slot, which is counted
+            return [*((slot, body[:_LENGTH_AND_ERROR]) for slot, _, _ in parts[:1]), (STRANGE, body[:_ENOUGH])]
         return [(slot, body[:_LENGTH_AND_ERROR] + body[start:stop]) for slot, start, stop in parts]
 
     return Split(_WHOLE, split)

@@ -121,8 +121,11 @@ def test_what_is_streamed_is_divided_by_slots() -> None:
         (3, before + bytes(range(9))),
         (20, before + bytes(range(9, 15))),
     ]
-    for framing in (of_two, UNKNOWN_SLOTS):
-        assert framing.framer().feed(STREAMED) == [Framed(STRANGE, STREAMED[3:-1], 16)]
+    strange = Framed(STRANGE, STREAMED[3:-1], 16)
+    assert UNKNOWN_SLOTS.framer().feed(STREAMED) == [strange]
+    frames = of_two.framer().feed(STREAMED)
+    assert frames == [Framed(3, STREAMED[3:6], 16), strange]
+    assert decoded(paxini("high_speed", {3: 1, 20: 0}), frames).state.bus_counters[0, :3].tolist() == [1, 1, 0]
 
 
 @pytest.mark.parametrize("frame", [ZERO_3_DONE, STREAMED])

@@ -48,7 +48,7 @@ def can_compile(framing: Framing) -> bool:
     if type(framing) is Delimited:
         can = type(framing.stuffing) in (Lines, Cobs, Escaped) and framing.body_start >= 0
     else:
-        can = type(framing) is Packet and framing.parts is None and _stays_within(framing)
+        can = type(framing) is Packet and _stays_within(framing)
     checksum, identifier = getattr(framing, "checksum", None), getattr(framing, "identifier", None)
     return can and _is_known(checksum) and _is_plain(identifier)
 

@@ -10,7 +10,6 @@ from typing import Literal
 from skinware.errors import ConfigurationError
 from skinware_drivers.serial.checksums import Checksum
 from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
-from skinware_drivers.serial.parts import Parts
 
 _GOOD, _REFUSED, _INCOMPLETE = range(3)
 
@@ -73,7 +72,6 @@ class Packet(Framing):
             it (and, with a trailer, ends as it should). For devices without a checksum; costs one frame of delay
             after every fault. ``"each"``: every frame is confirmed so, always; for devices whose frames have so little
             that can be checked that a shortened one passes together with the beginning of the next.
-        parts: frames that tell of several modules at once are divided into a frame for each.
 
     Raises:
         ConfigurationError: the declaration contradicts itself.
@@ -90,7 +88,6 @@ class Packet(Framing):
     identifier: Field | None = None
     header: int | None = None
     confirmed: bool | Literal["each"] = False
-    parts: Parts | None = None
     maximum_body: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -175,20 +172,23 @@ class Packet(Framing):
         return PacketFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """A frame as it is sent; what the declaration leaves open in the header is zero. Frames are not divided.
+        """A frame as it is sent; what the declaration leaves open in the header is zero.
+
+        Identifier and length are written where they are, also over the payload.
 
         Raises:
             ValueError: there is no such frame.
         """
         least = self.shortest - self.body_start - self.behind if isinstance(self.length, int) else 0
         check_body(identifier, payload, self.identifier, least, self.maximum_body)
-        frame = bytearray(_first(self.sync)).ljust(self.body_start, b"\0")
+        frame = bytearray(_first(self.sync)[: self.body_start]).ljust(self.body_start, b"\0") + payload
         total = self.body_start + len(payload) + self.behind
         has_checksum = self.checksum is not None
+        if len(frame) < max(0 if self.identifier is None else self.identifier.end, self.known_from):
+            raise ValueError(f"{len(payload)} bytes of payload have no room for what says what the frame is")
         if self.identifier is not None:
             self.identifier.put(frame, identifier)
         length = self._length_field(frame)
-        frame += payload
         if length is not None:
             if length.field.end > len(frame):
                 raise ValueError(f"{len(payload)} bytes of payload have no room for the length of the frame")
@@ -262,15 +262,14 @@ class PacketFramer(Framer):
         done = self._search(stream, 0, found)
         framing, field = self._framing, self._framing.identifier
         first, behind, bare = framing.body_start, framing.behind, self._bare
-        frames = [
+        return [
             Framed(
                 0 if field is None else field.of(stream, place),
                 stream[place + first : place + total - behind + (bare if is_bare else 0)],
                 self._before + place + total,
             )
             for place, total, is_bare in found
-        ]
-        return (frames if framing.parts is None else framing.parts.of(frames)), done
+        ], done
 
     def _search(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
         """Judge what may be a beginning, from ``place`` on, until one cannot be judged yet; gives its place."""
@@ -316,7 +315,7 @@ class PacketFramer(Framer):
         if isinstance(length, int):
             total, is_bare = length, False
         elif len(stream) - place < length.field.end:  # so much at least
-            return max(length.field.end, framing.shortest), False
+            return length.field.end, False
         else:
             says = length.field.of(stream, place)
             is_bare = says == 0 and self._bare > 0

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from skinware.errors import BusError, HandshakeTimeout
@@ -172,12 +172,16 @@ class ConverterBoard(Board):
         points = {sensor: self._points_of(sensor, version) for sensor, version in found.items()}
         for sensor, version in found.items():
             log.info("%s: sensor %d is %s, %s", link.bus_name, sensor, model_of(points[sensor]), version)
+        self._versions, self._silent = found, set()
+        return self.know(points)
+
+    def know(self, points: Mapping[int, int]) -> Sequence[Patch]:
+        """The patches of sensors with these ids, and so many taxels."""
         self.layout = Layout([_frame(sensor, count) for sensor, count in points.items()])
         self._polls = {sensor: self._ask_data(sensor, count) for sensor, count in points.items()}
         self._patches = {
             sensor: Patch(f"sensor {sensor}", [module(sensor, count)], sensor) for sensor, count in points.items()
         }
-        self._versions, self._silent = found, set()
         return list(self._patches.values())
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002

@@ -21,7 +21,7 @@ import asyncio
 import contextlib
 import logging
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 from typing import Any
 
@@ -37,9 +37,9 @@ from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.parts import Part, Parts
 from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, Slot, module, nominal_places, values
+from skinware_drivers.serial.splitting import Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -55,6 +55,8 @@ _FINGER_SLOTS, _SLOTS, _BYTES_OF_MASK = 20, 28, 4
 _MOST_ON_PALM = 9
 _LENGTH_AND_ERROR, _RESULTANT, _RESULTANT_STEP = 3, 6, 2
 _LONGEST = 7 + _SLOTS * (_RESULTANT + TAXEL * MOST_POINTS)
+_ENOUGH = 64
+"""Bytes of it that are handed on."""
 _TIMEOUT_S, _TRIES, _SWITCHES = 0.2, 3, 2
 _TIMEOUT_OF_CALIBRATION_S = 10.0
 _USUAL_HZ = 91.0
@@ -72,22 +74,30 @@ def version_request() -> bytes:
     return request(_READ, _VERSION, VERSION_BYTES)
 
 
+_WHOLE = Packet(
+    sync=(0xAA, (_REPLY, _STREAM), 0x00),
+    length=LengthTable(1, {_REPLY: Length(Field(6, 2), more=9), _STREAM: Length(Field(3, 2), more=6)}),
+    maximum=_LONGEST,
+    checksum=LRC,
+    identifier=Field(1),
+    header=3,
+)
+
+
 def framing_of(slots: Sequence[Slot]) -> Framing:
-    """Replies, and streamed frames divided into one for each of these slots."""
+    """Replies, and streamed frames split into one for each of these slots: its data behind length and error."""
     sizes = [_RESULTANT + TAXEL * slot.points for slot in slots]
-    *starts, size = accumulate(sizes, initial=_LENGTH_AND_ERROR)
-    parts = tuple(
-        Part(slot.number, start, start + size) for slot, start, size in zip(slots, starts, sizes, strict=True)
-    )
-    return Packet(
-        sync=(0xAA, (_REPLY, _STREAM), 0x00),
-        length=LengthTable(1, {_REPLY: Length(Field(6, 2), more=9), _STREAM: Length(Field(3, 2), more=6)}),
-        maximum=_LONGEST,
-        checksum=LRC,
-        identifier=Field(1),
-        header=3,
-        parts=Parts(_STREAM, size if slots else -1, parts, _LENGTH_AND_ERROR, STRANGE),
-    )
+    *starts, end = accumulate(sizes, initial=_LENGTH_AND_ERROR)
+    parts = [(slot.number, start, start + size) for slot, start, size in zip(slots, starts, sizes, strict=True)]
+
+    def split(identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+        if identifier != _STREAM:
+            return [(identifier, body)]
+        if not parts or len(body) != end:  # its beginning is too short for the first slot, which is counted
+            return [*((slot, body[:_LENGTH_AND_ERROR]) for slot, _, _ in parts[:1]), (STRANGE, body[:_ENOUGH])]
+        return [(slot, body[:_LENGTH_AND_ERROR] + body[start:stop]) for slot, start, stop in parts]
+
+    return Split(_WHOLE, split)
 
 
 UNKNOWN_SLOTS: Framing = framing_of(())
@@ -127,16 +137,20 @@ class HighSpeedBoard(Board):
         await self.stop(link)
         self.use(self.framing)
         version = (await self._read(link, _VERSION, VERSION_BYTES)).rstrip(b"\0 ").decode("ascii", "replace")
-        self._slots = await self._ask_slots(link)
-        if not self._slots:
+        slots = await self._ask_slots(link)
+        if not slots:
             raise BusError(f"the board {version} says that no module is connected to it")
-        log.info(
-            "%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in self._slots)
-        )
-        self.framing, self.geometry = framing_of(self._slots), nominal_places(self._slots, self._hand)
+        log.info("%s: board %s with %s", link.bus_name, version, ", ".join(f"{s.name} ({s.points})" for s in slots))
+        patches = self.know(slots)
         self.use(self.framing)
-        self.layout = Layout([_frame(slot) for slot in self._slots])
-        modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in self._slots]
+        return patches
+
+    def know(self, slots: Sequence[Slot]) -> Sequence[Patch]:
+        """The patch of a board with modules in these slots."""
+        self._slots = list(slots)
+        self.framing, self.geometry = framing_of(slots), nominal_places(slots, self._hand)
+        self.layout = Layout([_frame(slot) for slot in slots])
+        modules = [module(slot.number, slot.points, key=slot.number, name=slot.name) for slot in slots]
         self._patch = Patch("hand", modules)
         return [self._patch]
 

@@ -15,18 +15,17 @@ from skinware import DriverFrame, DriverReader, PatchState, Status
 from skinware.errors import ConfigurationError, RequestFailed, StructureChanged
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.description import Patch, assemble
-from skinware_drivers.layout import Layout
-from skinware_drivers.serial import paxini_converter, paxini_high_speed
+from skinware_drivers.description import assemble
 from skinware_drivers.serial.framing import Framed
 from skinware_drivers.serial.paxini import PaxiniDriver, PaxiniOptions
 from skinware_drivers.serial.paxini_converter import ConverterBoard, read, write
 from skinware_drivers.serial.paxini_high_speed import STRANGE, UNKNOWN_SLOTS, framing_of, request, version_request
-from skinware_drivers.serial.paxini_modules import POINTS_OF_PART, TYPES, Slot, model_of, module
+from skinware_drivers.serial.paxini_modules import POINTS_OF_PART, Slot, model_of
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini, EmulatedPaxiniOptions, message
 from skinware_drivers.virtual.emulator import Device
+from tests.drivers.fuzzed import paxini
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 
@@ -66,9 +65,9 @@ def following(reader: DriverReader, condition: Callable[[DriverFrame], bool]) ->
         return read_until(reader, condition)
 
 
-def decoded(layout: Layout, patch: Patch, frames: Sequence[Framed]) -> Decoder:
-    decoder = Decoder([layout], assemble([("bus", [patch])], TYPES, np.int16))
-    batch = FrameBatch(100, 824)
+def decoded(adapter: PaxiniDriver, frames: Sequence[Framed]) -> Decoder:
+    decoder = Decoder([adapter.layout], assemble([("bus", adapter.patches)], adapter.types, adapter.dtype))
+    batch = FrameBatch(100, adapter.payload_size)
     for number, frame in enumerate(frames):
         batch.append(0, 1 + number, frame.identifier, frame.body)
     updates, foreign = decoder.decode(batch)
@@ -96,8 +95,7 @@ def test_a_reply_of_a_sensor() -> None:
     reply = message(bytes.fromhex("AA 55 2B 00 02 00 FB F0 03 00 00 21 00 01 FB 05 C8"), bytes(27), b"\x80\x7f\xff")
     assert len(reply) == 0x2B + 5
     frames = ConverterBoard.framing.framer().feed(reply)
-    layout = Layout([paxini_converter._frame(2, 1)])
-    decoder = decoded(layout, Patch("sensor 2", [module(2, 1)], 2), frames)
+    decoder = decoded(paxini("converter", {2: 1}), frames)
     assert decoder.state.values.tolist() == [-128, 127, 255, -5, 5, 200]
     types = decoder.tables.structure.types
     assert [t.name for t in types] == ["force_x", "force_y", "force_z", "resultant_x", "resultant_y", "resultant_z"]
@@ -109,13 +107,12 @@ def test_what_is_streamed_is_divided_by_slots() -> None:
     slot = Slot(0, 1)
     frames = framing_of([slot]).framer().feed(STREAMED)
     assert frames == [Framed(0, STREAMED[3:-1], 16)]
-    layout = Layout([paxini_high_speed._frame(slot)])
-    patch = Patch("hand", [module(0, 1)])
-    decoder = decoded(layout, patch, frames)
+    adapter = paxini("high_speed", {0: 1})
+    decoder = decoded(adapter, frames)
     assert decoder.state.values.tolist() == [1, -1, 2, 1, -1, 3]
     assert not decoder.state.status.any()
     doubtful = message(STREAMED[:5], b"\4", STREAMED[6:-1])
-    decoder = decoded(layout, patch, framing_of([slot]).framer().feed(doubtful))
+    decoder = decoded(adapter, framing_of([slot]).framer().feed(doubtful))
     assert decoder.state.status.tolist() == [Status.SUSPECT] * 6
     of_two = framing_of([Slot(3, 1), Slot(20, 0)])
     stream = message(b"\xaa\x56\0", struct.pack("<HB", 16, 0), bytes(range(15)))
@@ -124,8 +121,11 @@ def test_what_is_streamed_is_divided_by_slots() -> None:
         (3, before + bytes(range(9))),
         (20, before + bytes(range(9, 15))),
     ]
-    for framing in (of_two, UNKNOWN_SLOTS):
-        assert framing.framer().feed(STREAMED) == [Framed(STRANGE, STREAMED[3:-1], 16)]
+    strange = Framed(STRANGE, STREAMED[3:-1], 16)
+    assert UNKNOWN_SLOTS.framer().feed(STREAMED) == [strange]
+    frames = of_two.framer().feed(STREAMED)
+    assert frames == [Framed(3, STREAMED[3:6], 16), strange]
+    assert decoded(paxini("high_speed", {3: 1, 20: 0}), frames).state.bus_counters[0, :3].tolist() == [1, 1, 0]
 
 
 @pytest.mark.parametrize("frame", [ZERO_3_DONE, STREAMED])

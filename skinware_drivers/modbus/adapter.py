@@ -161,6 +161,8 @@ class ModbusAdapter(Adapter[OptionsT]):
     async def _ask(self, link: Link, unit: int, question: bytes) -> bytes:
         timeout_s = 4 * self.timeout_s + 1  # it waits for the read before, and for what is written beside it
         reply = await link.request(unit, question, Match(ANSWERS | unit), timeout_s=timeout_s)
+        if not wire.is_reply(question, reply.payload):  # a late one, to a question that was given up
+            raise BusError(f"{link.bus_name}, unit {unit}: it answered another question")
         if code := wire.exception_of(reply.payload):
             raise ModbusException(f"{link.bus_name}, unit {unit}: {wire.exception_text(code)}", code)
         return reply.payload
@@ -181,7 +183,7 @@ class ModbusAdapter(Adapter[OptionsT]):
             values,
             patch=block.patch,
             module=block.module,
-            flags=self.flags,
+            flags=[*self.flags, *block.flags],
         )
 
 

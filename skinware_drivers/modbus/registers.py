@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.layout import AnyFlag
 from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
 
 Order = Literal["big", "little"]
@@ -33,6 +34,7 @@ class Registers:
         patch: key of the patch, if a bus has several.
         module: key of the module, if the patch has several.
         every: it is read in each cycle (1), in every second one (2) ...
+        flags: what sets status bits in it, beside the ``flags`` of the adapter.
     """
 
     address: int
@@ -44,6 +46,7 @@ class Registers:
     patch: int | None = None
     module: int | None = None
     every: int = 1
+    flags: Sequence[AnyFlag] = ()
 
     @property
     def words(self) -> int:

@@ -19,6 +19,7 @@ from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.modbus.inspire import InspireDriver
+from skinware_drivers.modbus.revo2 import Revo2Driver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
@@ -51,6 +52,7 @@ from skinware_drivers.virtual.devices.inspire import EmulatedInspire
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
+from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
@@ -353,6 +355,20 @@ class TestPaxiniHighSpeed(DriverConformance):
 class TestInspire(DriverConformance):
     driver = InspireDriver
     emulator = EmulatedInspire
+
+
+class TestRevo2(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedRevo2
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        """Proximities have 32 bits, of which float32 keeps 24."""
+        return [float(np.float32(value)) for value in felt]
+
+
+class TestRevo2ThatIsSwitchedOn(TestRevo2):
+    driver_options: ClassVar[Mapping[str, Any]] = {"enable": True}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"enabled": False}
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -17,6 +17,7 @@ from skinware_drivers.modbus import ModbusAdapter, wire
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.master import Master, Timing
 from skinware_drivers.modbus.registers import Wanted
+from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 
@@ -24,6 +25,7 @@ MS = 1_000_000
 FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
     "inspire": lambda: InspireDriver(InspireOptions()),
     "inspire-by_matrix": lambda: InspireDriver(InspireOptions(by_matrix=True)),
+    "revo2": lambda: Revo2Driver(Revo2Options()),
 }
 _ROWS = 64
 

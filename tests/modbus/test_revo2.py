@@ -1,0 +1,174 @@
+"""BrainCo's Revo2 Touch: published bytes, a server of somebody else's making, switching on, and hands without touch."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import DriverFrame, DriverReader
+from skinware.errors import BusError, ConfigurationError
+from skinware.status import Status
+from skinware_drivers.description import assemble
+from skinware_drivers.link import Link
+from skinware_drivers.modbus import wire
+from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
+from skinware_drivers.notice import Notice
+from skinware_drivers.registry import make_bus
+from skinware_drivers.testing.driving import driving_lines, emulated_skin
+from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2, EmulatedRevo2Options
+from tests.modbus.peers import Action, device, rtu_server
+
+pytestmark = [
+    pytest.mark.usefixtures("namespace"),
+    # pymodbus 3.16 leaves a question that came last unanswered, and its coroutine never awaited, when it is shut down
+    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:pytest.PytestUnraisableExceptionWarning"),
+    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:RuntimeWarning"),
+]
+READ = "7E 04 10 68 00 1E FE D1"
+ENABLE = "7E 10 0F A0 00 05 0A 00 01 00 01 00 01 00 01 00 01 4E E4"
+CALIBRATE = "7E 10 0F AA 00 05 0A 00 01 00 01 00 01 00 01 00 01 44 EE"
+FORCES = [1000, 20, 300, 0, 0, 0, 2500, 7, 359, 1, 2, 3, 4, 5, 6]
+PROXIMITIES = [1, 65535, 65536, 0x0102_0304, 0]
+WORDS = [*FORCES, 1, 0, 65535, 0, 0, 1, 0x0304, 0x0102, 0, 0, 9, 0, 0, 0, 0]
+
+
+def adapter(**options: Any) -> Revo2Driver:
+    return Revo2Driver(Revo2Options(**options))
+
+
+def told(hand: EmulatedRevo2, command: str, now_ns: int) -> bytes:
+    """What a hand answers to bytes."""
+    hand.receive(0, bytes.fromhex(command), now_ns)
+    return b"".join(frame.payload for frame in hand.emit(now_ns + 10**9))
+
+
+def has_no_data(frame: DriverFrame) -> bool:
+    return bool(((frame.status & Status.NOT_CONNECTED) != 0).all())
+
+
+@contextmanager
+def driven(name: str, **options: Any) -> Iterator[DriverReader]:
+    driver = adapter(**options)
+    bus = make_bus(f"{name}&timeout_ms=5000", payload_size=driver.payload_size)
+    with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
+        yield reader
+
+
+def hand_of(words: list[int], action: Action | None = None) -> Any:
+    """A left hand on a pymodbus server: its switches and its input registers are in one space."""
+    return device(126, 4000, [0] * 200 + words, action)
+
+
+# What is asked
+
+
+def test_one_read_gets_all_of_a_left_hand() -> None:
+    [read] = adapter(side="left").wanted.reads()
+    assert (read.address, read.count) == (4200, 25)
+    whole = wire.rtu_frame(wire.Message(read.unit, wire.question_to_read(read.function, read.address, 30)))
+    assert whole == bytes.fromhex(READ)
+
+
+def test_the_number_of_a_hand_follows_its_side_or_an_option() -> None:
+    assert {block.unit for block in adapter().registers} == {127}
+    assert {block.unit for block in adapter(unit=3, side="left").registers} == {3}
+    with pytest.raises(ConfigurationError, match="unit"):
+        Revo2Options(unit=255)
+
+
+def test_switching_on_and_calibrating_are_the_published_writes() -> None:
+    hand = EmulatedRevo2(EmulatedRevo2Options(unit=126, enabled=False), source=lambda _n, _c: [*FORCES, *PROXIMITIES])
+    hand.skip(10**9)
+    assert told(hand, READ, 2 * 10**9)[:5] == bytes.fromhex("7E 04 3C FF FF")
+    assert told(hand, ENABLE, 4 * 10**9)[:6] == bytes.fromhex("7E 10 0F A0 00 05")
+    assert told(hand, CALIBRATE, 6 * 10**9)[:6] == bytes.fromhex("7E 10 0F AA 00 05")
+    data = told(hand, READ, 8 * 10**9)
+    assert data[:3] == bytes.fromhex("7E 04 3C")
+    assert np.frombuffer(data[3:-2], ">u2")[:25].tolist() == WORDS[:25]
+
+
+# What it means
+
+
+def test_a_finger_is_a_tip_with_three_axes_and_a_proximity() -> None:
+    driver = adapter()
+    structure = assemble([("bus", driver.patches)], driver.types, driver.dtype).structure
+    assert structure.module_names[:2] == ("right hand, thumb tip", "right hand, index tip")
+    assert structure.module_names[-1] == "right hand, little proximity"
+    assert driver.geometry is not None
+    for sensor_type in structure.types:
+        places = driver.geometry.of(structure, sensor_type.name)
+        assert len(places) == 5
+        assert places.known.all()
+
+
+def test_a_server_with_a_hand() -> None:
+    with rtu_server(hand_of(WORDS), baudrate=460_800) as name, driven(name, side="left") as reader:
+        expected = np.array([*FORCES, *PROXIMITIES], np.float32)
+        frame = read_until(reader, lambda frame: not frame.status.any())
+        assert frame.values.tolist() == expected.tolist()
+
+
+def test_a_server_with_a_hand_that_is_switched_on_and_calibrated_on_request() -> None:
+    writes = []
+
+    async def note(function: int, _s: int, address: int, count: int, _r: object, values: list[int] | None) -> None:
+        if function == 16:
+            writes.append((address, values))
+
+    ones = [1] * 5
+    with rtu_server(hand_of(WORDS, note), baudrate=460_800) as name:
+        with driven(name, side="left") as reader:
+            read_until(reader, lambda frame: not frame.status.any())
+            assert writes == []
+            reader.call("enable")
+            reader.call("calibrate")
+            assert writes == [(4000, ones), (4010, ones)]
+        writes.clear()
+        with driven(name, side="left", enable=True) as reader:
+            read_until(reader, lambda frame: not frame.status.any())
+            assert writes == [(4000, ones)]
+
+
+# What is wrong with a hand
+
+
+def test_a_hand_that_is_not_switched_on_shows_no_data_and_says_what_to_do(caplog: Any) -> None:
+    with emulated_skin("revo2", enabled=False) as skin:
+        read_until(skin.reader, has_no_data)
+        wait_until(lambda: "touch is not switched on" in caplog.text)
+        skin.reader.call("enable")
+        read_until(skin.reader, lambda frame: not frame.status.any())
+
+
+def test_only_ffff_of_the_right_width_means_none() -> None:
+    words = [*[0xFFFF] * 3, *FORCES[3:], 0xFFFF, 0, 0xFFFF, 0xFFFF, *[1, 0] * 3, *[0] * 5]
+    with rtu_server(hand_of(words), baudrate=460_800) as name, driven(name, side="left") as reader:
+        frame = read_until(reader, lambda frame: not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any())
+        assert frame.status.tolist() == [16, 16, 16, *[0] * 12, 0, 16, 0, 0, 0]
+
+
+def test_a_hand_without_touch_is_switched_on_more_and_more_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver, pauses, told_of = adapter(enable=True), list[float](), list[Notice]()
+
+    async def sleep(pause_s: float) -> None:
+        pauses.append(pause_s)
+        if len(pauses) == 9:
+            raise BusError("enough")
+
+    async def read(*_: object, **_more: object) -> np.ndarray[Any, np.dtype[np.uint16]]:
+        return np.full(15, 0 if len(pauses) == 1 else 0xFFFF, np.uint16)
+
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    monkeypatch.setattr(driver, "read", read)
+    driver.heard_by = lambda _patch, notice: told_of.append(notice)
+    with pytest.raises(BusError, match="enough"):
+        asyncio.run(driver.attend(Link(make_bus("modbus:/dev/null"))))
+    assert pauses == [1, 1, 2, 4, 8, 16, 32, 60, 60]
+    assert told_of == [Notice.RESTARTED] * 7

@@ -45,17 +45,21 @@ class NativeMaster(Master):
         is_plain = self._image.is_plain and all(read.every == 1 for read in self._reads)
         self._can = is_plain and 0 < self._asker.most_blocks <= _MOST_BLOCKS
 
-    def hand_over(self, fd: int) -> int | None:
+    def hand_over(self, fd: int, guests_fd: int) -> int | None:
         """Have C go on, until ``take_back`` is called.
+
+        Args:
+            fd: of the port.
+            guests_fd: readable when another program wants something; -1: none can.
 
         Returns:
             The address of its state; None: there is something that only Python can do.
         """
-        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows
+        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows or self._has_guests
         if not self._can or asks_otherwise or self._holds_back or (self._open is not None and self._open.read < 0):
             return None
         asker, counters = self._asker, self._counters
-        asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, -1, 0, 0
+        asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, guests_fd, 0, 0
         asker.open, asker.next = -1, self._next
         if self._open is not None:
             asker.open, asker.until_ns = self._open.read, self._open.until_ns

@@ -17,6 +17,8 @@ from skinware.samples import Unused
 from skinware_drivers import native
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.modbus import wire
+from skinware_drivers.modbus.gateway import Gateway
+from skinware_drivers.modbus.guests import Guests
 from skinware_drivers.modbus.master import Listener, Master, Talk, Timing
 from skinware_drivers.modbus.native_master import NativeMaster
 from skinware_drivers.modbus.registers import Order, Wanted
@@ -51,6 +53,9 @@ class ModbusOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     listen: Annotated[bool, Meta(description="send nothing: overhear another master on a tapped line")] = False
     byte_order: Annotated[Order | None, Meta(description="of a register; default: as the driver says")] = None
     word_order: Annotated[Order | None, Meta(description="of registers of a value; default: likewise")] = None
+    gateway: Annotated[str, Meta(description="let others ask, too: PORT or HOST:PORT, or the path of a new port")] = ""
+    gateway_writes: Annotated[bool, Meta(description="no: the gateway refuses every write")] = True
+    gateway_public: Annotated[bool, Meta(description="other machines may reach the gateway")] = False
 
 
 def device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
@@ -74,6 +79,8 @@ class ModbusBus(KernelBus):
     ``send`` has a message (function and data) sent to a unit between two reads; the answer is a frame of the identifier
     ``ANSWERS | unit``. Only reads and writes of registers can be sent.
 
+    With a ``gateway``, other programs ask through it between two reads.
+
     Args:
         channel: ``tcp://HOST[:PORT]``, or the path of a port.
         options: see :class:`ModbusOptions`.
@@ -82,7 +89,7 @@ class ModbusBus(KernelBus):
         make_timer: gives the timer that wakes it.
 
     Raises:
-        ConfigurationError: no such address, an option is unknown or has a bad value, or a connection is to be tapped.
+        ConfigurationError: no such address, an option is unknown or has a bad value, or options contradict each other.
     """
 
     medium: ClassVar[str] = "modbus"
@@ -111,6 +118,12 @@ class ModbusBus(KernelBus):
                 raise ConfigurationError(f"{self.name}: only a line can be tapped, not a connection: it needs a master")
         else:
             self._serial_options = options_from_strings(SerialOptions, given)
+        self._gateway: Gateway | None = None
+        if self._modbus.gateway:
+            if listens:
+                raise ConfigurationError(f"{self.name}: who only listens cannot ask for others: no gateway")
+            guests = Guests(may_write=self._modbus.gateway_writes, over_tcp=self._address is not None)
+            self._gateway = Gateway(self._modbus.gateway, guests, is_public=self._modbus.gateway_public)
         self._make_timer = make_timer
         self._wanted = Wanted(())
         self._timing = Timing(NS_PER_S, NS_PER_S, 0)
@@ -180,11 +193,19 @@ class ModbusBus(KernelBus):
         """
         if self._epoll is not None:
             return
-        self._port = self._open_port()
+        self._port = port = self._open_port()
+        if self._gateway is not None:
+            try:
+                self._gateway.open()
+            except BusNotAvailable:
+                self._port = None
+                port.close()
+                raise
         self._timer = self._make_timer()
         epoll = select.epoll()
-        epoll.register(self._port.fileno(), select.EPOLLIN)
-        epoll.register(self._timer.fileno(), select.EPOLLIN)
+        for each in (port, self._timer, self._gateway):
+            if each is not None:
+                epoll.register(each.fileno(), select.EPOLLIN)
         self._begin_anew()
         self._epoll = epoll  # last: the driver looks at it while a thread opens the bus
 
@@ -200,8 +221,17 @@ class ModbusBus(KernelBus):
         else:
             over_tcp = self._address is not None
             kind = Master if native.library() is None else NativeMaster
+            guests = None if self._gateway is None else self._gateway.guests
+            if guests is not None:
+                guests.give_up()
             self._talk = kind(
-                self._wanted, self._timing, self.counters, over_tcp=over_tcp, name=self.name, begun_ns=now_ns()
+                self._wanted,
+                self._timing,
+                self.counters,
+                over_tcp=over_tcp,
+                name=self.name,
+                begun_ns=now_ns(),
+                guests=guests,
             )
         self._wake()
 
@@ -219,6 +249,8 @@ class ModbusBus(KernelBus):
         port, talk = self._port, self._talk
         if port is None or talk is None:
             raise BusNotAvailable(f"{self!r} is not open")
+        if self._gateway is not None:
+            self._gateway.serve(now_ns())
         left, self._left = self._left, b""
         come = port.read(CHUNK)
         self.tap.keep_bytes(now_ns(), come)
@@ -231,6 +263,8 @@ class ModbusBus(KernelBus):
             if self.counters.framing.checksum_errors > damaged:
                 self.samples.note(Unused.REFUSED, 0, chunk)
         self._say(port, talk)
+        if self._gateway is not None:
+            self._gateway.watch()
         taken = 0
         while talk.rows and batch.free:
             row = talk.rows.popleft()
@@ -258,7 +292,7 @@ class ModbusBus(KernelBus):
             return False
         if self._unsent or self._left:
             return False
-        address = talk.hand_over(port.fileno())
+        address = talk.hand_over(port.fileno(), -1 if self._gateway is None else self._gateway.fileno())
         if address is None:
             return False
         self._timer.wake_at(None)  # C looks at the time itself
@@ -298,14 +332,15 @@ class ModbusBus(KernelBus):
         """Let go of the port. Idempotent."""
         epoll, port, timer = self._epoll, self._port, self._timer
         self._epoll = self._port = self._timer = self._talk = None  # first: a thread may close it, too
-        for each in (epoll, timer, port):
+        for each in (epoll, timer, self._gateway, port):
             if each is not None:
                 each.close()
 
     @property
     def note(self) -> str:
         """What a person should know about the port."""
-        return "" if self._port is None else self._port.note
+        notes = [] if self._port is None else [self._port.note, "" if self._gateway is None else self._gateway.note]
+        return ", ".join(filter(None, notes))
 
     def _say(self, port: Port, talk: Talk) -> None:
         said = talk.say(now_ns())

@@ -14,19 +14,20 @@ from typing import NamedTuple
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
+from skinware_drivers.modbus.guests import Guests
 from skinware_drivers.modbus.registers import Image, Row, Wanted
+from skinware_drivers.modbus.trouble import Trouble
 from skinware_drivers.modbus.wire import Message
-from skinware_drivers.running.backoff import Backoff
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 ANSWERS = 0x700
 """Identifier of the frame that answers a driver's own question: this, and the unit. Its payload is the message."""
-_PATIENT_TIMES = 3
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
 _BUSY_NS, _SILENCE_NS = NS_PER_S // 100, NS_PER_S // 500
 _MOST_TRIES = 3
 _MOST_COMMANDS = 64
+_COMMAND, _GUEST = -1, -2
+"""In the place of a read: a question of the driver's own, and one of another program."""
 _OVERHEARD_NS = NS_PER_S
 """Registers that another master has read longer ago are not joined with newer ones."""
 
@@ -72,23 +73,9 @@ class Open(NamedTuple):
     """A question that waits for its reply."""
 
     message: Message
-    read: int  # -1: a command
+    read: int  # below 0: another question
     until_ns: int
     tries: int
-
-
-class _Trouble:
-    """How often in a row something failed, and until when it is left alone."""
-
-    def __init__(self) -> None:
-        self.times = 0
-        self.until_ns = 0
-        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-
-    def again(self, time_ns: int) -> None:
-        self.times += 1
-        if self.times >= _PATIENT_TIMES:
-            self.until_ns = time_ns + round(self._pauses.next_s() * NS_PER_S)
 
 
 class Master(Talk):
@@ -101,6 +88,8 @@ class Master(Talk):
     replies do not tell what they answer. Over TCP they have the number of their question; but there are servers which,
     when two questions are open, answer the first with the number of the second (pymodbus 3.16).
 
+    Between two reads that are due, one question of other programs is asked. Those are never repeated.
+
     Args:
         wanted: what is asked for.
         timing: how.
@@ -108,10 +97,19 @@ class Master(Talk):
         over_tcp: in a connection; else on a serial line.
         name: of the bus, for messages.
         begun_ns: now.
+        guests: other programs.
     """
 
     def __init__(
-        self, wanted: Wanted, timing: Timing, counters: BusCounters, *, over_tcp: bool, name: str, begun_ns: int
+        self,
+        wanted: Wanted,
+        timing: Timing,
+        counters: BusCounters,
+        *,
+        over_tcp: bool,
+        name: str,
+        begun_ns: int,
+        guests: Guests | None = None,
     ) -> None:
         super().__init__()
         self._timing, self._counters, self._name = timing, counters, name
@@ -121,7 +119,9 @@ class Master(Talk):
         self._tcp = wire.TcpMessages(counters.framing) if over_tcp else None
         self._rtu = None if over_tcp else wire.RtuMessages(counters.framing)
         self._commands: deque[Message] = deque()
-        self._troubles: dict[Hashable, _Trouble] = {}
+        self._guests = guests
+        self._was_guest = False
+        self._troubles: dict[Hashable, Trouble] = {}
         self._open: Open | None = None
         self._late: Message | None = None
         self._again: Open | None = None
@@ -139,6 +139,10 @@ class Master(Talk):
         return False
 
     @property
+    def _has_guests(self) -> bool:
+        return self._guests is not None and self._guests.are_waiting
+
+    @property
     def _holds_back(self) -> bool:
         """Whether something has come that is no whole message."""
         found = self._tcp if self._rtu is None else self._rtu
@@ -149,7 +153,7 @@ class Master(Talk):
         """A timeout, the end of a pause, or the beginning of a cycle."""
         if self._open is not None:
             return self._open.until_ns
-        if self._commands or self._again is not None or self._next < len(self._reads):
+        if self._commands or self._again is not None or self._next < len(self._reads) or self._has_guests:
             return self._free_ns
         return max(self._free_ns, self._deadline_ns) if self._reads else None
 
@@ -164,7 +168,14 @@ class Master(Talk):
             again, self._again = self._again, None
             return self._ask(again.message, again.read, time_ns, again.tries)
         if self._commands:
-            return self._ask(self._commands.popleft(), -1, time_ns)
+            return self._ask(self._commands.popleft(), _COMMAND, time_ns)
+        is_due = self._next < len(self._reads) or (time_ns >= self._deadline_ns and bool(self._reads))
+        if self._guests is not None and not (is_due and self._was_guest):
+            question = self._guests.next(time_ns)
+            if question is not None:
+                self._was_guest = True
+                return self._ask(question, _GUEST, time_ns)
+        self._was_guest = False
         if self._next == len(self._reads) and time_ns >= self._deadline_ns and self._reads:
             self._begin_cycle(time_ns)
         while self._next < len(self._reads):
@@ -211,7 +222,10 @@ class Master(Talk):
         code = wire.exception_of(message.data)
         if not wire.is_reply(asked.message.data, message.data):
             self._counters.framing.refused += 1
-        elif asked.read < 0:
+            self._answer_guest(asked, None, time_ns)
+        elif asked.read == _GUEST:
+            self._answer_guest(asked, message.data, time_ns)
+        elif asked.read == _COMMAND:
             self.rows.append(Row(time_ns, ANSWERS | message.unit, message.data))
         elif code:
             self._take_exception(asked, code, time_ns)
@@ -223,15 +237,21 @@ class Master(Talk):
     def _take_damaged(self, asked: Open, time_ns: int) -> None:
         """What came is as long as the reply, and is none: ask again once the line is silent."""
         self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
-        if asked.tries < _MOST_TRIES:
+        if asked.read == _GUEST:
+            self._answer_guest(asked, None, time_ns)
+        elif asked.tries < _MOST_TRIES:
             self._again = asked
+
+    def _answer_guest(self, asked: Open, reply: bytes | None, time_ns: int) -> None:
+        if asked.read == _GUEST and self._guests is not None:
+            self._guests.answer(reply, time_ns)
 
     def _take_exception(self, asked: Open, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
             return
-        trouble = self._troubles.setdefault(("read", asked.read), _Trouble())
+        trouble = self._troubles.setdefault(("read", asked.read), Trouble())
         if not trouble.times:
             read = self._reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
@@ -242,7 +262,8 @@ class Master(Talk):
         self._open = None
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
-            self._troubles.setdefault(("unit", asked.message.unit), _Trouble()).again(time_ns)
+            self._troubles.setdefault(("unit", asked.message.unit), Trouble()).again(time_ns)
+        self._answer_guest(asked, None, time_ns)
         self._late, self._free_ns = asked.message, time_ns + self._timing.timeout_ns
         if self._rtu is not None:
             self._rtu.drop()
@@ -257,9 +278,9 @@ class Master(Talk):
         until_ns = time_ns + self._timing.timeout_ns
         if self._tcp is not None:
             self._number = self._number % 0xFFFF + 1
-            message = message._replace(number=self._number)
         elif self._rtu is not None:
             self._rtu.drop()
+        message = message._replace(number=self._number)
         self._open = Open(message, read, until_ns, tries + 1)
         self._counters.sent += 1
         return wire.rtu_frame(message) if self._tcp is None else wire.tcp_frame(message)

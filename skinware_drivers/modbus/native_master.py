@@ -44,18 +44,29 @@ class NativeMaster(Master):
         )
         is_plain = self._image.is_plain and all(read.every == 1 for read in self._reads)
         self._can = is_plain and 0 < self._asker.most_blocks <= _MOST_BLOCKS
+        self._is_stuck = False
 
-    def hand_over(self, fd: int) -> int | None:
+    def say(self, time_ns: int) -> bytes:
+        """Also where C could not go on."""
+        self._is_stuck = False
+        return super().say(time_ns)
+
+    def hand_over(self, fd: int, guests_fd: int) -> int | None:
         """Have C go on, until ``take_back`` is called.
+
+        Args:
+            fd: of the port.
+            guests_fd: readable when another program wants something; -1: none can.
 
         Returns:
             The address of its state; None: there is something that only Python can do.
         """
-        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows
-        if not self._can or asks_otherwise or self._holds_back or (self._open is not None and self._open.read < 0):
+        asks_otherwise = self._commands or self._again or self._late or self._troubles or self.rows or self._has_guests
+        is_unusual = self._open is not None and (self._open.read < 0 or self._open.tries > 1)
+        if not self._can or self._is_stuck or asks_otherwise or is_unusual or self._holds_back:
             return None
         asker, counters = self._asker, self._counters
-        asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, -1, 0, 0
+        asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, guests_fd, 0, 0
         asker.open, asker.next = -1, self._next
         if self._open is not None:
             asker.open, asker.until_ns = self._open.read, self._open.until_ns
@@ -72,6 +83,7 @@ class NativeMaster(Master):
     def take_back(self) -> bytes:
         """Go on from where C is; gives what it has read and not understood."""
         asker, counters = self._asker, self._counters
+        self._is_stuck = bool(asker.is_stuck)
         self._number, self._cycle, self._next = asker.number, asker.cycle, asker.next
         self._free_ns, self._cycle_ns, self._deadline_ns = asker.free_ns, asker.cycle_ns, asker.deadline_ns
         counters.sent, counters.polls_missed, counters.frames = asker.sent, asker.polls_missed, asker.frames

@@ -15,9 +15,15 @@ from skinware_drivers.serial.checksums import CRC16_MODBUS
 
 READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_MANY = 3, 4, 6, 16
 READS = (READ_HOLDING, READ_INPUT)
-WRITES = (WRITE_ONE, WRITE_MANY)
 MOST_REGISTERS, MOST_WRITTEN = 125, 123
 """Of one read, and of one write."""
+_READ_BITS, _WRITE_BIT, _WRITE_BITS, _MASK, _EXCHANGE = (1, 2), 5, 15, 22, 23
+"""Which this driver never asks; other programs may, through it or beside it."""
+_MOST_BITS, _MOST_WRITTEN_BITS, _MOST_EXCHANGED = 2000, 1968, 121
+_ECHOING = {_WRITE_BIT: 5, WRITE_ONE: 5, _WRITE_BITS: 5, WRITE_MANY: 5, _MASK: 7}
+"""Functions whose reply repeats the beginning of the question, and how much of it."""
+_COUNTING = (*_READ_BITS, *READS, _EXCHANGE)
+"""Functions whose reply tells how many bytes follow."""
 LONGEST_MESSAGE = 253
 FAILED = 0x80
 """Bit of the function in a reply that is an exception."""
@@ -62,11 +68,40 @@ def question_to_read(function: int, address: int, count: int) -> bytes:
     return struct.pack(">BHH", function, address, count)
 
 
+def is_known(question: bytes) -> bool:
+    """Whether this is a function whose questions and replies we know."""
+    return question[0] in _COUNTING or question[0] in _ECHOING
+
+
+def is_write(question: bytes) -> bool:
+    """Whether a question changes something."""
+    return question[0] in _ECHOING or question[0] == _EXCHANGE
+
+
+def is_question(question: bytes) -> bool:
+    """Whether a question is as the specification has it: its length, and how much it asks for."""
+    function, size = question[0], len(question)
+    count = int.from_bytes(question[3:5], "big")
+    if function in READS or function in _READ_BITS:
+        return size == 5 and 1 <= count <= (MOST_REGISTERS if function in READS else _MOST_BITS)
+    if function in (WRITE_MANY, _WRITE_BITS):
+        bits, most = (16, MOST_WRITTEN) if function == WRITE_MANY else (1, _MOST_WRITTEN_BITS)
+        return 1 <= count <= most and size == 6 + (bits * count + 7) // 8 == 6 + question[5]
+    if function == _EXCHANGE:
+        written = int.from_bytes(question[7:9], "big")
+        are_few = 1 <= count <= MOST_REGISTERS and 1 <= written <= _MOST_EXCHANGED
+        return are_few and size == 10 + 2 * written == 10 + question[9]
+    return size == _ECHOING.get(function)
+
+
 def reply_size(question: bytes) -> int:
-    """Bytes of the reply to a question, unless it is an exception (which has 2); 0: not known."""
-    if question[0] in READS and len(question) == 5:
-        return 2 + 2 * int.from_bytes(question[3:5], "big")
-    return 5 if question[0] in WRITES else 0
+    """Bytes of the reply to a question, unless it is an exception (which has 2); 0: there is no such question."""
+    if not question or not is_question(question):
+        return 0
+    if question[0] in _COUNTING:
+        count = int.from_bytes(question[3:5], "big")
+        return 2 + ((count + 7) // 8 if question[0] in _READ_BITS else 2 * count)
+    return _ECHOING[question[0]]
 
 
 def is_reply(question: bytes, reply: bytes) -> bool:
@@ -75,7 +110,7 @@ def is_reply(question: bytes, reply: bytes) -> bool:
         return len(reply) == 2
     if reply[:1] != question[:1] or len(reply) != reply_size(question):
         return False
-    return reply[1] == len(reply) - 2 if question[0] in READS else reply[1:5] == question[1:5]
+    return reply[1] == len(reply) - 2 if question[0] in _COUNTING else question.startswith(reply)
 
 
 def exception_of(reply: bytes) -> int:
@@ -209,27 +244,29 @@ class RtuMessages:
 
 def _sizes_of_reply(here: bytes, unit: int, question: bytes) -> list[int]:
     """Bytes of the frames that may begin here and answer a question."""
+    size = reply_size(question)
     good = bytes([unit]) + question[:1]
-    if question[0] in READS:
-        good += bytes([reply_size(question) - 2])
+    if question[0] in _COUNTING:
+        good += bytes([size - 2]) if size else b""
     failed = bytes([unit, question[0] | FAILED])
     sizes = []
-    for begin, size in ((good, 1 + reply_size(question) + _CRC), (failed, 3 + _CRC)):
+    for begin, whole in ((good, 1 + size + _CRC if size else 0), (failed, 3 + _CRC)):
         n = min(len(begin), len(here))
-        if here[:n] == begin[:n]:
-            sizes.append(size)
+        if whole and here[:n] == begin[:n]:
+            sizes.append(whole)
     return sizes
 
 
 def _size_of_question(here: bytes) -> int:
     """Bytes of the question that may begin here; 0: none does."""
-    if len(here) < 2:
+    if len(here) < 2 or 1 <= here[1] <= WRITE_ONE:
         return 8
-    if 1 <= here[1] <= WRITE_ONE:
-        return 8
-    if here[1] not in (15, WRITE_MANY):
+    if here[1] == _MASK:
+        return 10
+    length_at = {_WRITE_BITS: 6, WRITE_MANY: 6, _EXCHANGE: 10}.get(here[1])
+    if length_at is None:
         return 0
-    return 9 + here[6] if len(here) > 6 else 9
+    return length_at + 3 + (here[length_at] if len(here) > length_at else 0)
 
 
 __all__ = [
@@ -241,7 +278,6 @@ __all__ = [
     "READS",
     "READ_HOLDING",
     "READ_INPUT",
-    "WRITES",
     "WRITE_MANY",
     "WRITE_ONE",
     "Message",
@@ -249,7 +285,10 @@ __all__ = [
     "TcpMessages",
     "exception_of",
     "exception_text",
+    "is_known",
+    "is_question",
     "is_reply",
+    "is_write",
     "question_to_read",
     "reply_size",
     "rtu_frame",

@@ -1,160 +1,284 @@
-"""Hostile devices for drivers of Modbus: whatever they reply, nothing raises, all bytes are accounted for, and the
-data paths in numpy and in C make the same of it. What ``tools/fuzz hostile_devices`` does for long and the tests for a
-moment.
+"""One fuzzer's input, run through a Modbus bus of each kind: what ``tools/fuzzing/modbus_lines.py`` does.
+
+An input is a script: what the other end of the line says to each question (a good reply, half of one, a damaged one, an
+exception, a reply to another question, any bytes), and how time passes. Two buses hear the same, one in which C asks
+while all is well and one that never leaves Python: they ask the same, count the same and have the same in the end.
+A listener hears the replies beside their questions.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping
-from typing import Any
+import os
+import select
+import socket
+from contextlib import ExitStack
+from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 
-from skinware_drivers.counters import BusCounters
+from skinware.driver_service import DriverWriter
+from skinware.errors import BusNotAvailable
+from skinware.sensor_types import PRESSURE
+from skinware_drivers import Module, NoOptions, Patch, native, taxels
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import assemble
-from skinware_drivers.modbus import ModbusAdapter, wire
-from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
-from skinware_drivers.modbus.master import Master, Timing
+from skinware_drivers.modbus import ModbusAdapter, Registers, wire
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.master import Listener, Master
 from skinware_drivers.modbus.registers import Wanted
-from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.modbus.wire import Message
-from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
+from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.flow import Flow, flow_of
+from skinware_drivers.running.generation import Generation
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.serial.ports import DescriptorPort, Port
+from skinware_drivers.testing.clock import HandClock
+from tests.serial.fuzzing import Script
 
-MS = 1_000_000
-FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
-    "inspire": lambda: InspireDriver(InspireOptions()),
-    "inspire-by_matrix": lambda: InspireDriver(InspireOptions(by_matrix=True)),
-    "revo2": lambda: Revo2Driver(Revo2Options()),
-}
-_ROWS = 64
+_OTHER_BUS = 2
+_MOST_BYTES = 300
+_MS = 1_000_000
 
 
-def fuzz(adapter: ModbusAdapter[Any], n_bytes: int, seed: int, *, over_tcp: bool) -> Counter[str]:
-    """Let a hostile device answer the questions of a driver, with so many bytes.
+class Outcome(NamedTuple):
+    """What came of an input.
 
-    Args:
-        adapter: whose patches and registers are known.
-        n_bytes: at least.
-        seed: of what is random.
-        over_tcp: in a connection, that ends where no Modbus comes; else on a line.
-
-    Returns:
-        What came, and what became of it: ``bytes``, ``rows``, ``updates``, and how often which kind of reply.
+    Attributes:
+        heard: bytes.
+        frames: of registers.
+        in_c: how often C was handed the line.
     """
-    tables = assemble([("bus", adapter.patches)], adapter.types, adapter.dtype)
-    found: Counter[str] = Counter()
-    with hand_clock() as clock:
-        hostile = _Hostile(adapter, np.random.default_rng(seed), clock.now_ns, over_tcp)
-        periods_s, size = [adapter.period_s], adapter.payload_size
-        publishing = Publishing(adapter.period_s)
-        with Pair(
-            clock, [adapter.layout], tables, periods_s, publishing, watch=adapter.watch, payload_size=size
-        ) as pair:
-            while hostile.found["bytes"] < n_bytes:
-                while len(hostile.master.rows) < _ROWS and hostile.found["bytes"] < n_bytes:
-                    hostile.answer()
-                rows = [(0, row.time_ns, row.identifier, row.payload) for row in hostile.master.rows]
-                hostile.master.rows.clear()
-                pair.pass_to(hostile.now_ns)
-                if rows:
-                    pair.feed(rows)
-                hostile.found["rows"] += len(rows)
-            state = pair.numpy.decoder.state
-            assert state.bus_counters[0, :3].sum() == 0, "the bus made frames that the layout does not know"
-            found["updates"] = int(state.patch_counters[:, 0].sum())
-        hostile.require_accounted()
-    return found + hostile.found
+
+    heard: int
+    frames: int
+    in_c: int
 
 
-class _Hostile:
-    """Who answers a master, in every way but the expected one, and often enough in that."""
+class Fingers(ModbusAdapter[NoOptions]):
+    """Two units; the blocks of one lie in several reads, and side by side in one."""
 
-    def __init__(self, adapter: ModbusAdapter[Any], random: np.random.Generator, now_ns: int, over_tcp: bool) -> None:
-        self.now_ns = now_ns
-        self.found: Counter[str] = Counter()
-        self._random, self._over_tcp = random, over_tcp
-        self._counters = BusCounters()
-        self._wanted = Wanted(
-            adapter.registers,
-            adapter.address_step,
-            adapter.largest_gap,
-            adapter.most_registers,
-            adapter.byte_order,
-            adapter.word_order,
+    types = (PRESSURE.measured(unit="counts"),)
+    dtype = np.uint16
+    period_s = 0.02
+    timeout_s = 0.05
+    turnaround_s = 0.001
+    patches = tuple(
+        Patch(
+            f"finger {unit}", [Module(taxels(n, first_uid=(unit << 12) + (n << 4)), key=n) for n in (9, 150)], key=unit
         )
-        self._begin()
+        for unit in (1, 2)
+    )
+    registers = tuple(
+        Registers(address, n, unit=unit, patch=unit, module=n)
+        for unit in (1, 2)
+        for address, n in ((3000, 9), (3012, 150))
+    )
 
-    def answer(self) -> None:
-        """Wait for a question, and reply something."""
-        said = b""
-        while not said:
-            said = self.master.say(self.now_ns)
-            if not said:
-                due_ns = self.master.due_ns
-                assert due_ns is not None, "it asks no more"
-                self.now_ns = max(self.now_ns + 1, due_ns)
-        asked = self._message(said)
-        stream = b"".join(self._reply(asked) for _ in range(int(self._random.integers(1, 4))))
-        at = 0
-        while at < len(stream):
-            size = int(self._random.choice([1, 7, 100, 300]))
-            self._hear(stream[at : at + size])
-            at += size
 
-    def require_accounted(self) -> None:
-        """Every byte was taken as something."""
-        counters = self._counters.framing
-        assert counters.bytes_in == self.found["bytes"]
-        taken = counters.frame_bytes + counters.skipped_bytes
-        assert taken == counters.bytes_in - self._pending, "bytes were lost or counted twice"
+class _End(ModbusBus):
+    """A bus at the end of a pair of sockets, whatever its name says."""
+
+    def __init__(self, channel: str) -> None:
+        super().__init__(channel, payload_size=Fingers(NoOptions()).payload_size)
+        self.far, self.near = socket.socketpair()
+        self.far.setblocking(False)
+
+    def _open_port(self) -> Port:
+        return DescriptorPort("line", socket.socket(fileno=os.dup(self.near.fileno())))
+
+    def asked(self) -> bytes:
+        """What it has sent since."""
+        try:
+            return self.far.recv(1 << 16)
+        except BlockingIOError:
+            return b""
 
     @property
-    def _pending(self) -> int:
-        return sum(line.pending for line in (self.master._tcp, self.master._rtu) if line is not None)
+    def registers(self) -> list[bytes]:
+        """What it has of its devices."""
+        assert isinstance(self._talk, Master)
+        image = self._talk._image
+        return [area.registers.tobytes() + area.heard_ns.tobytes() for area in image.areas] + [image.told_ns.tobytes()]
 
-    def _begin(self) -> None:
-        timing = Timing(20 * MS, 5 * MS, MS // 2)
-        self.master = Master(
-            self._wanted, timing, self._counters, over_tcp=self._over_tcp, name="bus", begun_ns=self.now_ns
+
+class _InPython:
+    """A bus that never leaves Python."""
+
+    in_c = 0
+
+    def __init__(self, channel: str, stack: ExitStack) -> None:
+        self.bus = _End(channel)
+        stack.callback(_close, self.bus)
+        self._batch = FrameBatch(64, self.bus.payload_size)
+        Fingers(NoOptions()).fit(self.bus)
+        with mock.patch.object(native, "library", return_value=None):
+            self.bus.open()
+
+    def take(self) -> None:
+        self._batch.clear()
+        self.bus.receive(self._batch, 0)
+
+
+class _InC(_InPython):
+    """One for which C asks, and Python where it has to."""
+
+    def __init__(self, channel: str, stack: ExitStack) -> None:
+        self.bus = _End(channel)
+        stack.callback(_close, self.bus)
+        epoll = stack.enter_context(select.epoll())
+        self._loop_fd = os.eventfd(1)  # Python always has something to do: C takes once, and comes back
+        stack.callback(os.close, self._loop_fd)
+        adapter = Fingers(NoOptions())
+        adapter.fit(self.bus)
+        line = BusLine("line", 0, adapter, self.bus, epoll)
+        line.patches = adapter.patches
+        self.bus.open()
+        line._is_open()
+        tables = assemble([("line", adapter.patches)], adapter.types, np.dtype(np.uint16))
+        writer = DriverWriter(
+            "fingers",
+            tables.structure,
+            bus_counters=ALL_BUS_COUNTERS,
+            patch_counters=ALL_PATCH_COUNTERS,
         )
+        stack.callback(writer.close)
+        decoder = Decoder([adapter.layout], tables, [adapter.period_s])
+        publisher = Publisher(writer, decoder, adapter.watch(tables), adapter.period_s, by_cycle=True)
+        self._generation = Generation([line], decoder, adapter.watch(tables), publisher, adapter.period_s)
+        flow = flow_of(self._generation, epoll.fileno(), 0.0, self._fail, self._fail)
+        assert isinstance(flow, Flow)
+        self._flow = flow
 
-    def _hear(self, chunk: bytes) -> None:
-        self.now_ns += int(self._random.choice([10_000, 200_000, 7 * MS], p=[0.6, 0.38, 0.02]))
-        self.found["bytes"] += len(chunk)
+    def take(self) -> None:
+        if self._flow._run(self._loop_fd, 0.01) == _OTHER_BUS:
+            batch = self._generation.empty_batch()
+            self.bus.receive(batch, 0)
+            self._generation.digest(batch)
+        self.in_c += len(self._flow._handed)
+
+    def _fail(self, *told: object) -> None:
+        raise AssertionError(told)
+
+
+def _close(bus: _End) -> None:
+    bus.close()
+    bus.far.close()
+    bus.near.close()
+
+
+def _counts(bus: ModbusBus) -> dict[str, int]:
+    return dict(zip(OWN_BUS_COUNTERS, read_own(bus.counters), strict=True))
+
+
+def run(clock: HandClock, data: bytes) -> Outcome:
+    """Run one input.
+
+    Raises:
+        AssertionError: the ways differ, or something was not counted.
+    """
+    script = Script(data)
+    over_tcp = script.number(2) == 1
+    channel = "tcp://127.0.0.1:1" if over_tcp else "/dev/line"
+    with ExitStack() as stack:
+        return _Fuzz(clock, script, [way(channel, stack) for way in (_InPython, _InC)], over_tcp=over_tcp).run()
+
+
+class _Fuzz:
+    """Plays a script."""
+
+    def __init__(self, clock: HandClock, script: Script, ways: list[_InPython], *, over_tcp: bool) -> None:
+        self._clock, self._script, self._ways, self._over_tcp = clock, script, ways, over_tcp
+        self._heard = 0
+        self._question: Message | None = None
+        self._before = Message(1, wire.question_to_read(3, 3000, 9))
+        self._listening = BusCounters()
+        wanted = Wanted(Fingers.registers)
+        self._listener = Listener(wanted, self._listening)
+
+    def run(self) -> Outcome:
+        is_modbus = True
+        while is_modbus and not self._script.is_over:
+            self._clock.now_ns += (0, 0, 0, 1, 5, 30, 60, 300)[self._script.number(8)] * _MS
+            is_modbus = self._take()
+            if is_modbus and (said := self._say()):
+                self._heard += len(said)
+                for way in self._ways:
+                    way.bus.far.send(said)
+                is_modbus = self._take()
+        one, other = self._ways
+        framing = one.bus.counters.framing
+        assert framing.bytes_in <= self._heard
+        assert framing.frame_bytes + framing.skipped_bytes <= framing.bytes_in
+        if is_modbus:
+            assert framing.bytes_in == self._heard
+            counts, others = _counts(one.bus), _counts(other.bus)
+            assert counts == others, {key: (n, others[key]) for key, n in counts.items() if n != others[key]}
+            assert one.bus.registers == other.bus.registers
+        return Outcome(self._heard, one.bus.counters.frames, other.in_c)
+
+    def _take(self) -> bool:
+        """Until all is heard; False: it was no Modbus, as both say."""
+        was_lost = [self._take_by(way) for way in self._ways]
+        assert was_lost[0] == was_lost[1], was_lost
+        if was_lost[0]:
+            return False
+        one, other = (way.bus.asked() for way in self._ways)
+        assert one == other, f"asked {one.hex(' ')} and {other.hex(' ')}"
+        if one:
+            self._listener.heard(one, self._clock.now_ns)
+            self._before = self._question or self._before
+            self._question = (
+                Message(one[6], one[7:12], int.from_bytes(one[:2], "big"))
+                if self._over_tcp
+                else Message(one[0], one[1:6])
+            )
+        return True
+
+    def _take_by(self, way: _InPython) -> bool:
         try:
-            self.master.heard(chunk, self.now_ns)
-        except ValueError:  # the bus closes the connection then
-            assert self._over_tcp
-            self.found["closed"] += 1
-            rows = self.master.rows
-            self._begin()
-            self.master.rows = rows
+            for _ in range(4):
+                way.take()
+        except BusNotAvailable:
+            return True
+        return False
 
-    def _message(self, said: bytes) -> Message:
-        if self._over_tcp:
-            return Message(said[6], said[7:], int.from_bytes(said[:2], "big"))
-        return Message(said[0], said[1:-2])
-
-    def _reply(self, asked: Message) -> bytes:
-        random = self._random
-        kind = str(random.choice(["good", "exception", "other", "damaged", "cut", "noise"], p=[0.7, *[0.06] * 5]))
-        self.found[kind] += 1
-        size = wire.reply_size(asked.data) - 2
-        data = bytes([asked.data[0], size & 0xFF]) + random.bytes(size)
-        if kind == "exception":
-            data = bytes([asked.data[0] | 0x80, int(random.integers(1, 12))])
-        elif kind == "other":
-            asked = asked._replace(unit=int(random.integers(256)), number=int(random.integers(1 << 16)))
-        message = asked._replace(data=data)
-        frame = bytearray(wire.tcp_frame(message) if self._over_tcp else wire.rtu_frame(message))
-        if kind == "damaged":
-            frame[int(random.integers(len(frame)))] ^= 1 << int(random.integers(8))
-        elif kind == "cut":
-            del frame[int(random.integers(len(frame))) :]
-        elif kind == "noise":
-            frame[:0] = random.bytes(int(random.integers(1, 40)))
-        return bytes(frame)
+    def _say(self) -> bytes:
+        script, asked = self._script, self._question or self._before
+        what = script.number(12)
+        if what == 11:
+            return b""
+        if what == 10:
+            return script.bytes(script.number(_MOST_BYTES))
+        message = self._before if what == 9 else asked
+        count = int.from_bytes(message.data[3:5], "big")
+        data = bytes([message.data[0], 2 * count]) + (script.bytes(4) * count)[: 2 * count]
+        if what == 8:
+            data = bytes([message.data[0] | 0x80, script.number(12)])
+        reply = message._replace(data=data)
+        frame = wire.tcp_frame(reply) if self._over_tcp else wire.rtu_frame(reply)
+        if what == 7:
+            return frame[: script.number(len(frame))]
+        if what == 6:
+            place = script.number(len(frame))
+            return frame[:place] + bytes([frame[place] ^ 1 << script.number(8)]) + frame[place + 1 :]
+        self._listener.heard(frame, self._clock.now_ns)
+        return frame + (script.bytes(script.number(20)) if what == 5 else b"")
 
 
-__all__ = ["FUZZED", "fuzz"]
+def listen(script: bytes) -> int:
+    """Let a listener hear any bytes; how many it skipped.
+
+    Raises:
+        AssertionError: it counted wrongly.
+    """
+    counters = BusCounters()
+    listener = Listener(Wanted(Fingers.registers), counters)
+    for begin in range(0, len(script), 60):
+        listener.heard(script[begin : begin + 60], begin)
+    framing = counters.framing
+    assert framing.bytes_in == len(script)
+    assert framing.frame_bytes + framing.skipped_bytes <= framing.bytes_in
+    return framing.skipped_bytes

@@ -17,7 +17,7 @@ from skinware.memory.namespace import Namespace
 
 def main() -> None:
     """Entry point."""
-    from tests.modbus.fuzzing import FUZZED, fuzz
+    from tests.modbus.hostile import FUZZED, fuzz
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(FUZZED)}; default: all")

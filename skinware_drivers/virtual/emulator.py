@@ -35,7 +35,6 @@ Source = Callable[[int, int], Sequence[int]]
 
 _DATA = "data"
 _REPLY_NS = 200_000
-_LONGEST_QUEUE = 256
 _FOREIGN_IDENTIFIERS = 40
 
 
@@ -123,6 +122,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         lowest: least value that it can send.
         rest: value of a sensor that nobody touches.
         swing: what a firm press adds to it.
+        longest_queue: frames that a device keeps for the wire; more are lost.
         devices: by number, once powered up.
     """
 
@@ -135,6 +135,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
     lowest: ClassVar[int | Sequence[int]] = 0
     rest: ClassVar[int | Sequence[int]] = 0
     swing: ClassVar[int | Sequence[int]]
+    longest_queue: ClassVar[int] = 256
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
         Stage.__init__(self, log, ("lost", "repeated", "truncated", "corrupted", "foreign"))
@@ -323,7 +324,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         lost: set[int] = set()
         for position, (identifier, payload) in enumerate(frames):
             fault = _FAULTS[int(hit[position].argmax())] if hit[position].any() else None
-            if len(device.transmitter) + len(identifiers) >= _LONGEST_QUEUE:
+            if len(device.transmitter) + len(identifiers) >= self.longest_queue:
                 fault = "unsent"
             sent = payload
             if fault == "truncated":

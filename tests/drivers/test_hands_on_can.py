@@ -204,9 +204,10 @@ def test_what_a_hand_has_is_heard(touch: str) -> None:
     assert patches == expected.patches
 
 
-def test_a_palm_is_heard() -> None:
-    (hand,) = listened({"touch": "hand_12x6", "palm": True, "program_ms": 100})
-    assert [module.kind for module in hand.modules] == ["12x6"] * 5 + ["14x16"]
+@pytest.mark.parametrize(("touch", "palm"), [("hand_12x6", "14x16"), ("hand_23x9", "28x20"), ("12x6", "12x6")])
+def test_a_palm_is_heard(touch: str, palm: str) -> None:
+    (hand,) = listened({"touch": touch, "palm": True, "program_ms": 100})
+    assert [module.kind for module in hand.modules] == [touch.removeprefix("hand_")] * 5 + [palm]
 
 
 def test_two_hands_on_one_bus() -> None:

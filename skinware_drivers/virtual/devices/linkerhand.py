@@ -47,6 +47,7 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
 
     full_scale = 255
     swing = 200
+    longest_queue = 1024
     period_s = 0.05
 
     def __init__(self, options: EmulatedLinkerHandOptions, **more: Any) -> None:

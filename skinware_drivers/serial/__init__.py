@@ -20,9 +20,11 @@ from skinware_drivers.serial.checksums import (
 )
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.length_first import LengthFirst
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from skinware_drivers.serial.parts import Part, Parts
 from skinware_drivers.serial.recurring import Recurring
+from skinware_drivers.serial.splitting import Split, by_length
 from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
 from skinware_drivers.serial.text_matrix import TextMatrix
 
@@ -47,6 +49,7 @@ __all__ = [
     "Delimited",
     "Field",
     "Length",
+    "LengthFirst",
     "LengthTable",
     "Packet",
     "Part",
@@ -54,8 +57,10 @@ __all__ = [
     "Recurring",
     "Refused",
     "SerialAdapter",
+    "Split",
     "Sum",
     "TextMatrix",
     "Unframed",
     "Xor",
+    "by_length",
 ]

@@ -4,26 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from skinware_drivers.serial.framing import Framed, Framer, Framing
+from skinware_drivers.serial.parts import Part
 
 Splitting = Callable[[int, bytes], Iterable[tuple[int, bytes]]]
 """(identifier, body) of a frame -> those of the frames that it becomes."""
-
-
-class Part(NamedTuple):
-    """Bytes of a body that become a frame.
-
-    Attributes:
-        identifier: of that frame.
-        start: first byte in the body.
-        stop: one past the last.
-    """
-
-    identifier: int
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -105,4 +91,4 @@ class _Splitter(Framer):
         raise NotImplementedError  # the framer of the whole frames finds
 
 
-__all__ = ["Part", "Split", "Splitting", "by_length"]
+__all__ = ["Split", "Splitting", "by_length"]

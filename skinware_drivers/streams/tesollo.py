@@ -39,7 +39,8 @@ from skinware_drivers.polling import Poll
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.length_first import LengthFirst
-from skinware_drivers.serial.splitting import Part, Split, by_length
+from skinware_drivers.serial.parts import Part
+from skinware_drivers.serial.splitting import Split, by_length
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

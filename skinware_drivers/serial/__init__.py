@@ -20,8 +20,10 @@ from skinware_drivers.serial.checksums import (
 )
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.length_first import LengthFirst
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from skinware_drivers.serial.recurring import Recurring
+from skinware_drivers.serial.splitting import Part, Split, by_length
 from skinware_drivers.serial.stuffing import COBS, HDLC, LINES, SLIP
 from skinware_drivers.serial.text_matrix import TextMatrix
 
@@ -46,13 +48,17 @@ __all__ = [
     "Delimited",
     "Field",
     "Length",
+    "LengthFirst",
     "LengthTable",
     "Packet",
+    "Part",
     "Recurring",
     "Refused",
     "SerialAdapter",
+    "Split",
     "Sum",
     "TextMatrix",
     "Unframed",
     "Xor",
+    "by_length",
 ]

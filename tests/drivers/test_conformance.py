@@ -20,6 +20,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.modbus.revo2 import Revo2Driver
+from skinware_drivers.modbus.revo3 import Revo3Driver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
@@ -53,6 +54,7 @@ from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
+from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
@@ -369,6 +371,18 @@ class TestRevo2(DriverConformance):
 class TestRevo2ThatIsSwitchedOn(TestRevo2):
     driver_options: ClassVar[Mapping[str, Any]] = {"enable": True}
     emulator_options: ClassVar[Mapping[str, Any]] = {"enabled": False}
+
+
+class TestRevo3(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedRevo3
+
+
+class TestRevo3Matrix(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedRevo3
+    driver_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
 
 
 def test_every_driver_that_ships_is_here() -> None:

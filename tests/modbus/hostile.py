@@ -18,6 +18,7 @@ from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.master import Master, Timing
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
+from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 
@@ -26,6 +27,8 @@ FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
     "inspire": lambda: InspireDriver(InspireOptions()),
     "inspire-by_matrix": lambda: InspireDriver(InspireOptions(by_matrix=True)),
     "revo2": lambda: Revo2Driver(Revo2Options()),
+    "revo3": lambda: Revo3Driver(Revo3Options()),
+    "revo3-matrix": lambda: Revo3Driver(Revo3Options(mapping="matrix")),
 }
 _ROWS = 64
 

@@ -100,6 +100,17 @@ EXAMPLES: dict[str, Example] = {
         ),
         range(0, 256, 7),
     ),
+    "paxini_converter": Example(
+        Packet(
+            sync=(0xAA, 0x55, range(256), range(4), range(16), 0x00),
+            length=Length(Field(2, 2), 5),
+            maximum=200,
+            checksum=LRC,
+            identifier=Field(4, 4, mask=0x07_04_00_FF),
+            header=8,
+        ),
+        (3, 0x0300_0003, 0x0400_0008, 0x0304_0001),
+    ),
     "paxini_high_speed": Example(
         Packet(
             sync=(0xAA, (0x55, 0x56)),

@@ -20,10 +20,12 @@ from skinware.status import Status, load_report
 from skinware.structure import Structure
 from skinware.views.health import bus_reason_name, bus_state_name, count_statuses, patch_state_name
 from skinware_drivers.doctor.evidence import BusSeen, Change, Counted, PatchSeen
+from skinware_drivers.doctor.matrices import whole_lines
 
 _HOUR_S = 3600
 _MOST_CHANGES = 500
 _MOST_NAMES = 3
+_BAD = np.uint8(Status.SUSPECT | Status.NOT_CONNECTED | Status.NO_ACK)
 
 Numbers = npt.NDArray[np.int64]
 Tables = Mapping[str, npt.NDArray[Any]]
@@ -220,6 +222,10 @@ class DriverLog:
             if bit.name and counts[bit.name.lower()]
         }
         return counts, names
+
+    def lines(self) -> tuple[str, ...]:
+        """Names of the rows and columns of matrices of which nothing good came, in no frame."""
+        return whole_lines(self.structure, (self._always & _BAD) != 0) if self.frames else ()
 
 
 __all__ = ["DriverLog"]

@@ -175,6 +175,7 @@ class DriverSeen:
         structure: of its sensors.
         statuses: sensors by status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``, for people.
+        lines: names of the rows and columns of matrices of which nothing good came.
         buses, patches: its.
         timing: its.
         health: of its taxels; None: not judged.
@@ -193,6 +194,7 @@ class DriverSeen:
     structure: Structure
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
+    lines: tuple[str, ...]
     buses: tuple[BusSeen, ...]
     patches: tuple[PatchSeen, ...]
     timing: Timing

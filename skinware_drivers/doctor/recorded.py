@@ -197,6 +197,7 @@ class _DriverTrack:
             structure=log.structure,
             statuses=statuses,
             affected=affected,
+            lines=log.lines(),
             buses=_joined(log.buses(), [one.buses() for one in self._earlier]),
             patches=_joined(
                 log.patches(status, newest.published_ns),

@@ -16,6 +16,7 @@ from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Se
 AREA = "taxels"
 _STATUS, _HEALTH, _CALIBRATION = "explanation/status.md", "tactile/health.md", "tactile/calibration.md"
 _MOST_NAMES = 3
+_MOST_LINES = 6
 
 
 class _Meaning(NamedTuple):
@@ -55,6 +56,7 @@ def check(evidence: Evidence) -> Iterator[Note]:
             AREA, f"driver {driver.name}", f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}"
         )
         yield from _statuses(driver)
+        yield from _lines(driver)
         yield from _health(driver)
         yield from _places(driver)
 
@@ -79,6 +81,20 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
             meaning.action,
             (command,),
             _STATUS if name != "unhealthy" else _HEALTH,
+        )
+
+
+def _lines(driver: DriverSeen) -> Iterator[Finding]:
+    if driver.lines:
+        yield Finding(
+            Severity.ERROR,
+            AREA,
+            "a matrix tells nothing good in whole rows or columns",
+            f"driver {driver.name}",
+            f"{'; '.join(driver.lines[:_MOST_LINES])}{' ...' if len(driver.lines) > _MOST_LINES else ''}",
+            "a broken wire or a loose plug rather than so many broken taxels: look at the cables of these lines",
+            (f"skin-top {driver.name}",),
+            _STATUS,
         )
 
 

@@ -134,6 +134,7 @@ class _DriverWatch:
             structure=reader.structure,
             statuses=statuses,
             affected=affected,
+            lines=log.lines(),
             buses=log.buses(),
             patches=log.patches(status, now_ns()),
             timing=self._timing(life),

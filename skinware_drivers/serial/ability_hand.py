@@ -12,7 +12,7 @@ have no touch.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -24,7 +24,7 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.conditions import Identifier
+from skinware_drivers.conditions import Bits, Identifier
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Expand, Frame, Layout, Packed, Sentinel, Values
@@ -35,6 +35,7 @@ from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.splitting import Split
 from skinware_drivers.serial.stuffing import HDLC
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -44,12 +45,12 @@ _FINGERS = ("index", "middle", "ring", "little", "thumb")
 _SITES_M = ((0.0, 0.0), (0.0, 0.006), (-0.004, 0.006), (-0.004, 0.020), (0.004, 0.006), (0.004, 0.020))
 """Across and down the finger, from its outermost sensor: upper and lower tip, upper and lower left, and right. After
 ``fsrlocs_to_xml.py`` of the maker's, of fingers of the large hand; which side is seen as the left one is not told."""
-_N = len(_FINGERS) * len(_SITES_M)
-_TOUCH_AT, _BODY = 24, 70
+_N = len(_SITES_M)
+_TOUCH_AT, _FINGER_BYTES, _BODY = 24, 9, 70
 _MOST = 4095
-_WITH_TOUCH = (Identifier(0x00, 0x74E), Identifier(0x40, 0x75E))
-"""Headers of answers: 0 or 1 in the lower four bits. None of them is 50, with which questions to a hand begin."""
-_WITHOUT_TOUCH = Match(0x02, 0x0F)
+_FINGER = 0x100
+"""Identifiers of the parts of an answer; below are headers and addresses."""
+_WITHOUT_TOUCH = Match(0x02, 0x70F)
 _IDENTIFY_S = 0.3
 _C1, _C2, _DIVIDER_OHM = 121591.0, 0.878894, 1e4
 """Placeholders: the maker says that nothing is calibrated."""
@@ -73,18 +74,25 @@ class AbilityHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         check_options(self)
 
 
-class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
-    """One hand on a serial line; uid = 6 * finger + site, in the order of the wire."""
+def _by_finger(header: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+    """An answer with touch in five parts; anything else as it is."""
+    if header & 0x0F > 1 or len(body) != _BODY:
+        return [(header, body)]
+    touch = body[_TOUCH_AT:]
+    return [(_FINGER | n, touch[n * _FINGER_BYTES :][:_FINGER_BYTES]) for n in range(len(_FINGERS))]
 
-    framing: Framing = Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0))
+
+class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
+    """One hand on a serial line; uid = 6 * finger + site, in the order of the wire. Each finger is a module."""
+
+    framing: Framing = Split(Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0)), _by_finger)
     baudrate = 460_800
 
     def __init__(self, options: AbilityHandOptions) -> None:
         super().__init__(options)
-        touch = Values(_TOUCH_AT, Packed(12, order="little"), _N)
         zero, most = Sentinel(Status.SUSPECT, 0), Sentinel(Status.OUT_OF_RANGE, _MOST)
         kind: SensorType = PRESSURE.measured(unit="counts", minimum=0, maximum=_MOST)
-        values: Values | Expand = touch
+        values: Values | Expand = Values(0, Packed(12, order="little"), _N)
         self.dtype: npt.DTypeLike = np.uint16
         if options.force != "no":
             newton = partial(_newton, sign=1 if options.force == "published" else -1)
@@ -93,15 +101,14 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
             kind = FORCE_Z.measured(minimum=0)
         flags = [zero, most] if options.zero == "suspect" else [most]
         self.types: Sequence[SensorType] = (kind,)
+        finger = Identifier(_FINGER, 0x7F8)
         self.layout: Layout = Layout(
-            [
-                Frame(name, [header], [_BODY], values, flags=flags)
-                for name, header in zip(("answer", "answer to 4x"), _WITH_TOUCH, strict=True)
-            ]
+            [Frame("finger", [finger], [_FINGER_BYTES], values, module=Bits(0, 3), flags=flags)]
         )
-        self.patches: Sequence[Patch] = (
-            Patch(f"{options.side} hand", (Module(taxels(_N, kind.name), kind="5x6", name="fingers"),)),
-        )
+        modules = [
+            Module(taxels(_N, kind.name, first_uid=_N * key), key, "3x2", name) for key, name in enumerate(_FINGERS)
+        ]
+        self.patches: Sequence[Patch] = (Patch(f"{options.side} hand", modules),)
         self.geometry: Geometry | None = _places(Hand(options.side), kind.name)
 
     @property
@@ -131,7 +138,7 @@ def _places(hand: Hand, type_name: str) -> Geometry:
     found = []
     for number, finger in enumerate(_FINGERS):
         [(x, y, z)] = hand.down(finger, [Grid(1, 1)])
-        for site, (across, down) in enumerate(_SITES_M, len(_SITES_M) * number):
+        for site, (across, down) in enumerate(_SITES_M, _N * number):
             found.append(Grid(1, 1).at((x + across, y - down, z), [type_name], [site]))
     return Geometry.joined(found)
 
@@ -144,7 +151,8 @@ def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:
 
 def _expand(payload: _Bytes, length: _Bytes, newton: Any) -> tuple[Any, Any, npt.NDArray[np.float32]]:
     """Of each pair of sensors, three bytes."""
-    low, middle, high = np.moveaxis(payload[:, _TOUCH_AT : _BODY - 1].astype(np.int64).reshape(-1, _N // 2, 3), 2, 0)
+    pairs = payload[:, :_FINGER_BYTES].astype(np.int64).reshape(-1, _N // 2, 3)
+    low, middle, high = pairs[..., 0], pairs[..., 1], pairs[..., 2]
     counts = np.stack([low | (middle & 0xF) << 8, middle >> 4 | high << 4], axis=2).ravel()
     row, channel = np.divmod(np.arange(len(length) * _N), _N)
     return row, channel, newton(counts)

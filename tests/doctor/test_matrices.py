@@ -1,0 +1,60 @@
+"""Whole rows and columns of matrices of which nothing good comes are named as such."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from skinware.sensor_types import FORCE, PRESSURE
+from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.doctor.finding import Severity
+from skinware_drivers.doctor.matrices import whole_lines
+from skinware_drivers.testing.driving import emulated_skin
+from tests.doctor.rig import found_until, of
+
+
+@pytest.mark.parametrize(
+    ("bad", "named"),
+    [
+        ([], ()),
+        ([0, 1, 2], ()),
+        ([0, 1, 2, 3], ("row 0 of pad, 3x4",)),
+        ([1, 5, 9, 2, 6], ("column 1 of pad, 3x4",)),
+        ([0, 1, 2, 3, 5, 9], ("row 0 of pad, 3x4", "column 1 of pad, 3x4")),
+        (range(12), ("all of pad, 3x4",)),
+        (range(12, 18), ("all of pad, strip",)),
+        (range(12, 17), ()),
+        (range(18, 22), ()),
+    ],
+)
+def test_lines_that_are_all_bad(bad: list[int], named: tuple[str, ...]) -> None:
+    modules = [
+        Module(taxels(12), 0, "3x4", "3x4"),
+        Module(taxels(6, first_uid=20), 1, "1x6", "strip"),
+        Module(taxels(4, first_uid=30), 2, "block", "block"),
+    ]
+    structure = assemble([("bus", [Patch("pad", modules)])], [PRESSURE], np.uint8).structure
+    of_sensor = np.zeros(structure.n_sensors, bool)
+    of_sensor[list(bad)] = True
+    assert whole_lines(structure, of_sensor) == named
+
+
+def test_a_line_of_one_axis_is_named_once() -> None:
+    modules = [Module(taxels(4, *(t.name for t in FORCE)), kind="2x2", name="tip")]
+    structure = assemble([("bus", [Patch("hand", modules)])], FORCE, np.int16).structure
+    of_taxel = np.array([True, True, False, False])
+    bad = np.array([of_taxel[int(uid)] for uid in structure.sensor_uid])
+    assert whole_lines(structure, bad) == ("row 0 of hand, tip",)
+
+
+def test_broken_lines_of_a_pad_are_named() -> None:
+    with emulated_skin("flexitac", broken_rows=(3,), broken_columns=(5, 6)):
+        finding = found_until(of("taxels", "whole rows or columns"))
+    assert finding.severity == Severity.ERROR
+    assert finding.evidence == "row 3 of pad, matrix; column 5 of pad, matrix; column 6 of pad, matrix"
+
+
+def test_a_pad_without_any_current() -> None:
+    with emulated_skin("flexitac", rows=16, columns=16, broken_rows=tuple(range(16))):
+        finding = found_until(of("taxels", "whole rows or columns"))
+    assert finding.evidence == "all of pad, matrix"

@@ -155,7 +155,7 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
         """How many matrices it has; nothing that it is asked stops one that sends."""
-        matrices = await cls._ask_matrices(link)
+        matrices = await cls._ask_matrices(link, tries=1)
         return f"Weiss DSA controller with {len(matrices)} matrices"
 
     async def start(self, link: Link) -> None:

@@ -200,8 +200,10 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return [Patch(model.name, modules)]
 
     @classmethod
-    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Its model; the question disturbs nothing."""
+    async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
+        """Its model; the question disturbs nothing. Devices on serial lines are not asked: no hand is there."""
+        if "tcp://" not in link.bus_name:
+            return None
         hand = await cls(TesolloOptions(sensors=1))._ask_version(link)  # noqa: SLF001
         return f"Tesollo {_MODELS[hand.model].name}"
 

@@ -127,8 +127,10 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         return self._describe(seen)
 
     @classmethod
-    async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
-        """Which sensors the server has."""
+    async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
+        """Which sensors the server has; nobody else is waited for."""
+        if "websocket:" not in link.bus_name:
+            return None
         patches = await cls(XelaServerOptions()).describe(link)
         return f"XELA's server with {', '.join(patch.name for patch in patches)}"
 

@@ -20,6 +20,7 @@ from skinware_drivers.testing.carrying import emulated_on_a_pty
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
+from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from tests.finding.fakes import see_only
@@ -29,6 +30,7 @@ DEVICES: dict[str, tuple[Any, str]] = {
     "agni": (EmulatedAgni, "AGNI device 7 with 2 sensors"),
     "openpatch": (EmulatedOpenPatch, "open patch: emulated 1"),
     "paxini": (EmulatedPaxini, "Paxini sensor 3: PAXINI PXSR-STDDP03F-v1.0.5"),
+    "weiss_dsa": (EmulatedWeissDsa, "Weiss DSA controller with 6 matrices"),
     "weiss_wts": (EmulatedWeissWts, "WTS with 4 x 8 cells"),
     "wuji_glove": (EmulatedWujiGlove, "Wuji left glove"),
 }

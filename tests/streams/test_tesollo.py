@@ -19,6 +19,7 @@ from skinware_drivers.testing.carrying import emulated_on
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
+from tests.commands import run
 from tests.serial.spoken import Spoken
 from tests.streams.peers import LOCAL, free_port
 
@@ -95,6 +96,15 @@ def test_a_hand_behind_tcp(tips: str, dtype: type, kind: str, count: int, namesp
             else:
                 with pytest.raises(Exception, match="only hands with force sensors"):
                     skin.reader.call("tare")
+
+
+def test_a_hand_is_asked_for_its_model_over_tcp_only(namespace: object) -> None:
+    port = free_port()
+    device = make_bus(f"tcp://{LOCAL}:{port}", payload_size=4096, for_devices=True)
+    with emulated_on(device, EmulatedTesollo):
+        found = run("skin-find", f"tcp://{LOCAL}:{port}", "--probe", "--driver", "tesollo")
+        assert "answers: Tesollo DG-5F right" in found.stdout
+    assert asyncio.run(TesolloDriver.identify(Link(make_bus("/dev/ttyUSB0")), idle=True)) is None
 
 
 def test_saturated_cells_are_flagged_and_columns_may_come_first() -> None:

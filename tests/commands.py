@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import queue
@@ -10,9 +11,13 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import IO, Any
+
+from skinware.cli._command import exit_status
 
 BIN = Path(sys.executable).parent
 PATIENCE_S = 120.0
@@ -24,6 +29,18 @@ def run(command: str, *arguments: str, timeout_s: float = PATIENCE_S) -> subproc
     return subprocess.run(
         [BIN / command, *arguments], capture_output=True, text=True, timeout=timeout_s, stdin=subprocess.DEVNULL
     )
+
+
+def refused(command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command that is to refuse its arguments, in this process: a new one costs a hundred times as much.
+
+    Its exit status and output are those of ``run``. An exception that it does not expect is raised here.
+    """
+    (entry,) = entry_points(group="console_scripts", name=command)
+    out, errors = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(errors):
+        status = exit_status(import_module(entry.module).command, arguments)
+    return subprocess.CompletedProcess([command, *arguments], status, out.getvalue(), errors.getvalue())
 
 
 class Running:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.status import BusState, PatchState, Status, load_report
+from skinware.structure import Structure
 from skinware.views.following import Followed
 from skinware.views.health import (
     DEAD,
@@ -76,32 +78,37 @@ def state_of(driver: Followed) -> dict[str, Any]:
 
 
 def problems_of(driver: Followed, state: dict[str, Any]) -> list[dict[str, Any]]:
-    """What is wrong with a driver, each with how bad it is: ``error``, ``warning`` or ``note``.
+    """What is wrong with a driver, each with how bad it is: ``error``, ``warning`` or ``note``, and where.
 
     Args:
         driver: it.
         state: what ``state_of`` said.
     """
-    found: list[tuple[str, str]] = []
+    found: list[dict[str, Any]] = []
+
+    def add(severity: str, text: str, **where: str) -> None:
+        found.append({"severity": severity, "driver": driver.number, **where, "text": text})
+
     if driver.life != LIVE:
-        found.append(_LIVES.get(driver.life, (NOTE, driver.life)))
+        add(*_LIVES.get(driver.life, (NOTE, driver.life)))
     if driver.life not in WITHOUT_NEWS:
         for bus in state["buses"]:
             if bus["state"] != bus_state_name(BusState.LIVE):
-                found.append((ERROR, _because(f"{bus['name']} is {bus['state']}", bus["reason"])))
+                add(ERROR, _because(f"{bus['name']} is {bus['state']}", bus["reason"]), bus=bus["name"])
             elif bus["reason"]:
-                found.append((WARNING, _because(bus["name"], bus["reason"])))
+                add(WARNING, _because(bus["name"], bus["reason"]), bus=bus["name"])
         for patch in state["patches"]:
             if patch["state"] != patch_state_name(PatchState.LIVE):
                 age = "" if patch["age_ms"] is None else f", its newest data is {patch['age_ms'] / 1e3:.1f} s old"
-                found.append((WARNING, f"{patch['name']} is {patch['state']}{age}"))
+                add(WARNING, f"{patch['name']} is {patch['state']}{age}", bus=patch["bus"], patch=patch["name"])
     for bit, (severity, text) in _STATUSES.items():
-        count = int(np.count_nonzero(driver.status & np.uint8(bit)))
-        if count and driver.frame is not None:
-            found.append((severity, f"{count} of {driver.structure.n_sensors} sensors {text}"))
+        sensors = np.flatnonzero(driver.status & np.uint8(bit))
+        if len(sensors) and driver.frame is not None:
+            where = _patch_of(driver.structure, sensors)
+            add(severity, f"{len(sensors)} of {driver.structure.n_sensors} sensors {text}", **where)
     if state["lost"]:
-        found.append((NOTE, f"{state['lost']} frames lost on its buses since it started"))
-    return [{"severity": severity, "driver": driver.number, "text": text} for severity, text in found]
+        add(NOTE, f"{state['lost']} frames lost on its buses since it started")
+    return found
 
 
 def problem_of_all(text: str) -> dict[str, Any]:
@@ -136,6 +143,14 @@ def _patches(driver: Followed) -> list[dict[str, Any]]:
         }
         for patch, name in enumerate(structure.patch_names)
     ]
+
+
+def _patch_of(structure: Structure, sensors: npt.NDArray[np.intp]) -> dict[str, str]:
+    """Bus and patch that sensors have in common; empty if they are of several."""
+    patch, *others = np.unique(structure.sensor_patch[sensors]).tolist()
+    if others:
+        return {}
+    return {"bus": structure.buses[int(structure.patch_bus[patch])], "patch": structure.patch_names[patch]}
 
 
 def _because(what: str, reason: str | None) -> str:

@@ -65,7 +65,7 @@ def test_what_comes_goes_and_comes_back_changed_is_followed(address: str, open_p
 def test_the_page_connects_again_to_a_command_that_was_started_again(
     namespace: Namespace, open_page: OpenPage, troubles: Troubles, sleeve: Sleeve, number: int
 ) -> None:
-    troubles.expected = ("ERR_CONNECTION_", "WebSocket connection")  # refused, or reset while something was loaded
+    troubles.expected = ("ERR_CONNECTION_", "ERR_EMPTY_RESPONSE", "WebSocket connection")  # also while it answers
     with viewing() as (view, address):
         page = open_page(f"{address}#{RAW_SCALE}")
         until(page, f"skin.connected && {STATE} === 'live'")

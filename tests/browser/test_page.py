@@ -199,6 +199,24 @@ def test_a_picture_shows_what_the_page_shows(page: Page, driver: FakeDriver) -> 
     assert len(data) > 3000
 
 
+def test_figures_of_contacts_and_regions_do_not_wrap(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    """Also where their units differ, and are told beside each."""
+    contact = {"kind": "sliding", "load": 12345.6, "speed": 0.1234, "age_s": 0.456, "taxels": 9, "driver": 0}
+    place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "area_m2": 4e-4}
+    server.extra["contacts"] = [{"id": i, "unit": unit} | contact | place for i, unit in ((8, "counts"), (1234, "N"))]
+    server.extra["regions"] = [
+        {"name": name, "value": 12345.6, "unit": "counts", "speed": 0.0, "touched": True, "driver": 0}
+        for name in ("palm", "the whole of the left forearm")
+    ]
+    until(page, "skin.contacts.length === 2")
+    assert "12346 counts" in page.locator("#contacts").inner_text()
+    assert "12346\t" in page.locator("#regions").inner_text()
+    assert "counts" in page.locator("#regions thead").inner_text()
+    until(page, "document.querySelectorAll('#contacts tbody tr').length === 2")
+    heights = tell(page, "[...document.querySelectorAll('#contacts tbody td, th')].map(cell => cell.clientHeight)")
+    assert max(heights) < 30  # a line has 18
+
+
 def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: FakeDriver) -> None:
     driver.shear = np.zeros((driver.n, 2), np.int8)
     before = look(page)
@@ -207,6 +225,7 @@ def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: Fa
     place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9, "driver": 0}
     server.extra["contacts"] = [contact | place]
     until(page, "skin.contacts.length === 1 && skin.contacts[0].id === 12")
+    assert "load, counts\tmm/s\ts" in page.locator("#contacts").inner_text()
     assert "12\thold\t31.5\t0\t2" in page.locator("#contacts").inner_text()
     page.wait_for_timeout(200)
     after = look(page)

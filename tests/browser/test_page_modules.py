@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
@@ -261,6 +262,68 @@ def test_what_has_a_problem_is_first_in_the_tree(tell: Callable[..., Any]) -> No
         0,
         0,
     ]
+
+
+# -- framing.js ----------------------------------------------------------------------------------------------------
+
+
+PICTURE = "{ right: 0.4, left: 0.4, top: 0.3, bottom: 0.25 }"
+FILLED = f"""(() => {{
+    const position = Float32Array.from(a[0].flat()), normal = Float32Array.from(a[1].flat()), n = a[0].length;
+    const radius = new Float32Array(n).fill(0.001);
+    const sheets = [{{ n, position, normal, radius, placed: a[2] }}], all = () => true, picture = {PICTURE};
+    const towards = m.directionOf(sheets, all, picture);
+    const {{ position: eye, target }} = m.eyeOf(sheets, all, towards, picture);
+    const z = eye.map((x, c) => x - target[c]), away = Math.hypot(...z);
+    return [towards, eye, z.map(x => x / away)];
+}})()"""
+
+
+def edges(points: Any, eye: Any, z: Any) -> tuple[float, float, float, float]:
+    """How far points are to each side of the picture, of the edge of the picture: right, left, top, bottom."""
+    x = np.cross([0, 0, 1], z)
+    x /= np.linalg.norm(x)
+    seen = (np.asarray(points) - eye) @ np.stack([x, np.cross(z, x), z]).T
+    across, up = seen[:, 0] / -seen[:, 2], seen[:, 1] / -seen[:, 2]
+    return across.max() / 0.4, -across.min() / 0.4, up.max() / 0.3, -up.min() / 0.25
+
+
+def cylinder(length: float) -> tuple[list[list[float]], list[list[float]]]:
+    """Places and normals around an arm along x."""
+    at, around = (grid.ravel() for grid in np.meshgrid(np.linspace(0, length, 15), np.arange(12) * np.pi / 6))
+    normals = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)
+    return (np.stack([at, 0 * at, 0 * at], axis=1) + 0.03 * normals).tolist(), normals.tolist()
+
+
+@pytest.mark.parametrize("length", [0.05, 0.3, 0.6])
+def test_the_eye_is_as_near_as_all_taxels_can_be_seen(tell: Callable[..., Any], length: float) -> None:
+    points, normals = cylinder(length)
+    _, eye, z = tell("framing.js", FILLED, points, normals, True)
+    sides = edges(points, eye, z)
+    assert max(sides) < 1
+    assert max(min(sides[:2]), min(sides[2:])) > 0.9  # opposite edges are reached by something
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("steepest", [0.95, 0.2], ids=["nearly flat", "half of an arm"])
+def test_an_arm_is_seen_from_the_side_that_has_taxels(tell: Callable[..., Any], side: int, steepest: float) -> None:
+    points, normals = cylinder(0.3)
+    has = [i for i, normal in enumerate(normals) if side * normal[2] > steepest]
+    towards, _, _ = tell("framing.js", FILLED, [points[i] for i in has], [normals[i] for i in has], True)
+    assert side * towards[2] > 0.2 * np.linalg.norm(towards)
+
+
+def test_what_is_laid_out_flat_is_seen_from_above(tell: Callable[..., Any]) -> None:
+    points = [[0.01 * i, 0.01 * j, 0.0] for i in range(20) for j in range(4)]
+    towards, _, _ = tell("framing.js", FILLED, points, [[0, 0, 1]] * len(points), False)
+    assert towards[2] > 0.99 * np.linalg.norm(towards)
+
+
+def test_no_taxels_and_a_single_one(tell: Callable[..., Any]) -> None:
+    assert tell("framing.js", f"m.eyeOf([], () => true, [0, -1, 1], {PICTURE})") is None
+    _, eye, _ = tell("framing.js", FILLED, [[1, 2, 3]], [[0, 0, 0]], True)
+    assert np.isfinite(eye).all()
+    assert np.linalg.norm(np.subtract(eye, [1, 2, 3])) < 0.1
 
 
 # -- picking.js, overlay.js ----------------------------------------------------------------------------------------

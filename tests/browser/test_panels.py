@@ -83,9 +83,13 @@ def test_problems_stand_first_and_a_row_leads_to_its_taxels(sleeve: Sleeve, addr
     page = open_page(f"{address}#{RAW_SCALE}")
     until(page, "skin.problems.some(text => text.includes('board 9'))")
     assert "board 9" in page.locator(role("problems")).inner_text()
+    page.locator(role("problems")).get_by_role("button", name="board 9 is stale").click()
+    until(page, "skin.selected?.endsWith('/board 9')")
+    stale, others = (int(np.flatnonzero(sleeve.structure.sensor_patch == patch)[0]) for patch in (2, 0))
+    assert states(page, [stale, others], "dimmed") == [False, True]
     before = look(page)
     page.locator(role("row", "[data-patch='board 8']")).click()
-    until(page, "skin.selected !== null")
+    until(page, "skin.selected?.endsWith('/board 8')")
     page.wait_for_timeout(300)
     assert abs(look(page) - before).mean() > 1
 

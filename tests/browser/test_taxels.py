@@ -22,7 +22,7 @@ OpenPage = Callable[..., Page]
 THEMES = ("dark", "light")
 VIEWS = ("solid", "flat")
 MARGIN = 30
-HALF = 8
+HALF = 11
 """Of what is looked at about taxels, and about one, pixels."""
 MARKS = {
     Status.NEVER_SEEN: "never seen",

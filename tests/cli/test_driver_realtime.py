@@ -13,7 +13,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.cli.driver import command
 from skinware_drivers.running import runner
 from tests import scheduling
-from tests.commands import BIN, run, running
+from tests.commands import BIN, refused, running
 from tests.scheduling import may_have_fifo
 from tests.unprivileged import without_rights
 
@@ -122,7 +122,7 @@ def test_how_long_frames_may_wait(
     ],
 )
 def test_wrong_text_gets_one_line_and_exit_code_2(arguments: list[str], words: str) -> None:
-    result = run("skin-driver", *VIRTUAL, *arguments)
+    result = refused("skin-driver", *VIRTUAL, *arguments)
     assert result.returncode == 2
     assert len(result.stderr.splitlines()) == 1
     assert result.stderr.startswith("skin-driver: ")
@@ -143,7 +143,7 @@ def test_wrong_text_gets_one_line_and_exit_code_2(arguments: list[str], words: s
 )
 def test_wrong_text_in_a_file_names_the_file(tmp_path: Path, text: str, words: str) -> None:
     path = config_file(tmp_path, text)
-    result = run("skin-driver", "--config", str(path))
+    result = refused("skin-driver", "--config", str(path))
     assert result.returncode == 2
     assert len(result.stderr.splitlines()) == 1
     line = path.read_text().splitlines().index(text) + 1

@@ -164,8 +164,7 @@ def test_what_does_not_fit_is_told_of() -> None:
                 await until(pilot, lambda: f"↓ {22 - (table.size.height - 1)} more" in line(app, "head"))
                 assert "↑" not in line(app, "head")
                 await until(pilot, lambda: "(PgUp, PgDn: " in line(app, "title"))
-                for _ in range(21):
-                    await pilot.press("down")
+                await pilot.press(*["down"] * 21)
                 await until(pilot, lambda: f"↑ {22 - (table.size.height - 1)} more" in line(app, "head"))
                 assert "↓" not in line(app, "head")
                 await until(pilot, lambda: line(app, "title").startswith("board 26: "))

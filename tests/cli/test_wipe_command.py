@@ -14,7 +14,7 @@ import pytest
 from skinware import Status
 from skinware.sensor_types import PRESSURE
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
-from tests.commands import BIN, PATIENCE_S, run, running
+from tests.commands import BIN, PATIENCE_S, refused, run, running
 
 STRUCTURE = fake_structure(1, 4)
 TAXELS = np.arange(STRUCTURE.n_sensors)[STRUCTURE.index("pressure")]
@@ -131,10 +131,9 @@ def test_a_real_driver_is_wiped() -> None:
 def test_mistakes_get_one_clear_line(arguments: list[str], status: int, words: str) -> None:
     with FakeSkin("hand", STRUCTURE) as skin:
         skin.publish()
-        done = run("skin-wipe", *arguments)
+        done = refused("skin-wipe", *arguments)
     assert (done.returncode, done.stdout) == (status, "")
     assert words in done.stderr
-    assert "Traceback" not in done.stderr
 
 
 def test_of_several_drivers_one_must_be_named() -> None:

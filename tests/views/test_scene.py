@@ -12,7 +12,7 @@ from skinware import Structure
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
 from skinware.views.quantities import quantities_of
-from skinware.views.scene import FLAT_PITCH_M, Scene
+from skinware.views.scene import ASPECT, FLAT_PITCH_M, Scene
 from tests.cli.fake_skin import fake_structure
 from tests.tactile.skins import triangles
 
@@ -47,6 +47,11 @@ def apart(places: npt.NDArray[np.float32]) -> float:
     return float(away[~np.eye(len(places), dtype=bool)].min(initial=np.inf))
 
 
+def beside_or_below(one: npt.NDArray[np.float32], other: npt.NDArray[np.float32]) -> bool:
+    """Whether one's box is on the left of the other's, or above it."""
+    return bool(other[:, 0].min() > one[:, 0].max() or other[:, 1].max() < one[:, 1].min())
+
+
 modules = st.lists(st.tuples(st.integers(0, 3), st.sampled_from(KINDS), st.integers(1, 14)), min_size=1, max_size=9)
 
 
@@ -57,10 +62,21 @@ def test_no_two_lie_on_each_other(one: list[tuple[int, str, int]], other: list[t
     places = np.concatenate([found.position for found in placed])
     assert np.isfinite(places).all()
     assert apart(places) > 0.9 * FLAT_PITCH_M
-    assert placed[1].position[:, 0].min() > placed[0].position[:, 0].max()
+    assert beside_or_below(placed[0].position, placed[1].position)
     for found in placed:
         assert not found.is_known
         assert np.array_equal(found.normal, [[0, 0, 1]] * len(found.normal))
+
+
+@pytest.mark.parametrize(("patches", "per_patch"), [(1, 16), (4, 16), (12, 1), (5, 3)])
+@pytest.mark.parametrize("drivers", [1, 2, 5, 9])
+def test_what_is_laid_out_flat_has_the_shape_of_a_window(drivers: int, patches: int, per_patch: int) -> None:
+    hand = structure_of([(patch, "4x6", 24) for patch in range(patches) for _ in range(per_patch)])
+    scene = scene_of(**{f"hand {number}": hand for number in range(drivers)})
+    hands = [scene.of(f"hand {number}", "pressure").position for number in range(drivers)]
+    assert all(beside_or_below(hands[i], hands[j]) for i in range(drivers) for j in range(i + 1, drivers))
+    width, height, _ = np.ptp(np.concatenate(hands), axis=0)
+    assert 0.4 < width / height / ASPECT < 1 / 0.4  # so much of a window is filled at least: half, where two boxes are
 
 
 def test_a_module_has_its_shape() -> None:

@@ -7,7 +7,7 @@ import { byId, h, setHidden, setText } from "./dom.js";
 import { Modes, onPointer, useTabs } from "./controls.js";
 import { measure } from "./format.js";
 import { Past } from "./history.js";
-import { boxOf, directionOf, withRoom } from "./framing.js";
+import { directionOf } from "./framing.js";
 import { hooks } from "./hooks.js";
 import { fillHelp, onKeys } from "./keys.js";
 import { Legend } from "./legend.js";
@@ -84,7 +84,7 @@ const probes = new Probes(send);
 const cards = new Cards(byId("tip"), byId("pins"), (probe) => pin(probe));
 const tree = new Tree(byId("tree"), choose);
 const bar = new Bar(byId("bar"));
-const list = new Problems(byId("problems"));
+const list = new Problems(byId("problems"), (key) => choose(tree.find(key) ?? null));
 const touches = new Touches(byId("contacts"), byId("regions"));
 const legend = new Legend((scale) => {
   view.scale = scale;
@@ -177,10 +177,10 @@ function restructured() {
 
 function takeState(state) {
   for (const told of state.drivers ?? []) states.set(told.id, told);
-  const nameOf = (id) => skin.drivers.get(id)?.name;
-  now.problems = (state.problems ?? []).map((problem) => {
-    const name = nameOf(problem.driver) ?? problem.driver;
-    return { ...problem, text: name === null || name === undefined ? problem.text : `${name}: ${problem.text}` };
+  now.problems = (state.problems ?? []).map(({ severity, driver, bus, patch, text }) => {
+    const { name = driver, key = null } = skin.drivers.get(driver) ?? {};
+    const told = name === null || name === undefined ? text : `${name}: ${text}`;
+    return { severity, text: told, key: key && [key, bus, patch].filter(Boolean).join("/") };
   });
   now.recording = state.recording ?? null;
   tree.update(skin, states);
@@ -231,10 +231,8 @@ function sheetsChanged() {
 /** Bring all taxels, or those selected, into view. */
 function frameAll(isFirst = false) {
   const isIn = selection();
-  const box = boxOf(stage.sheets, isIn ?? undefined);
-  if (!box) return;
-  const from = isFirst || isIn ? directionOf(stage.sheets, isIn ?? undefined) : null;
-  stage.frame(withRoom(box, stage.sheets), from);
+  const isShown = isIn ?? (() => true);
+  stage.frame(isShown, isFirst || isIn ? directionOf(stage.sheets, isShown, stage.picture) : null);
 }
 
 /** Whether a taxel is selected: (sheet, i) => bool; null if nothing is. */

@@ -2,9 +2,12 @@
 
 import { Matrix4, OrbitControls, PerspectiveCamera, Spherical, Vector3 } from "./vendor/three.min.js";
 import { Flat } from "./flat.js";
+import { eyeOf } from "./framing.js";
 import { Solid } from "./solid.js";
 
 const VIEW_ANGLE = 35; // degrees, from the bottom of the picture to its top
+const FILLED = 0.95; // of the picture, by what is to be seen
+const BELOW = 44; // CSS pixels, of the scale
 const SLOW_MS = 55;
 const QUICK_MS = 24;
 const RATIOS = [0.75, 1, 1.5, 2];
@@ -170,17 +173,14 @@ export class Stage {
   }
 
   /**
-   * Look at a box.
-   * @param {number[]} box smallest and greatest x, y, z.
-   * @param {?number[]} from direction from its middle to the eye; null: as it is.
+   * Have some taxels fill the picture.
+   * @param {(sheet, i) => boolean} isIn which.
+   * @param {?number[]} from direction from them to the eye; null: as it is.
    */
-  frame(box, from = null) {
-    const middle = new Vector3((box[0] + box[3]) / 2, (box[1] + box[4]) / 2, (box[2] + box[5]) / 2);
-    const direction = from
-      ? new Vector3(...from).normalize()
-      : this.camera.position.clone().sub(this.controls.target).normalize();
-    const distance = this.#distance(box, middle, direction);
-    this.look(middle.clone().addScaledVector(direction, distance), middle);
+  frame(isIn, from = null) {
+    const towards = from ?? this.camera.position.clone().sub(this.controls.target).toArray();
+    const eye = eyeOf(this.sheets, isIn, towards, this.picture);
+    if (eye) this.look(new Vector3(...eye.position), new Vector3(...eye.target));
   }
 
   /** Look from a place at another. */
@@ -211,19 +211,12 @@ export class Stage {
     return this.camera.far;
   }
 
-  /** How far away all corners of a box are within the picture. */
-  #distance(box, middle, direction) {
-    const right = new Vector3().crossVectors(this.camera.up, direction).normalize();
-    const up = new Vector3().crossVectors(direction, right);
-    const tall = Math.tan((VIEW_ANGLE * Math.PI) / 360) * 0.88;
+  /** Where the edges of the picture are, 1 m ahead of the eye; what is below it needs a strip of its own. */
+  get picture() {
+    const tall = FILLED * Math.tan((VIEW_ANGLE * Math.PI) / 360);
     const wide = tall * this.camera.aspect;
-    let distance = 0.02;
-    for (let corner = 0; corner < 8; corner++) {
-      const at = new Vector3(...[0, 1, 2].map((c) => box[corner & (1 << c) ? c + 3 : c])).sub(middle);
-      const towards = at.dot(direction);
-      distance = Math.max(distance, towards + Math.abs(at.dot(right)) / wide, towards + Math.abs(at.dot(up)) / tall);
-    }
-    return distance;
+    const below = Math.min(BELOW / this.height, 0.2);
+    return { right: wide, left: wide, top: tall, bottom: tall * (1 - 2 * below) };
   }
 }
 

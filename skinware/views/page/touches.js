@@ -1,9 +1,10 @@
 // Contacts and regions, where services tell them: lists, and where contacts are drawn.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
-import { measure, short } from "./format.js";
+import { short } from "./format.js";
 
-const COLUMNS = ["", "", "load", "mm/s", "s"];
+const CONTACTS = ["", "", "load", "mm/s", "s"];
+const LOAD = CONTACTS.indexOf("load");
 
 export class Touches {
   constructor(contacts, regions) {
@@ -11,34 +12,46 @@ export class Touches {
     this.regions = regions;
     this.contactRows = h("tbody");
     this.regionRows = h("tbody");
-    const head = h("tr", {}, ...COLUMNS.map((name) => h("th", { scope: "col" }, name)));
-    contacts.append(h("h2", {}, "Contacts"), h("table", {}, h("thead", {}, head), this.contactRows));
-    regions.append(h("h2", {}, "Regions"), h("table", {}, this.regionRows));
+    const headOf = (names) => h("tr", {}, ...names.map((name) => h("th", { scope: "col" }, name)));
+    this.contactHead = headOf(CONTACTS);
+    this.regionHead = headOf(["", "", ""]);
+    contacts.append(h("h2", {}, "Contacts"), h("table", {}, h("thead", {}, this.contactHead), this.contactRows));
+    regions.append(h("h2", {}, "Regions"), h("table", {}, h("thead", {}, this.regionHead), this.regionRows));
   }
 
   /** Take a turn; says where the contacts are: [{id, at, normal, area_m2}]. */
   update(skin, header) {
     const places = (header.contacts ?? []).map((contact) => ({ ...contact, at: placeOf(skin, contact) }));
     setHidden(this.contacts, this.contacts.hidden && !places.length); // once there were some, it stays
+    const load = inUnit(places);
+    setText(this.contactHead.cells[LOAD], load.unit ? `load, ${load.unit}` : "load");
     fill(
       this.contactRows,
       places.map((contact) => [
         `${contact.id}`,
         contact.kind ?? "",
-        short(contact.load),
+        load.tell(contact.load, contact.unit),
         short(1000 * contact.speed),
         short(contact.age_s),
       ]),
     );
     setHidden(this.regions, !header.regions?.length);
+    const regions = header.regions ?? [];
+    const region = inUnit(regions);
+    setText(this.regionHead.cells[1], region.unit);
     fill(
       this.regionRows,
-      (header.regions ?? []).map(({ name, value, unit, touched }) => {
-        return [name, measure(value, unit), touched ? "◉ touched" : ""];
-      }),
+      regions.map(({ name, value, unit, touched }) => [name, region.tell(value, unit), touched ? "◉ touched" : ""]),
     );
     return places.filter(({ at }) => at);
   }
+}
+
+/** The unit that all of them have, for the head of their column, and how each is told; several units stay with each. */
+function inUnit(told) {
+  const units = new Set(told.map(({ unit }) => unit ?? ""));
+  if (units.size > 1) return { unit: "", tell: (x, unit) => `${short(x)} ${unit ?? ""}`.trim() };
+  return { unit: [...units][0] ?? "", tell: short };
 }
 
 function placeOf(skin, { position, driver, sensor }) {

@@ -69,9 +69,11 @@ export class Tree {
     return all(this.branches ?? []).find((row) => row.key === key);
   }
 
+  /** Select a row; it comes into view. */
   select(key) {
     this.selected = key;
     this.draw();
+    this.#rows.get(key)?.scrollIntoView({ block: "nearest" });
   }
 
   draw() {

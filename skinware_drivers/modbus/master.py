@@ -306,7 +306,8 @@ class Master(Talk):
 class Listener(Talk):
     """Pairs the questions of another master with their replies, on a line that it taps. It never says anything.
 
-    A reply does not tell which registers it holds, so one whose question was not heard is not used.
+    A reply does not tell which registers it holds, so one whose question was not heard is not used. A master that asks
+    what we would ask first begins its cycle there: what it has read before is then not joined with what comes after.
 
     Args:
         wanted: what is looked for in the replies.
@@ -319,6 +320,9 @@ class Listener(Talk):
         self._image = Image(wanted)
         self._line = wire.RtuMessages(counters.framing)
         self._asked: Message | None = None
+        reads = wanted.reads()
+        self._first = Message(reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
 
     @property
     def due_ns(self) -> int | None:
@@ -346,7 +350,9 @@ class Listener(Talk):
             if wire.exception_of(message.data):
                 self._counters.errors += 1
             elif asked.data[0] in wire.READS:
-                since_ns = time_ns - _OVERHEARD_NS
+                if asked == self._first:
+                    self._cycle_ns = time_ns
+                since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
                 self.rows += self._image.overhear(asked.unit, asked.data, message.data[2:], time_ns, since_ns)
 
 

@@ -16,11 +16,13 @@ import msgspec
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus
+from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.recorded_modbus import as_on_a_line, modbus_form
 from skinware_drivers.virtual.timer import MonotonicTimer
 
 if TYPE_CHECKING:
@@ -188,6 +190,22 @@ class ReplayedSerialBus(SerialBus):
             self._hear(chunk, self._recorded.read_ns)
 
 
+class ReplayedModbusBus(ModbusBus):
+    """A recorded Modbus line or connection, which is listened to: the questions are those of then."""
+
+    def __init__(self, wire: RecordedWire, name: str, *, payload_size: int) -> None:
+        super().__init__("", payload_size=payload_size, listen_only=True)
+        self._wire, self._name = wire, name
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus {self._name}"
+
+    def _open_port(self) -> Port:
+        return _RecordedPort(self._wire)
+
+
 class _RecordedPort(Port):
     """A port that gives what was read, read by read.
 
@@ -251,6 +269,10 @@ def replayed_bus(
     items = _items(recording, wire, wanted)
     of_driver = [one for one in recording.wires if one.driver == wire.driver]
     first_ns = first_of(of_driver, wanted.start)
+    form = modbus_form(wire.items()) if wire.is_serial else None
+    if form is not None:
+        heard = RecordedWire(as_on_a_line(items, form), first_ns, speed=wanted.speed, waits=False, name=name)
+        return ReplayedModbusBus(heard, name, payload_size=payload_size)
     recorded = RecordedWire(items, first_ns, speed=wanted.speed, waits=not listen_only, name=name)
     kind = ReplayedSerialBus if wire.is_serial else ReplayedCanBus
     return kind(recorded, name, payload_size=payload_size, listen_only=listen_only)

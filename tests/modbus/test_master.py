@@ -376,3 +376,14 @@ def test_a_block_of_two_reads_is_joined_only_within_a_second() -> None:
     assert len(said(listener, exchange(1, 104, range(4, 8)), 1500 * MS)) == 1
     assert said(listener, exchange(1, 100, range(4)), 3000 * MS) == []
     assert said(listener, exchange(1, 104, range(4, 8)), 5000 * MS) == []
+
+
+def test_what_is_overheard_of_two_cycles_is_not_joined() -> None:
+    listener, _ = overhear(Registers(0, 200))
+    first, second = exchange(1, 0, range(125)), exchange(1, 125, range(75))
+    assert said(listener, second, 1000 * MS) == []  # it listens from the middle of a cycle on
+    assert said(listener, first, 1020 * MS) == []
+    [row] = said(listener, second, 1021 * MS)
+    assert row.time_ns == 1020 * MS
+    assert said(listener, first, 1040 * MS) == []
+    assert len(said(listener, second, 1041 * MS)) == 1

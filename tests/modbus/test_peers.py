@@ -183,6 +183,32 @@ def test_questions_and_replies_are_recorded(over: Any, tmp_path: Path) -> None:
         assert counted(driving)["state"] == "live"
 
 
+def test_a_recorded_wire_is_decoded_again(over: Any, tmp_path: Path) -> None:
+    """The server raises all registers before each first read: the replay shows values that were seen, and in order."""
+    file = tmp_path / "palm.mcap"
+
+    async def rise(function: int, start: int, address: int, count: int, registers: list[int], _set: object) -> None:
+        if address == FINGER_AT:
+            registers[:] = [registers[0] + 1] * len(registers)
+
+    with over(device(1, FINGER_AT, [0] * N, rise)) as name, driven(name) as (_, reader):
+        with recording(file, with_wires=True) as recorder:
+            wait_until(lambda: any(channel.startswith("/wire/palm/") for channel in recorder.messages))
+            before = int(read_until(reader, lambda frame: frame.values[0] > 0).values[0])
+            last = int(read_until(reader, lambda frame: frame.values[0] > before + 20).values[0])
+            [wire] = [channel for channel in recorder.messages if channel.startswith("/wire/palm/")]
+            written = recorder.messages[wire]
+            wait_until(lambda: recorder.messages[wire] >= written + 3)  # what it has of the wire then is written
+    with driven(f"replay:{file}", wait=False) as (driving, reader):
+        seen = [0]
+        while seen[-1] < last - 5:
+            frame = read_until(reader, lambda frame: frame.values[0] > seen[-1])
+            assert (frame.values == frame.values[0]).all()
+            seen.append(int(frame.values[0]))
+        assert seen == sorted(seen)
+        assert counted(driving)["sent"] == 0
+
+
 def test_several_units_on_one_line_one_of_them_dead() -> None:
     class Fingers(ModbusAdapter[NoOptions]):
         types = Palm.types

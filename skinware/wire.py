@@ -46,7 +46,8 @@ IS_CUT = 0x80
 
 COLUMNS: dict[str, Any] = {"bus": ("<u2", ()), "used": ("<u4", ()), "lost": ("<u8", ()), "pieces": ("u1", BATCH_BYTES)}
 """Of such a service. ``used``: bytes of the pieces; ``lost``: frames or bytes of the bus that there was no room for
-so far. Static columns: ``driver``, its name, and ``bus_name``, those of its buses."""
+so far. Static columns: ``driver``, its name, ``bus_name``, those of its buses, and ``about``, JSON: what the driver is,
+and with which options (``driver_type``, ``listen_only``, ``versions``; ``buses`` with ``medium`` and ``options``)."""
 
 
 class Piece(NamedTuple):

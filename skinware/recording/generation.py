@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -58,12 +59,20 @@ class Generation:
         if not isinstance(self.context, Structure):
             raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
         structure = self.context.only(positions)
-        static = {name: table for name, table in self.static().items() if name != STATIC_NAME}
         columns = dict(self.schema.columns)
         for name in PER_SENSOR:
             columns[name] = replace(columns[name], shape=(structure.n_sensors,))
-        schema = Schema(columns, self.schema.description)
-        return Generation(segments.head_like(self._segment, schema, {**static, **structure.to_columns()}), self.name)
+        return Generation(self.head_with(structure, Schema(columns, self.schema.description)), self.name)
+
+    def head_with(self, structure: Structure, schema: Schema) -> bytes:
+        """The head of the same generation of a driver with another structure.
+
+        Args:
+            structure: whose tables it has.
+            schema: of its columns.
+        """
+        static = {name: table for name, table in self.static().items() if name != STATIC_NAME}
+        return segments.head_like(self._segment, schema, {**static, **structure.to_columns()})
 
     @property
     def generation(self) -> int:
@@ -118,3 +127,21 @@ class Generation:
     def static(self) -> dict[str, npt.NDArray[Any]]:
         """The static columns, read-only."""
         return self._segment.static_columns()
+
+
+def disguised(head: bytes, name: str, disguise: Callable[[str], str]) -> bytes:
+    """The head of the same generation of a driver with other names of its buses; that of any other as it is.
+
+    Args:
+        head: the bytes of the service's file up to its slots.
+        name: of the service.
+        disguise: gives the other names.
+
+    Raises:
+        BadRecording: the head cannot be read.
+    """
+    generation = Generation(head, name)
+    if not isinstance(generation.context, Structure):
+        return head
+    structure = generation.context.replace(buses=[disguise(bus) for bus in generation.context.buses])
+    return generation.head_with(structure, generation.schema)

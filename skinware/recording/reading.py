@@ -15,7 +15,7 @@ from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
 from skinware.recording.generation import Generation
 from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource
 from skinware.recording.timeline import GONE, LIVE, PAUSED, Moment, Timeline
-from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, newer_format, service_of, wire_of
+from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
@@ -56,6 +56,7 @@ class Recording:
         self.end_ns: int = max((place.end_ns for place in self._source.chunks), default=0)
         self._topics: dict[str, int] = {}
         self._wires: dict[tuple[str, str], WireTrack] = {}
+        self._abouts: dict[str, int] = {}
         self._problems: dict[str, None] = {}
         self._damaged: set[int] = set()
         try:
@@ -253,6 +254,9 @@ class Recording:
             if newer is not None:
                 raise BadRecording(f"{self.path}: recorded by a newer version ({newer}): update skinware to read it")
             self._topics[channel.topic] = channel.id
+            driver = about_of(channel)
+            if driver is not None:
+                self._abouts[driver] = channel.id
             wire = wire_of(channel)
             if wire is not None:
                 self._wires[wire] = WireTrack(self, *wire, channel.id)
@@ -281,6 +285,22 @@ class Recording:
                     self.note(str(error))
                 else:
                     services[name].generations.setdefault(generation.generation, generation)
+
+    def about(self, driver: str) -> dict[str, Any]:
+        """What a driver said of itself last, if its wires were recorded: see "Recordings" in the documentation.
+
+        Empty in files of earlier versions, which do not have it.
+
+        Args:
+            driver: its name.
+        """
+        told: dict[str, Any] = {}
+        channel = self._abouts.get(driver)
+        for contents in self.chunks({channel} if channel is not None else ()):
+            for message in contents.messages:
+                if message.channel_id == channel:
+                    told = _event(message.data)
+        return told
 
     def _json(self, topic: str) -> Iterator[dict[str, Any]]:
         channel = self._topics.get(topic, 0)

@@ -25,7 +25,7 @@ from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
 from skinware.recording.codec import CodedColumn, Encoder
 from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
-from skinware.recording.generation import Generation
+from skinware.recording.generation import Generation, disguised
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
@@ -89,6 +89,7 @@ class Recorder:
         names: of services; None: all there are and come.
         namespace: where they are.
         with_wires: record also what goes over the wires of the drivers.
+        disguise: gives what is written in the place of names of buses and of texts of options; None: they are.
         beside: makes messages that are recorded beside frames.
     """
 
@@ -99,12 +100,13 @@ class Recorder:
         names: Collection[str] | None = None,
         namespace: Namespace | str | None = None,
         with_wires: bool = False,
+        disguise: Callable[[str], str] | None = None,
         beside: Beside | None = None,
     ) -> None:
         self._target = target
         self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
-        self._coder = _Coder(target, self._jobs, beside)
+        self._coder = _Coder(target, self._jobs, disguise, beside)
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # what comes later is recorded from its first frame on
         self._stopping = False
@@ -198,10 +200,11 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _WireStream:
-    """What goes over the wires of a driver, with their names."""
+    """What goes over the wires of a driver, with their names, and what it says of itself."""
 
     driver: str
     buses: list[str]
+    about: dict[str, Any]
 
 
 class _Coder(threading.Thread):
@@ -211,16 +214,18 @@ class _Coder(threading.Thread):
         self,
         target: Target,
         jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End],
+        disguise: Callable[[str], str] | None,
         beside: Beside | None,
     ) -> None:
         super().__init__(name="skinware recorder")
         self.channels = Channels()
         self.bytes_done = 0
         self.failure: Exception | None = None
-        self._target, self._jobs, self._beside = target, jobs, beside
+        self._target, self._jobs, self._disguise, self._beside = target, jobs, disguise, beside
         self._streams: dict[str, _Stream | _WireStream] = {}
         self._chunk = OpenChunk()
         self._heads: set[Head] = set()
+        self._abouts = 0
         self._due_ns = 0
         self._next_clock_ns = now_ns()
         self._offset_ns = 0
@@ -272,8 +277,11 @@ class _Coder(threading.Thread):
         segment = segments.recorded(head, service)
         wires = _wires_of(segment)
         if wires is not None:
-            self._streams[service] = wires
+            self._begin_wires(service, wires)
             return
+        if self._disguise is not None:
+            with contextlib.suppress(BadRecording):  # it is kept as it is, and nobody can read it
+                head = disguised(head, service, self._disguise)
         before = self._streams.get(service)
         number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
         channel, schema = self.channels.of_service(service, GENERATION)
@@ -284,6 +292,18 @@ class _Coder(threading.Thread):
             with contextlib.suppress(BadRecording):  # of no driver that anybody could show
                 generation = Generation(head, service)
         self._streams[service] = _Stream(Head(channel, schema, number, head), encoder, generation)
+
+    def _begin_wires(self, service: str, wires: _WireStream) -> None:
+        if self._disguise is not None:
+            buses = [self._disguise(bus) for bus in wires.buses]
+            wires = _WireStream(wires.driver, buses, _texts_disguised(wires.about, self._disguise))
+        before = self._streams.get(service)
+        self._streams[service] = wires
+        if wires.about and not (isinstance(before, _WireStream) and before == wires):
+            about = {**wires.about, "buses": dict(zip(wires.buses, wires.about.get("buses", ()), strict=False))}
+            self._abouts += 1
+            channel, schema = self.channels.of_about(wires.driver)
+            self._heads.add(Head(channel, schema, self._abouts, json.dumps(about).encode()))
 
     def _add_frame(self, stream: _Stream, service: str, frame: Frame) -> None:
         channel, schema = self.channels.of_service(service, FRAME)
@@ -333,4 +353,18 @@ def _wires_of(segment: segments.Segment) -> _WireStream | None:
         return None
     tables = segment.static_columns()
     texts = [bytes(text).decode(errors="replace") for name in ("driver", "bus_name") for text in tables.get(name, ())]
-    return _WireStream(texts[0], texts[1:]) if texts else None
+    about: dict[str, Any] = {}
+    with contextlib.suppress(ValueError, IndexError, KeyError):
+        about = dict(json.loads(bytes(tables["about"][0])))
+    return _WireStream(texts[0], texts[1:], about) if texts else None
+
+
+def _texts_disguised(data: Any, disguise: Callable[[str], str]) -> Any:
+    """The same data, with all texts disguised that are no names of its parts."""
+    if isinstance(data, str):
+        return disguise(data)
+    if isinstance(data, list):
+        return [_texts_disguised(each, disguise) for each in data]
+    if isinstance(data, dict):
+        return {name: _texts_disguised(each, disguise) for name, each in data.items()}
+    return data

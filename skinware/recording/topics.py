@@ -12,7 +12,7 @@ ENCODING = f"skinware/{FORMAT}"
 _FAMILY = "skinware/"
 FRAME, GENERATION = "frame", "generation"
 EVENTS, CLOCK = "/skin/events", "/skin/clock"
-WIRE = "wire"
+WIRE, ABOUT = "wire", "about"
 WIRE_ENCODING = "skinware-wire/1"
 """Of messages with what went over a wire."""
 
@@ -35,6 +35,18 @@ _CLOCK = {
         "boot": {"type": "string", "description": "which start of the machine the first one counts from"},
     },
 }
+_ABOUT = {
+    "type": "object",
+    "properties": {
+        "driver_type": {"type": "string", "description": "as --driver takes it"},
+        "listen_only": {"type": "boolean"},
+        "versions": {"type": "object", "description": "of the programs that ran"},
+        "buses": {
+            "type": "object",
+            "description": "by name: medium, and the options of the driver for it",
+        },
+    },
+}
 _FRAME_TEXT = b"""\
 One frame: u8 generation, u8 sequence, i8 acquired_ns, i8 published_ns, u8 flags, u8 after, little-endian; a byte for
 each column, how it is coded; u4 of each, its size; what changed in each since frame `after`."""
@@ -51,6 +63,7 @@ SCHEMAS = {
     EVENTS: Schema(3, json.dumps(_EVENT).encode(), "jsonschema", "skinware.Event"),
     CLOCK: Schema(4, json.dumps(_CLOCK).encode(), "jsonschema", "skinware.Clock"),
     WIRE: Schema(5, _WIRE_TEXT, WIRE_ENCODING, "skinware.Wire"),
+    ABOUT: Schema(6, json.dumps(_ABOUT).encode(), "jsonschema", "skinware.About"),
 }
 
 
@@ -71,6 +84,10 @@ class Channels:
     def of_wire(self, driver: str, bus: str) -> tuple[Channel, Schema]:
         """The channel of what went over a bus of a driver."""
         return self.of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
+
+    def of_about(self, driver: str) -> tuple[Channel, Schema]:
+        """The channel of what a driver says of itself beside its wires."""
+        return self.of(f"/wire/{driver}", "json", SCHEMAS[ABOUT], {"driver": driver})
 
     def names(self) -> dict[int, str]:
         """Topics by number."""
@@ -100,6 +117,12 @@ def wire_of(channel: Channel) -> tuple[str, str] | None:
     told = channel.metadata
     is_wire = channel.message_encoding == WIRE_ENCODING and "driver" in told and "bus" in told
     return (told["driver"], told["bus"]) if is_wire else None
+
+
+def about_of(channel: Channel) -> str | None:
+    """The driver of a channel with what it says of itself beside its wires; None of any other."""
+    driver = channel.metadata.get("driver", "")
+    return driver if driver and channel.topic == f"/wire/{driver}" else None
 
 
 def newer_format(channel: Channel) -> str | None:

@@ -22,8 +22,8 @@ from skinware.cli._command import (
     run,
     version_option,
 )
-from skinware.errors import ConfigurationError, DriverError
-from skinware_drivers.cli.driver_events import report, tell_patches, tell_ready
+from skinware.errors import ConfigurationError, DriverError, SkinwareError
+from skinware_drivers.cli.driver_events import report, tell_capture, tell_patches, tell_ready
 from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class DriverCommand(HardwareCommand):
 
     def options_class(self, args: list[str]) -> tuple[str, type[msgspec.Struct]]:
         """The options of the driver that the command line or the file names."""
+        from skinware_drivers.cli.of_recording import driver_of_recording
         from skinware_drivers.loading import short_name
         from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
@@ -58,6 +59,9 @@ class DriverCommand(HardwareCommand):
         name = value_of("--driver", args)
         if not name and config:
             name = _read(Path(config)).settings.driver
+        if not name:
+            with contextlib.suppress(SkinwareError):  # which the bus says again when it is made
+                name = driver_of_recording([value_of("--bus", args) or ""])
         name = name or DEFAULT_DRIVER
         return short_name(name), load_driver(name).Options
 
@@ -93,6 +97,8 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
         "skin-driver --bus can0 --realtime fifo:50  real-time scheduling, if allowed",
         "skin-driver --driver xela --help           the options of another driver",
         "skin-driver --bus can0 --driver ./my.py    your own driver, in this file",
+        "skin-driver --bus can0 --capture it.mcap   record all of it, for who helps you",
+        "skin-driver --bus replay:it.mcap           decode that again, with the driver and options of then",
     ),
 )
 @click.option(
@@ -145,6 +151,12 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to run on, such as 1,2-3.")
 @click.option(
+    "--capture",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Record all that goes over the buses, and what comes of it, into a new file for who helps you.",
+)
+@click.option(
     "--unit",
     is_flag=True,
     is_eager=True,
@@ -170,6 +182,7 @@ def command(
     group: str | None,
     realtime: str | None,
     cpus: str | None,
+    capture: Path | None,
     namespace: str | None,
     as_json: bool,
     verbose: bool,
@@ -189,6 +202,7 @@ def command(
     from skinware.geometry import read_geometry
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
+    from skinware_drivers.cli.of_recording import driver_of_recording, only_listened, options_of_recording
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, class_for, load_driver, make_bus
     from skinware_drivers.running.flow import FlowLoop
@@ -201,13 +215,13 @@ def command(
     file = _read(config)
     settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)
-    is_of_file, is_named = not driver_name, bool(driver_name or settings.driver)
-    driver_name = driver_name or settings.driver or DEFAULT_DRIVER
+    bus_names = list(buses) or [bus.name for bus in settings.bus]
+    is_of_file, driver_name = not driver_name, driver_name or settings.driver or driver_of_recording(bus_names)
+    is_named, driver_name = bool(driver_name), driver_name or DEFAULT_DRIVER
     driver_type = short_name(driver_name)
     driver = load_driver(driver_name)
     latency_ms = settings.latency_ms if latency_ms is None else latency_ms
-    listen_only = listen_only or settings.listen_only
-    bus_names = list(buses) or [bus.name for bus in settings.bus]
+    listen_only = listen_only or settings.listen_only or only_listened(bus_names)
     if not bus_names:
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
     _refuse_twice(bus_names)
@@ -215,7 +229,7 @@ def command(
     given = {key: text for key, text in driver_options.items() if text is not None}
 
     def adapter_of(bus_name: str, file: ConfigFile) -> AnyAdapter:
-        options = file.options_of_bus(driver.Options, bus_name, given)
+        options = file.options_of_bus(driver.Options, bus_name, given, options_of_recording(bus_name, driver_type))
         with file.blamed_for(bus_name):
             adapter_class = class_for(driver, bus_name, driver_name)
             with hook("__init__", bus_name):
@@ -252,25 +266,31 @@ def command(
         await runner.change_geometry(geometry)
 
     adapters = [adapter_of(bus_name, file) for bus_name in bus_names]
+    name, place = name or settings.name or driver_type, Namespace(namespace)
     runner = Runner(
         driver_type,
         [(name, adapter, bus_of(name, adapter, file)) for name, adapter in zip(bus_names, adapters, strict=True)],
-        name=name or settings.name or driver_type,
+        name=name,
         listen_only=listen_only,
         wait_for_buses=wait or settings.wait,
         publish=publish or settings.publish or None,
         latency_s=None if latency_ms is None else latency_ms / 1e3,
-        namespace=Namespace(namespace),
+        namespace=place,
         slots=slots,
         group=group,
         geometry=geometry_of(settings),
         on_ready=lambda: tell_ready(runner, as_json),
         on_patches=lambda change: tell_patches(runner, change) if as_json else None,
     )
-    if profile is not None:
-        profile.apply()
-    with asyncio.Runner(loop_factory=FlowLoop) as loop:
-        loop.run(_run(runner, as_json, read_again))
+    with contextlib.ExitStack() as beside:
+        if capture is not None:
+            from skinware_drivers.cli.capturing import captured
+
+            beside.enter_context(captured(capture, name, place.name, lambda done: tell_capture(done, as_json)))
+        if profile is not None:  # not that of what records
+            profile.apply()
+        with asyncio.Runner(loop_factory=FlowLoop) as loop:
+            loop.run(_run(runner, as_json, read_again))
 
 
 async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine[Any, Any, None]]) -> None:

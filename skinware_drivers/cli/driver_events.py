@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,6 +12,7 @@ from skinware.cli._command import print_json
 from skinware.cli._format import plural
 
 if TYPE_CHECKING:
+    from skinware_drivers.cli.capturing import Capture
     from skinware_drivers.running.patch_news import PatchChange
     from skinware_drivers.running.runner import Runner
 
@@ -40,6 +42,19 @@ def tell_patches(runner: Runner, change: PatchChange) -> None:
     """Patches fell silent, or are live again: for programs. People have it in the log."""
     if runner.ready:
         print_json({"event": "patches", "name": runner.name, **change._asdict()})
+
+
+def tell_capture(capture: Capture, as_json: bool) -> None:
+    """The file with what went over the buses is complete, or is not."""
+    with contextlib.suppress(BrokenPipeError):
+        if as_json:
+            print_json({"event": "captured", "file": str(capture.path), **capture.told})
+        elif capture.told["problem"]:
+            click.echo(f"{capture.path}: ended early: {capture.told['problem']}", err=True)
+        else:
+            lost = f", {capture.told['lost']} frames lost" if capture.told["lost"] else ""
+            size = capture.told["bytes"] / 1e6
+            click.echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
 
 
 async def report(runner: Runner) -> None:

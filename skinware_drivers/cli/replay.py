@@ -17,7 +17,7 @@ from skinware.cli.replay import command as frames_command
 if TYPE_CHECKING:
     from skinware.recording import Recording, WireTrack
     from skinware_drivers.bus import Bus
-    from skinware_drivers.virtual.recorded import RecordedWire
+    from skinware_drivers.virtual.recorded_wire import RecordedWire
 
 _OF_SERVICES = {"paused": "--paused", "stay": "--stay", "namespace": "--namespace"}
 _LONGEST_SLEEP_S = 0.05
@@ -167,7 +167,8 @@ class WireSender:
                 break
 
     def _send_once(self) -> None:
-        from skinware_drivers.virtual.recorded import RecordedWire, first_of
+        from skinware_drivers.virtual.recorded import first_of
+        from skinware_drivers.virtual.recorded_wire import RecordedWire
 
         first_ns = first_of([wire for wire, _ in self._pairs], self._start_s)
         wires: list[tuple[str, Bus, RecordedWire]] = []

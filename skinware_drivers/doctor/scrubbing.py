@@ -30,6 +30,8 @@ _ADDRESSES = (
     re.compile(r"(?<![\w:])(?:[0-9a-fA-F]{1,4}:){3,7}[0-9a-fA-F]{1,4}(?![\w:])|(?<![\w:])[0-9a-fA-F:]*::[0-9a-fA-F:]+"),
     re.compile(r"(?<=://)[^\s/:@]+:[^\s/@]+(?=@)"),
 )
+_HOST = re.compile(r"(?<=://)(?:\[[^\]]*\]|[^/:?\s]+)|(?<=[?&]host=)[^&\s]+")
+"""Of the name of a bus."""
 _PATH = re.compile(r"(?<![\w./:])/(?:[^\s/'\"`,;:()]+/)+(?=[^\s/'\"`,;:()])")
 _KNOWN_PATHS = ("/dev/", "/sys/", "/proc/", "/etc/", "/usr/", "/run/")
 """Beginnings of paths that are the same on all machines."""
@@ -88,8 +90,27 @@ def scrubbed(text: str, secrets: Secrets) -> str:
     return _PATH.sub(lambda found: found[0] if found[0].startswith(_KNOWN_PATHS) else "/<folder>/", text)
 
 
+class Disguise:
+    """Names of buses and other texts as they may be given to others: hosts are ``host1``, ``host2``; no secrets.
+
+    Args:
+        secrets: what is known to be some; default: those of this machine.
+    """
+
+    def __init__(self, secrets: Secrets | None = None) -> None:
+        self._secrets = secrets or Secrets.of_this_machine()
+        self._hosts: dict[str, str] = {}
+
+    def __call__(self, text: str) -> str:
+        """The same text in disguise; the same host has the same name again."""
+        return scrubbed(_HOST.sub(self._host, text), self._secrets)
+
+    def _host(self, found: re.Match[str]) -> str:
+        return self._hosts.setdefault(found[0], f"host{len(self._hosts) + 1}")
+
+
 def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
     return sorted(of.items(), key=lambda pair: -len(pair[0]))
 
 
-__all__ = ["Secrets", "scrubbed"]
+__all__ = ["Disguise", "Secrets", "scrubbed"]

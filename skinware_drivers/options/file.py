@@ -107,13 +107,20 @@ class ConfigFile:
             settings = msgspec.structs.replace(settings, geometry=str(path.parent / settings.geometry))
         self.settings = settings
 
-    def options_of_bus(self, struct: type[T], bus_name: str, given: Mapping[str, str] | None = None) -> T:
+    def options_of_bus(
+        self,
+        struct: type[T],
+        bus_name: str,
+        given: Mapping[str, str] | None = None,
+        usual: Mapping[str, Any] | None = None,
+    ) -> T:
         """A driver's options for one bus: what is given as text beats the bus' own, they beat the common ones.
 
         Args:
             struct: the driver's ``Options``.
             bus_name: as it stands in the file.
             given: ``key=value`` texts, say of a command line.
+            usual: what holds where nothing else does, instead of the defaults.
 
         Raises:
             ConfigurationError: an unknown option or a wrong value.
@@ -121,7 +128,7 @@ class ConfigFile:
         number, of_bus = next(
             ((i, bus.options) for i, bus in enumerate(self.settings.bus) if bus.name == bus_name), (0, {})
         )
-        values = {**self.settings.options, **of_bus}
+        values = {**(usual or {}), **self.settings.options, **of_bus}
         as_given = options_from_strings(struct, given) if given else None
         values.update({key: getattr(as_given, key) for key in given or ()})
         try:

@@ -120,7 +120,7 @@ class Runner:
         self._serving = Serving(
             self.lines, listen_only, lambda: self.generation, self._built, self._build, self._tell_ready, self.fail
         )
-        self._wires = Wires(name, self.lines, self._namespace, group)
+        self._wires = Wires(name, driver_type, self.lines, listen_only, self._namespace, group)
         self._timer: asyncio.TimerHandle | None = None
         self._flows = False
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import platform
 from collections.abc import Sequence
+from functools import cache
+from importlib.metadata import version
 
+import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from skinware import wire
 from skinware.errors import SkinwareError
 from skinware.memory.announcement import is_wished
 from skinware.memory.namespace import Namespace
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
 from skinware_drivers.running.bus_line import BusLine
 
@@ -24,6 +29,8 @@ _LOOK_S = 0.5
 """Between two looks whether somebody does."""
 _TURN_S = 0.05
 _SLOTS = 64
+_LEAST_S = 0.3
+"""So long the service is there, so that who wants it finds it also if the driver ends at once."""
 
 
 class Wires:
@@ -31,14 +38,26 @@ class Wires:
 
     Args:
         name: of the driver.
+        driver_type: of the driver.
         lines: its buses; the list may change.
+        listen_only: nothing is sent.
         namespace, group: as of the driver.
     """
 
-    def __init__(self, name: str, lines: Sequence[BusLine], namespace: Namespace, group: str | None) -> None:
+    def __init__(
+        self,
+        name: str,
+        driver_type: str,
+        lines: Sequence[BusLine],
+        listen_only: bool,
+        namespace: Namespace,
+        group: str | None,
+    ) -> None:
         self._name, self._lines, self._namespace, self._group = name, lines, namespace, group
+        self._driver_type, self._listen_only = driver_type, listen_only
         self._writer: ServiceWriter | None = None
-        self._buses: tuple[str, ...] = ()
+        self._found_ns = 0
+        self._told: dict[str, npt.NDArray[np.bytes_]] = {}
         self._task: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
@@ -56,6 +75,7 @@ class Wires:
         try:
             if self._writer is not None:
                 self._publish()
+                await asyncio.sleep(max(0, self._found_ns - now_ns()) / NS_PER_S)
         except (SkinwareError, OSError) as error:
             self._tell_trouble(error)
         self._withdraw()
@@ -83,21 +103,24 @@ class Wires:
             await asyncio.sleep(_TURN_S)
 
     def _publish(self) -> None:
-        writer = self._writer_for(tuple(line.name for line in self._lines))
+        is_new = self._writer is None
+        writer = self._writer_for()
         for line in self._lines:
-            for batch in line.bus.tap.fetch():
+            # nothing, but for who wants to know also of a bus on which nothing comes that it is there
+            for batch in line.bus.tap.fetch() if not is_new else (memoryview(b""), *line.bus.tap.fetch()):
                 columns = writer.begin()
                 columns["bus"][()], columns["used"][()] = line.ordinal, len(batch)
                 columns["lost"][()] = line.bus.tap.lost
                 columns["pieces"][: len(batch)] = np.frombuffer(batch, np.uint8)
                 writer.commit(now_ns())
 
-    def _writer_for(self, buses: tuple[str, ...]) -> ServiceWriter:
+    def _writer_for(self) -> ServiceWriter:
         static = {
             "driver": np.array([self._name.encode()]),
-            "bus_name": np.array([name.encode() for name in buses]),
+            "bus_name": np.array([line.name.encode() for line in self._lines]),
+            "about": np.array([msgspec.json.encode(self._about())]),
         }
-        rate_hz = len(buses) / _TURN_S
+        rate_hz = len(self._lines) / _TURN_S
         if self._writer is None:
             self._writer = ServiceWriter(
                 wire.service_name(self._name),
@@ -110,10 +133,23 @@ class Wires:
                 group=self._group,
                 description=f"what goes over the wires of {self._name}",
             )
-        elif buses != self._buses:
+            self._found_ns = now_ns() + round(_LEAST_S * NS_PER_S)
+        elif any(static[name].tolist() != self._told[name].tolist() for name in static):
             self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
-        self._buses = buses
+        self._told = static
         return self._writer
+
+    def _about(self) -> dict[str, object]:
+        """What whoever decodes it again has to know."""
+        options = [msgspec.to_builtins(line.adapter.options) for line in self._lines]
+        return {
+            "driver_type": self._driver_type,
+            "listen_only": self._listen_only,
+            "versions": _versions(),
+            "buses": [
+                {"medium": line.adapter.medium, "options": own} for line, own in zip(self._lines, options, strict=True)
+            ],
+        }
 
     def _open_taps(self) -> None:
         for line in self._lines:
@@ -128,3 +164,13 @@ class Wires:
 
     def _tell_trouble(self, error: Exception) -> None:
         log.warning("what goes over the wires of %s is not published: %s", self._name, error)
+
+
+@cache
+def _versions() -> dict[str, str]:
+    return {
+        "skinware": version("skinware"),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+        "linux": platform.release(),
+    }

@@ -382,6 +382,17 @@ def test_press(printing: Print) -> None:
         check("`skin-press`", *printing(press, "0.07", "0.0225", "0"))
 
 
+def test_a_capture_and_a_proof(tmp_path: Path) -> None:
+    with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", f"{tmp_path}/it.mcap") as driver:
+        driver.wait_for("ready")
+        options = ("--rest", "1", "--wait", "0.1", "--only", "taxel 3", "--only", "xela", "-o", f"{tmp_path}/proof")
+        with running("skin-prove", "xela", *options) as prove:
+            step = prove.wait_for("step")
+            done = prove.wait_for("done")
+        check("`skin-prove`", step, done)
+        check("`captured`", driver.stop())
+
+
 def test_an_emulation() -> None:
     out = io.StringIO()
     bus = HostBus()

@@ -26,7 +26,7 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.recorded import RecordedWire
+from skinware_drivers.virtual.recorded_wire import RecordedWire
 from skinware_drivers.wire_tap import WireTap
 from tests.can.rig import TIP_IDENTIFIER, Tip
 from tests.commands import run, running
@@ -310,12 +310,12 @@ def test_skin_driver_runs_on_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "walk.mcap"
     kind = load_driver("roboskin")
     before = record(path, kind(kind.Options()), make_bus("virtual", driver="roboskin"), 40)
-    with running("skin-driver", "--bus", f"replay:{path}?speed=0.5") as driver:
+    with running("skin-driver", "--driver", "roboskin", "--bus", f"replay:{path}?speed=0.5") as driver:
         driver.wait_for("ready")
         with DriverReader("roboskin") as reader:
             assert reader.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
         driver.stop()
         assert driver.process.returncode == 0
-    refused = run("skin-driver", "--bus", f"replay:{path}?bus=can9")
+    refused = run("skin-driver", "--driver", "roboskin", "--bus", f"replay:{path}?bus=can9")
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr == f"skin-driver: {path}: no bus can9; there are: bus=bus0&driver=skin\n"

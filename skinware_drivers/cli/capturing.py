@@ -1,0 +1,138 @@
+"""A capture: a driver and all that goes over its wires, from the first byte on, in one file that may be given away.
+
+It is a recording of a process of its own, which cannot hold up the driver, and completes the file whatever ends that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from skinware.errors import ConfigurationError
+
+_END_S = 30.0
+"""How long it may take to complete the file."""
+
+
+class Capture:
+    """A recording that runs beside.
+
+    Args:
+        path: of the new file.
+        driver: name of the driver.
+        namespace: of the driver.
+
+    Attributes:
+        path: as above.
+        told: what came of it, once it has ended: ``bytes``, ``lost``, ``problem``.
+
+    Raises:
+        ConfigurationError: it cannot be recorded; the message says why.
+    """
+
+    def __init__(self, path: Path, driver: str, namespace: str) -> None:
+        self.path = path
+        self.told: dict[str, Any] = {"bytes": 0, "lost": 0, "problem": "it was ended by something else"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, str(path), driver, namespace],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C ends the driver first, and what that says at last is in the file
+        )
+        begun = self._next()
+        if not begun.get("ready"):
+            self.end()
+            raise ConfigurationError(f"{path}: {begun.get('problem', 'nothing can be recorded')}")
+
+    def end(self) -> None:
+        """Complete the file. Idempotent."""
+        if self._process.stdin is None or self._process.stdin.closed:
+            return
+        self._process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+        if self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()
+        self.told |= self._next()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _next(self) -> dict[str, Any]:
+        """What it says next; empty: it has ended."""
+        line = self._process.stdout.readline() if self._process.stdout is not None else ""
+        return dict(json.loads(line)) if line else {}
+
+
+@contextmanager
+def captured(path: Path, driver: str, namespace: str, tell: Callable[[Capture], None]) -> Iterator[Capture]:
+    """Capture a driver during a block; it is to begin after that has.
+
+    Args:
+        path: of the new file.
+        driver: name of the driver.
+        namespace: of the driver.
+        tell: called with the capture when its file is complete.
+
+    Raises:
+        ConfigurationError: it cannot be recorded.
+    """
+    capture = Capture(path, driver, namespace)
+    try:
+        yield capture
+    finally:
+        capture.end()
+        tell(capture)
+
+
+def _record(path: Path, driver: str, namespace: str) -> None:
+    """Record until standard input is closed, by whoever wants it or by the kernel."""
+    from skinware.errors import SkinwareError
+
+    problem, size, lost = "", 0, 0
+    try:
+        from skinware.recording.files import Files
+        from skinware.recording.recorder import Recorder
+        from skinware_drivers.doctor.scrubbing import Disguise
+
+        target = Files(path)
+        recorder = Recorder(target, names=[driver], namespace=namespace, with_wires=True, disguise=Disguise())
+        threading.Thread(target=_end_with_input, args=(recorder.stop,), daemon=True).start()
+        _say(ready=True)
+        try:
+            recorder.run()
+        finally:
+            size, lost = target.size, recorder.lost
+    except FileExistsError:
+        problem = "exists already: give another name, or remove it"
+    except OSError as error:
+        problem = error.strerror or str(error)
+    except SkinwareError as error:
+        problem = str(error)
+    _say(problem=problem, bytes=size, lost=lost)
+
+
+def _end_with_input(stop: Callable[[], None]) -> None:
+    os.read(0, 1)
+    stop()
+
+
+def _say(**what: Any) -> None:
+    with contextlib.suppress(BrokenPipeError):
+        print(json.dumps(what), flush=True)  # noqa: T201 - to the program that began this one
+
+
+if __name__ == "__main__":
+    _record(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
+
+
+__all__ = ["Capture", "captured"]

@@ -1,0 +1,235 @@
+"""``skin-prove``: walk the owner of a device through a proof of its driver."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    EXIT_FAILED,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    run,
+    seconds,
+    version_option,
+)
+from skinware.errors import ConfigurationError, DriverError
+
+if TYPE_CHECKING:
+    from skinware.memory.namespace import Namespace
+    from skinware_drivers.proving.proof import Proof
+    from skinware_drivers.proving.walk import Step
+
+_STARTS_WITHIN_S = 30.0
+_ENDS_WITHIN_S = 30.0
+_DRIVER = "from skinware_drivers.cli.driver import main; main()"
+_COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged": "yellow"}
+
+
+@click.command(
+    "skin-prove",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-prove                                    the only driver that runs",
+        "skin-prove hand --only index --only palm      only these modules",
+        "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
+        "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
+    ),
+)
+@click.argument("name", required=False)
+@click.argument("driver_arguments", metavar="[-- OPTIONS OF SKIN-DRIVER]", nargs=-1, type=click.UNPROCESSED)
+@click.option(
+    "--type", "type_name", metavar="TYPE", help="Sensors to look at.  [default: pressure, force, or the first]"
+)
+@click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; repeat it for several.")
+@click.option("--wait", "patience_s", type=seconds, default="30", show_default=True, help="SECONDS for each step.")
+@click.option(
+    "--rest", "rest_s", type=seconds, default="3", show_default=True, help="Look so long at the skin at rest."
+)
+@click.option("--tare", "with_tare", is_flag=True, help="At last, have the driver tare, if it can.")
+@click.option(
+    "-o",
+    "--output",
+    "stem",
+    metavar="STEM",
+    type=click.Path(path_type=Path),
+    help="Write STEM.md, STEM.json and STEM.mcap.  [default: prove-DRIVER-DATE-TIME]",
+)
+@namespace_option
+@json_option
+@version_option
+@click.pass_context
+def command(
+    context: click.Context,
+    name: str | None,
+    driver_arguments: tuple[str, ...],
+    type_name: str | None,
+    only: tuple[str, ...],
+    patience_s: float,
+    rest_s: float,
+    with_tare: bool,
+    stem: Path | None,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Prove the driver of a device that you have: press where you are told, stroke, and attach the report to an issue.
+
+    It looks whether the right module answers, the sign, saturation, the order of taxels in matrices, dead taxels, rate
+    and losses, with driver NAME, or the only one that runs, or one that it starts. All of it is captured. Type
+    "skip" and Enter to leave a module out. Nothing is sent to the device but by the driver itself.
+
+    Exit status: 0 proven, 1 something failed or nothing was pressed, 2 wrong usage.
+    """
+    from skinware.cli._driver_frames import reader_of
+    from skinware.memory.namespace import Namespace
+    from skinware_drivers.proving.proof import Proof
+    from skinware_drivers.proving.walk import Manner, walk
+
+    if name is not None and name.startswith("-"):  # there was nothing before the --
+        driver_arguments, name = (name, *driver_arguments), None
+    place = Namespace(namespace)
+    stem = stem or Path(time.strftime(f"prove-{name or 'driver'}-%Y%m%d-%H%M%S"))
+    capture = stem.with_name(f"{stem.name}.mcap")
+    person = _AtTerminal(as_json)
+    with contextlib.ExitStack() as beside:
+        if driver_arguments:
+            name = beside.enter_context(_started(driver_arguments, name, place, capture))
+        reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
+        if not driver_arguments:
+            from skinware_drivers.cli.capturing import captured
+
+            beside.enter_context(captured(capture, reader.name, place.name, lambda _done: None))
+        proof = Proof(reader.name, reader.driver_type, _facts(bool(driver_arguments), capture))
+        try:
+            with contextlib.suppress(KeyboardInterrupt):
+                walk(reader, person, Manner(type_name, only, patience_s, rest_s, with_tare), proof)
+        finally:
+            _write(proof, stem)
+    _tell(proof, stem, as_json)
+    if not proof.is_proven:
+        context.exit(EXIT_FAILED)
+
+
+def _facts(is_whole: bool, capture: Path) -> dict[str, str]:
+    versions = {"skinware": version("skinware"), "python": platform.python_version(), "linux": platform.release()}
+    beginning = "from the first byte on" if is_whole else "without what was said before skin-prove began"
+    return {
+        "date": time.strftime("%Y-%m-%d"),
+        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+        "verified against": "a device in the hands of its owner, as this table says",
+        "capture": f"{capture.name}, {beginning}",
+    }
+
+
+@contextlib.contextmanager
+def _started(arguments: Sequence[str], name: str | None, place: Namespace, capture: Path) -> Iterator[str]:
+    """A driver that runs as long as the block, and its name.
+
+    Raises:
+        DriverError: it does not start; it has said why.
+    """
+    more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(capture), "--json"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _DRIVER, *arguments, *more],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C ends the walk, which ends it
+    )
+    told: dict[str, Any] = {}
+    is_ready = threading.Event()
+
+    def listen() -> None:
+        assert process.stdout is not None  # noqa: S101 - it is a pipe
+        for line in process.stdout:
+            event = json.loads(line)
+            if event.get("event") == "ready":
+                told.update(event)
+                is_ready.set()
+        is_ready.set()
+
+    thread = threading.Thread(target=listen, daemon=True)
+    thread.start()
+    try:
+        if not is_ready.wait(_STARTS_WITHIN_S) or not told:
+            raise DriverError(f"skin-driver publishes nothing; {capture} has what went over its buses: attach it")
+        yield str(told["name"])
+    finally:
+        process.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_ENDS_WITHIN_S)
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+        thread.join()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+class _AtTerminal:
+    """A person, or a program, that reads what is asked for and writes ``skip``."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._is_there = sys.stdin is not None and not sys.stdin.closed
+
+    def ask(self, step: Step) -> None:
+        """Print it."""
+        if self._as_json:
+            print_json({"event": "step", "wanted": step.wanted, "module": step.module, "text": step.text})
+        else:
+            click.echo(f"> {click.style(step.text, bold=True)}")
+
+    def skips(self) -> bool:
+        """Whether a line says so."""
+        is_skipped = False
+        while self._is_there and select.select([sys.stdin], [], [], 0)[0]:
+            line = sys.stdin.readline()
+            self._is_there = bool(line)
+            is_skipped |= line.strip().lower() == "skip"
+        return is_skipped
+
+
+def _write(proof: Proof, stem: Path) -> None:
+    import msgspec
+
+    try:
+        stem.with_name(f"{stem.name}.md").write_text(proof.as_markdown(), encoding="utf-8")
+        data = msgspec.json.format(msgspec.json.encode(proof.as_data()))
+        stem.with_name(f"{stem.name}.json").write_bytes(data + b"\n")
+    except OSError as error:
+        raise ConfigurationError(f"{error.filename}: {error.strerror}") from None
+
+
+def _tell(proof: Proof, stem: Path, as_json: bool) -> None:
+    if as_json:
+        print_json(
+            {"event": "done", "files": [f"{stem}.{ending}" for ending in ("md", "json", "mcap")], **proof.as_data()}
+        )
+        return
+    for check in proof.checks:
+        verdict = click.style(f"{check.verdict.value:>10}", fg=_COLOURS[check.verdict.value])
+        click.echo(f"{verdict}  {check.what}{f', {check.where}' if check.where else ''}: {check.seen}")
+    click.echo(click.style("proven" if proof.is_proven else "not proven", bold=True))
+    click.echo(f"written to {stem}.md, {stem}.json and {stem}.mcap; read them before you give them to others")
+
+
+def main() -> None:
+    """Entry point."""
+    run(command)

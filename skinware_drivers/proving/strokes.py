@@ -1,0 +1,172 @@
+"""Whether the taxels of a matrix are where the driver says, by two strokes of a finger over all of it.
+
+The first stroke goes down, from the first row to the last, the second across, from the first column to the last. A
+taxel tells where it is by when it answers; how fast the finger goes does not matter. Arrays, and no service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Places = npt.NDArray[np.int64]
+"""(n, 2): row and column of each taxel."""
+
+_SURE = 0.5
+"""Agreement from which on an order is one: three of four pairs of taxels have it."""
+
+
+class Matrix(NamedTuple):
+    """Taxels in rows and columns, row by row.
+
+    Attributes:
+        rows, columns: how many there are.
+    """
+
+    rows: int
+    columns: int
+
+    @classmethod
+    def of_kind(cls, kind: str, count: int) -> Matrix | None:
+        """The matrix of a module's kind (``4x6``), if so many taxels fill it."""
+        rows, times, columns = kind.partition("x")
+        if not (times and rows.isdigit() and columns.isdigit()):
+            return None
+        found = cls(int(rows), int(columns))
+        return found if found.rows * found.columns == count and count > 1 else None
+
+    @property
+    def places(self) -> Places:
+        """(n, 2) int64: row and column of each taxel."""
+        numbers = np.arange(self.rows * self.columns)
+        return np.stack(np.divmod(numbers, self.columns), axis=1)
+
+
+@dataclass(frozen=True)
+class Order:
+    """What two strokes tell of a matrix.
+
+    Attributes:
+        wrong: in words, what is wrong with all of it: mirrored rows, say; empty: nothing.
+        misplaced: in words, which taxels answer at the places of others.
+        silent: numbers of taxels that answered to neither stroke.
+        judged: taxels that answered to both.
+    """
+
+    wrong: Sequence[str]
+    misplaced: Sequence[str]
+    silent: Sequence[int]
+    judged: int
+
+
+def judge(matrix: Matrix, down: Floats, across: Floats, threshold: float) -> Order:
+    """Compare when taxels answered with where they are said to be.
+
+    Args:
+        matrix: what the driver says.
+        down: (frames, n) how far each taxel was from its rest while a finger went over the rows.
+        across: likewise, over the columns.
+        threshold: from which on a taxel has answered.
+    """
+    heard = (_peak(down) > threshold) & (_peak(across) > threshold)
+    silent = np.flatnonzero((_peak(down) <= threshold) & (_peak(across) <= threshold))
+    moments = np.stack([_moments(down, threshold), _moments(across, threshold)], axis=1)
+    wrong, places = _turned(matrix, moments, heard)
+    misplaced = [] if places is None else _misplaced(matrix, moments, heard, places)
+    return Order(wrong, misplaced, silent.tolist(), int(heard.sum()))
+
+
+def _peak(stroke: Floats) -> Floats:
+    return np.asarray(stroke.max(axis=0)) if len(stroke) else np.zeros(stroke.shape[1])
+
+
+def _moments(stroke: Floats, threshold: float) -> Floats:
+    """(n,) when each taxel was pressed most, in frames: the centre of the upper half of its answer."""
+    weight = np.maximum(stroke - np.maximum(_peak(stroke) / 2, threshold), 0)
+    total = weight.sum(axis=0)
+    frames = np.arange(len(stroke))[:, np.newaxis]
+    moments: Floats = (weight * frames).sum(axis=0) / np.where(total > 0, total, np.nan)
+    return moments
+
+
+def _turned(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_]) -> tuple[list[str], Places | None]:
+    """What is wrong with all of a matrix, and where its taxels are then; None: that cannot be told."""
+    places = matrix.places
+    if heard.sum() < 2:
+        return [], None
+    straight = [_agreement(moments[heard, axis], places[heard, axis]) for axis in (0, 1)]
+    crossed = [_agreement(moments[heard, axis], places[heard, 1 - axis]) for axis in (0, 1)]
+    if min(matrix) > 1 and min(np.abs(crossed)) > max(_SURE, *np.abs(straight)):
+        return ["rows and columns are exchanged"], None
+    wrong = []
+    turned = places.copy()
+    for axis, (size, name) in enumerate(zip(matrix, ("rows", "columns"), strict=True)):
+        if size == 1:
+            continue
+        if straight[axis] <= -_SURE:
+            wrong.append(f"{name} are mirrored: the last comes first")
+            turned[:, axis] = size - 1 - turned[:, axis]
+        elif straight[axis] < _SURE:
+            return [*wrong, _no_order(matrix, moments, heard, name)], None
+    return wrong, turned
+
+
+def _no_order(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], name: str) -> str:
+    """The taxels of an axis answer in no order: perhaps the matrix has another shape."""
+    other = Matrix(matrix.columns, matrix.rows)
+    fits = [abs(_agreement(moments[heard, axis], other.places[heard, axis])) >= _SURE for axis in (0, 1)]
+    if matrix.rows != matrix.columns and all(fits):
+        return f"it answers as {other.rows} rows of {other.columns}, not {matrix.rows} rows of {matrix.columns}"
+    return f"{name} answer in no order"
+
+
+def _agreement(moments: Floats, places: npt.NDArray[np.int64]) -> float:
+    """Of all pairs of taxels in different lines, how many answered in the order of these: 1 all, -1 none.
+
+    Pairs, since two exchanged taxels, however far apart, are in few of them.
+    """
+    apart = np.sign(places[:, np.newaxis] - places)
+    if not apart.any():
+        return 0.0
+    return float((np.sign(moments[:, np.newaxis] - moments) * apart).sum() / np.abs(apart).sum())
+
+
+def _misplaced(matrix: Matrix, moments: Floats, heard: npt.NDArray[np.bool_], places: Places) -> list[str]:
+    """Taxels that answer when those of another row or column do."""
+    found: dict[int, tuple[int, int]] = {}
+    at = np.stack(
+        [_nearest(moments[:, axis], places[:, axis], heard, size) for axis, size in enumerate(matrix)], axis=1
+    )
+    for taxel in np.flatnonzero(heard & (at != places).any(axis=1)).tolist():
+        found[taxel] = (int(at[taxel, 0]), int(at[taxel, 1]))
+    whose = {(int(row), int(column)): taxel for taxel, (row, column) in enumerate(places.tolist())}
+    words = []
+    for taxel, place in found.items():
+        other = whose[place]
+        if other in found and whose[found[other]] == taxel:
+            if taxel < other:
+                words.append(f"taxels {taxel} and {other} are exchanged")
+        else:
+            words.append(f"taxel {taxel} answers where taxel {other} is said to be")
+    return words
+
+
+def _nearest(moments: Floats, place: Places, heard: npt.NDArray[np.bool_], size: int) -> Places:
+    """(n,) the row, or column, whose taxels answered at the moment at which each did."""
+    counts = [int((heard & (place == line)).sum()) for line in range(size)]
+    if size < 2 or min(counts) < 3:  # with fewer, one that is misplaced would move its own row
+        return place
+    usual = np.array([np.median(moments[heard & (place == line)]) for line in range(size)])
+    distance = np.abs(np.nan_to_num(moments)[:, np.newaxis] - usual)
+    nearest = distance.argmin(axis=1)
+    own = distance[np.arange(len(place)), place]
+    gap = np.median(np.abs(np.diff(usual)))
+    return np.where(heard & (own > 0.75 * gap), nearest, place)
+
+
+__all__ = ["Matrix", "Order", "judge"]

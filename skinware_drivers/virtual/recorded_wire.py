@@ -1,0 +1,213 @@
+"""What went over a wire when it was recorded, again: with the times that it had, and answers after questions."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.timer import MonotonicTimer, Timer
+
+if TYPE_CHECKING:
+    from skinware.recording import WireItem
+
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+SENT = 1
+"""Identifier of what was sent, where that is given too."""
+_PATIENCE_NS = 500_000_000
+"""So long a question is waited for that was asked when it was recorded; the next one of its kind is not, after that."""
+_EARLIEST_NS = 250_000_000
+"""A question may come so long before its time."""
+
+
+class RecordedWire:
+    """The devices at the other end of a recorded wire; see :class:`.hardware.EmulatedHardware`.
+
+    Args:
+        items: what went over it, by time.
+        first_ns: time of the recording, CLOCK_MONOTONIC of then, at which it begins.
+        speed: 2.0: twice as fast.
+        waits: for the questions that were asked when it was recorded.
+        with_sent: what was sent is given too, with the identifier :data:`SENT`.
+        name: that the end is logged under; empty: it is not.
+    """
+
+    def __init__(
+        self,
+        items: Iterator[WireItem],
+        first_ns: int,
+        *,
+        speed: float = 1.0,
+        waits: bool = True,
+        with_sent: bool = False,
+        name: str = "",
+    ) -> None:
+        self._items, self._speed, self._waits, self._name = items, speed, waits, name
+        self._with_sent = with_sent
+        self._next: WireItem | None = None
+        self._first_ns = first_ns
+        self._begun_ns = self._given_ns = 0
+        self._has_begun = self._is_over = False
+        self._asked: dict[int, deque[tuple[int, bytes]]] = {}
+        self._answered: dict[int, bytes] = {}
+        self._unasked: set[int] = set()
+        self._counts = {"frames": 0, "bursts": 0, "commands": 0}
+
+    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
+        """Take a question."""
+        self._counts["commands"] += 1
+        self._asked.setdefault(identifier, deque(maxlen=1000)).append((now_ns, payload))
+        self._unasked.discard(identifier)
+
+    def next_due_ns(self) -> int | None:
+        """When there is something, or a question was waited for long enough; None: at the end."""
+        item = self._next
+        if item is None or not self._has_begun:
+            return None
+        due_ns = self._due_ns(item)
+        if self._is_waited_for(item):
+            return self._asked[_kind(item)][0][0] if self._asked.get(_kind(item)) else due_ns + _PATIENCE_NS
+        return due_ns
+
+    def emit(self, now_ns: int) -> list[WireFrame]:
+        """What is due."""
+        found: list[WireFrame] = []
+        while (item := self._next) is not None and self._due_ns(item) <= now_ns:
+            if item.is_sent:
+                if self._is_waited_for(item) and not self._is_asked(item, now_ns):
+                    break
+                if self._with_sent:
+                    found.append(WireFrame(self._stamp_ns(item), SENT, item.data))
+            elif item.identifier is None or not item.identifier & (ERROR_FLAG | REMOTE_FLAG):
+                found.append(WireFrame(self._stamp_ns(item), item.identifier or 0, item.data))
+            self._take_next()
+        self._counts["frames"] += len(found)
+        return found
+
+    def skip(self, now_ns: int) -> int:
+        """Begin; later, leave out what is due."""
+        if self._has_begun:
+            return len(self.emit(now_ns))
+        self._has_begun, self._begun_ns = True, now_ns
+        self._take_next()
+        return 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all of it was given."""
+        return self._is_over
+
+    def totals(self) -> dict[str, int]:
+        """Frames that were given, and questions that were asked."""
+        return dict(self._counts)
+
+    def _due_ns(self, item: WireItem) -> int:
+        return self._begun_ns + round((item.time_ns - self._first_ns) / self._speed)
+
+    def _stamp_ns(self, item: WireItem) -> int:
+        self._given_ns = max(self._given_ns, self._due_ns(item))
+        return self._given_ns
+
+    def _is_waited_for(self, item: WireItem) -> bool:
+        return self._waits and item.is_sent and _kind(item) not in self._unasked
+
+    def _is_asked(self, item: WireItem, now_ns: int) -> bool:
+        """Whether the question was asked, or is waited for no more; if it was asked late, all that follows is late."""
+        due_ns, asked = self._due_ns(item), self._asked.get(_kind(item), deque())
+        while asked and (asked[0][0] < due_ns - _EARLIEST_NS or self._is_repeated(item, asked[0][1])):
+            asked.popleft()
+        if asked:
+            asked_ns, self._answered[_kind(item)] = asked.popleft()
+            self._begun_ns += max(0, asked_ns - due_ns)
+            return True
+        if now_ns < due_ns + _PATIENCE_NS:
+            return False
+        self._begun_ns += _PATIENCE_NS
+        self._unasked.add(_kind(item))
+        return True
+
+    def _is_repeated(self, item: WireItem, question: bytes) -> bool:
+        """Whether it was asked again before its answer came, and this is not where it was so when it was recorded."""
+        return question == self._answered.get(_kind(item)) and question != item.data
+
+    def _take_next(self) -> None:
+        self._next = next(self._items, None)
+        if self._next is None and not self._is_over:
+            self._is_over = True
+            if self._name:
+                log.warning("%s: the recording is over", self._name)
+
+
+def _kind(item: WireItem) -> int:
+    """What questions are told apart by."""
+    return item.identifier or 0
+
+
+class RecordedPort(Port):
+    """A port that gives what was read, read by read.
+
+    Args:
+        wire: that is read.
+        clock: tells CLOCK_MONOTONIC ns.
+        make_timer: makes what wakes the reader; another clock needs another timer.
+
+    Attributes:
+        read_ns: when what was given last was read.
+    """
+
+    def __init__(
+        self,
+        wire: RecordedWire,
+        clock: Callable[[], int] = time.monotonic_ns,
+        make_timer: Callable[[], Timer] = MonotonicTimer,
+    ) -> None:
+        self._wire, self._clock = wire, clock
+        self._timer = make_timer()
+        self._reads: deque[WireFrame] = deque()
+        self.read_ns: int = 0
+        wire.skip(self._clock())
+        self._wake_when_due()
+
+    def fileno(self) -> int:
+        """The timer's descriptor."""
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:  # noqa: ARG002
+        """As much as was read at once then."""
+        frame = self.next_frame()
+        return b"" if frame is None else frame.payload
+
+    def next_frame(self) -> WireFrame | None:
+        """The next one that is due."""
+        self._reads += self._wire.emit(self._clock())
+        frame = self._reads.popleft() if self._reads else None
+        self._wake_when_due()
+        if frame is not None:
+            self.read_ns = frame.time_ns
+        return frame
+
+    def write(self, data: bytes) -> int:
+        """A question."""
+        self._wire.receive(0, data, self._clock())
+        self._wake_when_due()
+        return len(data)
+
+    def wake(self) -> None:
+        """Be readable at once."""
+        self._timer.wake_at(0)
+
+    def close(self) -> None:
+        """Give the timer back."""
+        self._timer.close()
+
+    def _wake_when_due(self) -> None:
+        self._timer.wake_at(0 if self._reads else self._wire.next_due_ns())
+
+
+__all__ = ["SENT", "RecordedPort", "RecordedWire"]

@@ -1,0 +1,57 @@
+"""The walk over an emulated hand, pressed by a test that does what it is asked for; planted faults are found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.proving.rig import COLUMNS, NAMES, ROWS, N, PressingPerson, failed, proven, straight
+
+INDEX, MIDDLE = (f"hand, {name}" for name in NAMES)
+
+
+def test_a_driver_in_order_is_proven() -> None:
+    person = PressingPerson()
+    proof = proven(person, straight())
+    assert failed(proof) == {}
+    passed = {(check.what, check.where) for check in proof.checks if check.verdict == "passed"}
+    for name in (INDEX, MIDDLE):
+        assert {(what, name) for what in ("right module", "sign", "order of taxels", "taxel answers")} <= passed
+    wanted = ["press", "let go", "stroke down", "stroke across"]
+    assert [(step.wanted, step.module) for step in person.asked] == [
+        ("rest", ""),
+        *((step, name) for name in (INDEX, MIDDLE) for step in wanted),
+    ]
+
+
+def test_planted_faults_are_found() -> None:
+    """Mirrored rows and a dead taxel of the index tip; two exchanged taxels of the middle tip."""
+    wiring = straight()
+    wiring[:N] = np.arange(N).reshape(ROWS, COLUMNS)[::-1].ravel()
+    wiring[[N + 1, N + 16]] = wiring[[N + 16, N + 1]]
+    proof = proven(PressingPerson(), wiring, dead=[5])
+    assert failed(proof) == {
+        ("order of taxels", INDEX): "rows are mirrored: the last comes first",
+        ("taxel answers", f"{INDEX}, taxel 5"): "always 7",
+        ("order of taxels", MIDDLE): "taxels 1 and 16 are exchanged",
+    }
+    assert not proof.is_proven
+
+
+def test_another_module_that_answers_is_named_and_one_that_is_not_wanted_is_skipped() -> None:
+    wiring = np.roll(straight(), N)
+    proof = proven(PressingPerson(skipped=[MIDDLE], ignored=["stroke down"]), wiring, patience_s=3.0)
+    wrong = failed(proof)
+    assert wrong["right module", INDEX] == "no stroke was felt within 3 s"
+    (check,) = [
+        one for one in proof.checks if (one.what, one.where, one.verdict) == ("right module", MIDDLE, "skipped")
+    ]
+    assert check.seen == "not wanted"
+    pressed = next(one for one in proof.checks if (one.what, one.where) == ("right module", INDEX))
+    assert pressed.verdict == "failed"
+    assert MIDDLE in pressed.seen
+
+
+def test_nobody_presses_anything() -> None:
+    proof = proven(PressingPerson(ignored=["press"]), straight(), patience_s=0.3, only=["index"])
+    assert failed(proof) == {("right module", INDEX): "nothing was felt within 0.3 s"}
+    assert not proof.is_proven

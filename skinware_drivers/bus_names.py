@@ -59,9 +59,9 @@ def parse_bus_name(name: str) -> BusName:
     return BusName(*_split(address), options)
 
 
-def is_over_network(name: str) -> bool:
-    """Whether a bus' name means a serial device that is reached over a network."""
-    return _split(name.partition("?")[0])[0] in NETWORKS
+def is_only_asked(name: str) -> bool:
+    """Whether nothing is to be heard on a bus of this name unless a device is called, or asked."""
+    return _split(name.partition("?")[0])[0] in (*NETWORKS, "modbus")
 
 
 def place_of_bus(name: str) -> BusPlace:

@@ -96,7 +96,7 @@ async def look(
         ConfigurationError: one of ``driver_names`` is not there.
     """
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.bus_names import is_over_network
+    from skinware_drivers.bus_names import is_only_asked
     from skinware_drivers.finding.adapters import Detection, detect_adapters
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import can_interfaces
@@ -107,7 +107,7 @@ async def look(
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
     buses_to_hear = [one.name for one in interfaces if one.up]
-    buses_to_hear += [name for name in others if not is_over_network(name)]
+    buses_to_hear += [name for name in others if not is_only_asked(name)]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
     detection: Detection
     detection, *listened = await asyncio.gather(searching, *(listen(name, listen_s, drivers) for name in buses_to_hear))
@@ -115,7 +115,7 @@ async def look(
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
         raise BusNotAvailable(problems[0])
-    networks = [name for name in others if is_over_network(name)]
+    networks = [name for name in others if is_only_asked(name)]
     answers = await _ask(heard, ports, networks, running, force, driver_names) if probe else {}
     return {
         "can": _can_data(interfaces, heard, answers, running, whole=not buses),
@@ -161,6 +161,7 @@ async def _ask(
     force: bool,
     driver_names: tuple[str, ...],
 ) -> dict[str, Answer]:
+    from skinware_drivers.bus_names import parse_bus_name
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.looking import Answer, ask, ask_port
     from skinware_drivers.finding.running import driver_on
@@ -174,7 +175,8 @@ async def _ask(
     for name in networks:
         owner = driver_on(name, running)
         refused = Answer(name, refused=f"{owner} has it")
-        answers[name] = refused if owner else await ask_port(name, known_drivers("serial", driver_names))
+        medium = "modbus" if parse_bus_name(name).interface == "modbus" else "serial"
+        answers[name] = refused if owner else await ask_port(name, known_drivers(medium, driver_names))
     for port in ports:
         owner = driver_on(port.path, running)
         users = [f"{user.program} (pid {user.pid})" for user in port.users]
@@ -183,7 +185,8 @@ async def _ask(
         elif not port.may_open:
             answers[port.path] = Answer(port.path, refused="you may not open it")
         else:
-            answers[port.path] = await ask_port(port.path, known_drivers("serial", driver_names))
+            of_ports = known_drivers("serial", driver_names) | known_drivers("modbus", driver_names)
+            answers[port.path] = await ask_port(port.path, of_ports)
     return answers
 
 

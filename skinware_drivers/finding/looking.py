@@ -11,7 +11,7 @@ from skinware.errors import BusError, BusNotAvailable, ConfigurationError, Hands
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.bus_names import is_over_network
+from skinware_drivers.bus_names import is_only_asked
 from skinware_drivers.finding.attended import attended
 from skinware_drivers.finding.guess import Guess, guess, likely, with_default_options
 from skinware_drivers.finding.traffic import IdentifierClass, Traffic
@@ -148,10 +148,9 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
     """Ask who is on a serial port, one driver after the other; opening it resets some microcontrollers.
 
     Args:
-        path: of the port; or the name of a bus over a network.
-        drivers: those that may ask.
+        path: of the port; or the name of a bus over a network, or of Modbus.
+        drivers: those that may ask, of serial devices or of Modbus.
     """
-    bus_name = path if is_over_network(path) else f"serial:{path}"
     asked: list[str] = []
     answers: dict[str, str] = {}
     problems: dict[str, str] = {}
@@ -163,6 +162,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
             problems[name] = "it has options that must be given"
             continue
         try:
+            bus_name = path if is_only_asked(path) else f"{driver.medium}:{path}"
             bus = make_bus(bus_name, payload_size=adapter.payload_size)
             adapter.fit(bus)
             told = await _ask_all(bus, path, {name: driver}, idle=False)

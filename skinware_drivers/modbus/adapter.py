@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -131,6 +132,21 @@ class ModbusAdapter(Adapter[OptionsT]):
     async def probe(self, link: Link, patch: object) -> bool:  # noqa: ARG002
         """Nothing: the registers of a silent device are asked for all the time."""
         return False
+
+    @classmethod
+    async def identify(cls, link: Link, *, idle: bool) -> str | None:  # noqa: ARG003
+        """One read of the first registers that the driver wants, which changes nothing in any device.
+
+        What answers need not be what the driver is for: Modbus knows no names, and many devices have registers there.
+        """
+        of_default_options: Callable[[msgspec.Struct], ModbusAdapter[Any]] = cls
+        adapter = of_default_options(cls.Options())
+        if not adapter.registers:
+            return None
+        first = adapter.registers[0]
+        count = min(first.count, adapter.most_registers)
+        await adapter.read(link, first.address, count, unit=first.unit, function=first.function)
+        return f"unit {first.unit} lets {count} registers be read at {first.address}, where this driver wants them"
 
     async def read(
         self, link: Link, address: int, count: int = 1, *, unit: int = 1, function: int = wire.READ_HOLDING

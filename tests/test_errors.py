@@ -16,10 +16,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+import zenoh
 from serial.tools import list_ports
 
 import skinware.recording
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter, errors
+from skinware.bridge import Link as BridgeLink
+from skinware.bridge import endpoints
 from skinware.errors import SkinwareError
 from skinware.memory import _fences
 from skinware.realtime import Profile
@@ -97,6 +100,20 @@ def BadRecording(_: pytest.MonkeyPatch) -> object:  # noqa: N802
 def MissingExtra(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
     monkeypatch.setitem(sys.modules, "mcap", None)
     return importlib.reload(skinware.recording)
+
+
+@produces
+def BridgeError(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
+    place = "tcp/127.0.0.1:47448"
+
+    def fail(_: object) -> None:  # as zenoh 1.10, whose threads stay for good once they run
+        raise zenoh.ZError(
+            f"Can not create a new TCP listener bound to {place}: [127.0.0.1:47448: Address already in use (os error"
+            " 98)] at io/zenoh-links/zenoh-link-tcp/src/unicast.rs:335."
+        )
+
+    monkeypatch.setattr(zenoh, "open", fail)
+    return BridgeLink(endpoints(listen=[place]))
 
 
 @produces

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -21,6 +22,7 @@ LEASE_MS = 2000
 """A peer that says nothing for so long is gone."""
 _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 _FOREVER_MS = -1
+_OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
 Payload = bytes
 
@@ -235,5 +237,6 @@ def _configuration(endpoints: Endpoints) -> zenoh.Config:
 
 
 def _reason(error: Exception) -> str:
-    """What zenoh says, without where in its sources."""
-    return str(error).partition(" at ")[0].partition(" - ")[0]
+    """What zenoh says: the system's own words if it has them, and not where in its sources."""
+    of_system = _OS_ERROR.search(str(error))
+    return of_system[1] if of_system else str(error).partition(" at ")[0].partition(" - ")[0]

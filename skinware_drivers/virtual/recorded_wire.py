@@ -20,7 +20,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 SENT = 1
 """Identifier of what was sent, where that is given too."""
-_PATIENCE_NS = 500_000_000
+_PATIENCE_NS = 2_000_000_000
 """So long a question is waited for that was asked when it was recorded; the next one of its kind is not, after that."""
 _EARLIEST_NS = 250_000_000
 """A question may come so long before its time."""
@@ -52,7 +52,7 @@ class RecordedWire:
         self._with_sent = with_sent
         self._next: WireItem | None = None
         self._first_ns = first_ns
-        self._begun_ns = self._given_ns = 0
+        self._begun_ns = self._given_ns = self._looked_ns = 0
         self._has_begun = self._is_over = False
         self._asked: dict[int, deque[tuple[int, bytes]]] = {}
         self._answered: dict[int, bytes] = {}
@@ -71,14 +71,19 @@ class RecordedWire:
         if item is None or not self._has_begun:
             return None
         due_ns = self._due_ns(item)
-        if self._is_waited_for(item):
-            return self._asked[_kind(item)][0][0] if self._asked.get(_kind(item)) else due_ns + _PATIENCE_NS
-        return due_ns
+        if not self._is_waited_for(item):
+            return due_ns
+        asked = self._asked.get(_kind(item))
+        if not asked:
+            return due_ns + _PATIENCE_NS
+        is_early = asked[0][1] == item.data and asked[0][0] > self._looked_ns - _EARLIEST_NS
+        return asked[0][0] if is_early else max(due_ns, asked[0][0])
 
     def emit(self, now_ns: int) -> list[WireFrame]:
         """What is due."""
         found: list[WireFrame] = []
-        while (item := self._next) is not None and self._due_ns(item) <= now_ns:
+        self._looked_ns = now_ns
+        while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._is_hurried(item, now_ns)):
             if item.is_sent:
                 if self._is_waited_for(item) and not self._is_asked(item, now_ns):
                     break
@@ -130,6 +135,20 @@ class RecordedWire:
             return False
         self._begun_ns += _PATIENCE_NS
         self._unasked.add(_kind(item))
+        return True
+
+    def _is_hurried(self, item: WireItem, now_ns: int) -> bool:
+        """Whether this very question was asked before its time, by a driver that was held up when it was recorded.
+
+        Its answer must not be late: all that follows is earlier then.
+        """
+        asked = self._asked.get(_kind(item))
+        if not (self._is_waited_for(item) and asked and asked[0][1] == item.data):
+            return False
+        asked_ns = asked[0][0]
+        if asked_ns < now_ns - _EARLIEST_NS:
+            return False
+        self._begun_ns -= self._due_ns(item) - asked_ns
         return True
 
     def _is_repeated(self, item: WireItem, question: bytes) -> bool:

@@ -216,8 +216,22 @@ def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
     items = [item(0, 0x10, is_sent=True), item(1, 1), item(10, 0x10, is_sent=True), item(11, 2)]
     wire = RecordedWire(iter(items), 7_000 * MS)
     wire.skip(0)
-    assert wire.next_due_ns() == 500 * MS
-    assert emitted(wire, 600) == [(501, 1), (511, 2)]
+    assert wire.next_due_ns() == 2000 * MS
+    assert emitted(wire, 2100) == [(2001, 1), (2011, 2)]
+
+
+def test_a_question_that_comes_earlier_than_it_did_is_answered_at_once() -> None:
+    """Whoever was held up when it was recorded: the answer came in time then, and must do so now."""
+    items = [item(0, 0x10, b"a", is_sent=True), item(1, 1), item(900, 0x10, b"b", is_sent=True), item(902, 2)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
+    wire.skip(0)
+    wire.receive(0x10, b"a", 0)
+    assert emitted(wire, 5) == [(1, 1)]
+    wire.receive(0x10, b"b", 6 * MS)
+    assert wire.next_due_ns() == 6 * MS
+    assert wire.emit(6 * MS) == []
+    assert wire.next_due_ns() == 8 * MS
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(8 * MS)] == [(8 * MS, 2)]
 
 
 def test_who_only_listens_is_not_waited_for() -> None:

@@ -162,7 +162,8 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> Answer
             problems[name] = "it has options that must be given"
             continue
         try:
-            bus_name = path if is_only_asked(path) else f"{driver.medium}:{path}"
+            kind = "modbus" if driver.medium == "modbus" else "serial"
+            bus_name = path if is_only_asked(path) else f"{kind}:{path}"
             bus = make_bus(bus_name, payload_size=adapter.payload_size)
             adapter.fit(bus)
             told = await _ask_all(bus, path, {name: driver}, idle=False)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from skinware import wire
 from skinware.errors import SkinwareError
-from skinware.memory.announcement import is_wished
+from skinware.memory.announcement import is_wished, living_readers
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
@@ -29,8 +29,9 @@ _LOOK_S = 0.5
 """Between two looks whether somebody does."""
 _TURN_S = 0.05
 _SLOTS = 64
-_LEAST_S = 0.3
-"""So long the service is there, so that who wants it finds it also if the driver ends at once."""
+_MOST_S = 1.5
+"""So long after its beginning the service is there, until who wants it has found it: the driver may end at once."""
+_FINDING_S = 0.02
 
 
 class Wires:
@@ -75,10 +76,18 @@ class Wires:
         try:
             if self._writer is not None:
                 self._publish()
-                await asyncio.sleep(max(0, self._found_ns - now_ns()) / NS_PER_S)
+                for _ in range(round(_MOST_S / _FINDING_S)):
+                    if now_ns() > self._found_ns or self._is_read() or not is_wished(self._namespace, wire.WISH):
+                        break
+                    await asyncio.sleep(_FINDING_S)
         except (SkinwareError, OSError) as error:
             self._tell_trouble(error)
         self._withdraw()
+
+    def _is_read(self) -> bool:
+        """Whether anybody took of it: what comes after that is taken even when the service has ended."""
+        name = wire.service_name(self._name)
+        return any(record.service == name and record.frames for record in living_readers(self._namespace))
 
     async def _serve(self) -> None:
         try:
@@ -133,7 +142,7 @@ class Wires:
                 group=self._group,
                 description=f"what goes over the wires of {self._name}",
             )
-            self._found_ns = now_ns() + round(_LEAST_S * NS_PER_S)
+            self._found_ns = now_ns() + round(_MOST_S * NS_PER_S)
         elif any(static[name].tolist() != self._told[name].tolist() for name in static):
             self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
         self._told = static

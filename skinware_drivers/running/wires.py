@@ -74,7 +74,7 @@ class Wires:
         await asyncio.gather(self._task, return_exceptions=True)
         self._task = None
         try:
-            if self._writer is not None:
+            if self._writer is not None or is_wished(self._namespace, wire.WISH):
                 self._publish()
                 for _ in range(round(_MOST_S / _FINDING_S)):
                     if now_ns() > self._found_ns or self._is_read() or not is_wished(self._namespace, wire.WISH):
@@ -85,9 +85,9 @@ class Wires:
         self._withdraw()
 
     def _is_read(self) -> bool:
-        """Whether anybody took of it: what comes after that is taken even when the service has ended."""
+        """Whether anybody has found it: who has can take all of it, also when the service has ended."""
         name = wire.service_name(self._name)
-        return any(record.service == name and record.frames for record in living_readers(self._namespace))
+        return any(record.service == name for record in living_readers(self._namespace))
 
     async def _serve(self) -> None:
         try:

@@ -123,7 +123,8 @@ def test_a_capture_of_modbus_is_decoded_again_with_its_options_and_without_its_h
         (wire,) = recording.wires
         assert wire.bus == name.replace(LOCAL, "host1")
         assert then.structure.buses == (wire.bus,)
-    for secret in (LOCAL.encode(), socket.gethostname().encode()):
+    host = socket.gethostname().encode()
+    for secret in (LOCAL.encode(), *([host] if len(host) > 5 else [])):  # short names are in any bytes by chance
         assert secret not in readable(path)
     with running("skin-driver", "--driver", ARRAY, "--bus", f"replay:{path}") as driver:
         driver.wait_for("ready")

@@ -88,11 +88,9 @@ class _Mirrored:
         patience_s: how long such an answer may take.
         count: the robot's number of the frame that was published last, over generations.
         newest: position of that frame.
-        heard_ns: when its last frame came.
         silence: ends the subscription to its frames.
         pull_until_ns: until when an answer to the question for the newest frame may come, 0 if none is open.
         probe_until_ns: likewise, to one for a frame as it would be pushed.
-        trouble: why it is not here, if somebody was told.
     """
 
     told: Service
@@ -104,12 +102,10 @@ class _Mirrored:
     patience_s: float = _FIRST_GENERATION_S
     count: int | None = None
     newest: tuple[int, int] = (0, 0)
-    heard_ns: int = 0
     silence: Callable[[], None] | None = None
     pull_until_ns: int = 0
     probe_until_ns: int = 0
     traffic: Traffic = field(default_factory=Traffic)
-    trouble: str = ""
 
 
 class Joiner:
@@ -545,7 +541,7 @@ class Joiner:
             return
         if mirrored.count is not None:
             mirrored.traffic.lost += max(0, count - mirrored.count - 1)
-        mirrored.count, mirrored.newest, mirrored.heard_ns = count, frame.position, now_ns()
+        mirrored.count, mirrored.newest = count, frame.position
         mirrored.traffic.frames += 1
         mirrored.traffic.ages_ns.append(age_ns)
         if mirrored.pacing.saw(now_ns(), age_ns):

@@ -57,7 +57,7 @@ class Wires:
         self._name, self._lines, self._namespace, self._group = name, lines, namespace, group
         self._driver_type, self._listen_only = driver_type, listen_only
         self._writer: ServiceWriter | None = None
-        self._found_ns = 0
+        self._until_ns = 0
         self._told: dict[str, npt.NDArray[np.bytes_]] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -77,7 +77,7 @@ class Wires:
             if self._writer is not None or is_wished(self._namespace, wire.WISH):
                 self._publish()
                 for _ in range(round(_MOST_S / _FINDING_S)):
-                    if now_ns() > self._found_ns or self._is_read() or not is_wished(self._namespace, wire.WISH):
+                    if now_ns() > self._until_ns or self._is_read() or not is_wished(self._namespace, wire.WISH):
                         break
                     await asyncio.sleep(_FINDING_S)
         except (SkinwareError, OSError) as error:
@@ -142,7 +142,7 @@ class Wires:
                 group=self._group,
                 description=f"what goes over the wires of {self._name}",
             )
-            self._found_ns = now_ns() + round(_MOST_S * NS_PER_S)
+            self._until_ns = now_ns() + round(_MOST_S * NS_PER_S)
         elif any(static[name].tolist() != self._told[name].tolist() for name in static):
             self._writer.restructure(wire.COLUMNS, static, rate_hz=rate_hz)
         self._told = static

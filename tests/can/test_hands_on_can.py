@@ -21,6 +21,8 @@ pytestmark = [pytest.mark.can, pytest.mark.timeout(200)]
 
 LEFT = 0x28
 LAST_ROW = 0x90
+PERIOD_S = 0.5
+"""From one round of questions to the next: far longer than a round takes where the lab has little time."""
 ROUNDS = 10
 
 
@@ -41,7 +43,7 @@ class Program:
         self._thread = threading.Thread(target=self._run)
 
     def _run(self) -> None:
-        while not self._stop.wait(0.02):
+        while not self._stop.wait(PERIOD_S):
             self._socket.send(can_frame(LEFT, bytes.fromhex("01FF80FF10FF20")))
             for finger in range(1, 6):
                 self._socket.send(can_frame(LEFT, bytes([0xB0 | finger, 0xA4])))
@@ -65,7 +67,7 @@ class Program:
 
 def test_a_driver_shows_what_the_hands_own_program_asks_for_and_sends_nothing(vcan: Callable[[], str]) -> None:
     bus = vcan()
-    listener = LinkerHandDriver(LinkerHandOptions(period_ms=500))
+    listener = LinkerHandDriver(LinkerHandOptions(period_ms=round(1e3 * PERIOD_S)))
     lines = [(listener, make_bus(bus))]
     with (
         emulating("linkerhand", bus, pattern="idle", hands=(LEFT,), touch="10x4", program_ms=0) as hand,

@@ -58,6 +58,7 @@ _CANDIDATES = {
 _UNREADABLE = {0: "it has none", 6: "not over CAN"}
 _ANSWER_S, _SERIAL_S = 0.03, 0.05
 _TRIES, _LONGEST_QUESTION = 2, 5
+_FEWEST_ROUNDS, _SHORTEST_ROUND_S, _LONGEST_ROUND_S = 3, 0.01, 2.0
 
 
 class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,7 +79,9 @@ class LinkerHandOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     ] = False
     period_ms: Annotated[
         Annotated[int, msgspec.Meta(ge=20, le=2000)] | None,
-        msgspec.Meta(description="time between two updates, ms; default: 50, of the whole hand 100"),
+        msgspec.Meta(
+            description="time between two updates, ms; default: learnt by a listener, else 50, of the whole hand 100"
+        ),
     ] = None
     learn_s: Annotated[float, msgspec.Meta(description="how long a listener learns who is there, s", gt=0)] = 1.0
 
@@ -111,6 +114,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
     types: Sequence[SensorType]
     layout: Layout
     patches: Sequence[Patch]
+    _round_s: float | None = None  # from one round of another program's questions to the next
 
     def __init__(self, options: LinkerHandOptions) -> None:
         super().__init__(options)
@@ -202,7 +206,7 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
         self._questions = {hand: touch.questions(of.parts) for hand, of in found.items()}
         self.types = touch.types
         if self.options.period_ms is None:
-            self.period_s = touch.period_s
+            self.period_s = self._round_s or touch.period_s
         self.layout = touch.layout(Identifier.covering(list(found)))
         self.patches = [Patch(_name(hand), touch.modules(hand, of.parts), hand) for hand, of in found.items()]
         self.geometry = Geometry.joined([touch.geometry(hand, of.parts, _side(hand)) for hand, of in found.items()])
@@ -213,7 +217,21 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
             return {hand: of for hand in wanted if (of := await self._ask_hand(link, hand)) is not None}
         if self.options.hands and self.options.touch != "auto":
             return {hand: _Found(self.options.touch, FINGERS) for hand in wanted}
-        return self._heard(await link.listen(self.options.learn_s), wanted)
+        heard = await link.listen(self.options.learn_s)
+        found = self._heard(heard, wanted)
+        self._round_s = self._round(heard, found) or self._round_s
+        return found
+
+    def _round(self, heard: Counter[Heard], found: Mapping[int, _Found]) -> float | None:
+        """How long a program takes from one question to the same one again, s; None if it was asked too seldom."""
+        asked = [
+            heard[Heard(hand, question.payload[0], len(question.payload))]
+            for hand, of in found.items()
+            for question in TOUCH[of.touch].questions(of.parts)
+        ]
+        if max(asked, default=0) < _FEWEST_ROUNDS:
+            return None
+        return min(max(self.options.learn_s / max(asked), _SHORTEST_ROUND_S), _LONGEST_ROUND_S)
 
     def _heard(self, heard: Counter[Heard], wanted: Sequence[int]) -> dict[int, _Found]:
         """The hands that told of touch; of one that told of it in several ways, what was told most."""

@@ -204,6 +204,29 @@ def test_what_a_hand_has_is_heard(touch: str) -> None:
     assert patches == expected.patches
 
 
+@pytest.mark.parametrize("touch", ["10x4", "fingers"])
+@pytest.mark.parametrize("program_ms", [15, 40, 300])
+def test_how_often_a_hand_is_asked_is_learnt(touch: str, program_ms: int) -> None:
+    """Far from the usual 50 ms, too: a program that asks five times as often is not too fast, a slow one not stale."""
+
+    async def scenario() -> None:
+        emulated = {"touch": touch, "program_ms": program_ms}
+        async with Bench(Case(LinkerHandDriver, EmulatedLinkerHand, {}, emulated)) as bench:
+            assert bench.adapter.period_s == pytest.approx(program_ms / 1e3, rel=0.35)
+            await bench.run(4 * program_ms)
+            assert not bench.decoder.state.status.any()
+
+    play(scenario())
+
+
+def test_a_period_that_is_given_is_not_learnt() -> None:
+    async def scenario() -> None:
+        async with Bench(Case(LinkerHandDriver, EmulatedLinkerHand, {"period_ms": 90}, {"program_ms": 40})) as bench:
+            assert bench.adapter.period_s == 0.09
+
+    play(scenario())
+
+
 @pytest.mark.parametrize(("touch", "palm"), [("hand_12x6", "14x16"), ("hand_23x9", "28x20"), ("12x6", "12x6")])
 def test_a_palm_is_heard(touch: str, palm: str) -> None:
     (hand,) = listened({"touch": touch, "palm": True, "program_ms": 100})

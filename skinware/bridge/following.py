@@ -1,0 +1,300 @@
+"""One service of a robot, followed: its generations, and its frames, pushed or pulled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.bridge.link import Priority
+from skinware.bridge.messages import RAW, Service, coded_part, form_of, generation_of, slot_of, split_generation
+from skinware.bridge.mirror import Mirror
+from skinware.bridge.pacing import Pacing
+from skinware.bridge.peer import ANSWER_S, Peer
+from skinware.errors import BadRecording, BridgeError, NameInUse, SkinwareError
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.recording.codec import Decoder
+from skinware.recording.frames import frame_of
+from skinware.recording.generation import Generation
+from skinware.recording.timeline import CLOSED, DEAD, LIVE, PAUSED
+
+Slot = npt.NDArray[np.uint8]
+_FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
+"""A large structure takes its time on a slow link: each time that none comes, it gets twice as long."""
+_STATES = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
+
+
+@dataclass
+class Traffic:
+    """What came of a service since it was looked at last.
+
+    Attributes:
+        frames: that were published here.
+        lost: of the robot's, that were not, since the first one.
+        bytes: of messages.
+        ages_ns: from the publication there to the one here.
+    """
+
+    frames: int = 0
+    lost: int = 0
+    bytes: int = 0
+    ages_ns: list[int] = field(default_factory=list)
+
+
+class Follower:
+    """Publishes a service of a robot. All of it is called with the lock of the mirror held.
+
+    Args:
+        name: of the service.
+        told: how it is there.
+        peer: the robot.
+        mirror: publishes it.
+        mode: ``push`` or ``pull``; None: it finds out.
+
+    Attributes:
+        state: of the service there.
+        traffic: what came.
+        is_over: nothing that comes is taken any more.
+    """
+
+    def __init__(self, name: str, told: Service, peer: Peer, mirror: Mirror, mode: str | None) -> None:
+        self._name, self._peer, self._mirror, self._mode = name, peer, mirror, mode
+        self._pacing = Pacing(0, mode)
+        self.state: str = told.state
+        self.traffic = Traffic()
+        self.is_over = False
+        self._generation: Generation | None = None  # of which frames can be read
+        self._decoder: Decoder | None = None
+        self._held = b""  # the newest frame, where its generation or the robot's clock is not known yet
+        self._asked = (0, 0)  # number of the generation that was asked for, and until when its answer may come
+        self._patience_s = _FIRST_GENERATION_S
+        self._count: int | None = None  # the robot's number of the frame published last, over generations
+        self._newest = (0, 0)  # position of that frame
+        self._silence: Callable[[], None] | None = None  # ends the subscription to frames
+        self._pull_until_ns = 0  # until when an answer to the question for the newest frame may come, 0: none is open
+        self._probe_until_ns = 0  # likewise, to one for a frame as it would be pushed
+
+    @property
+    def mode(self) -> str:
+        """``push`` or ``pull``."""
+        return self._pacing.mode
+
+    def take(self, told: Service) -> None:
+        """How it is there now."""
+        before, self.state = self.state, told.state
+        if told.generation and (self._generation is None or self._generation.generation != told.generation):
+            self._ask_generation(told.generation)
+        if told.state != before or told.state in ("closed", "dead"):
+            self._mirror.happened(self._name, _STATES[told.state])
+        if told.state == "closed":
+            self.is_over = True
+            self._unsubscribe()
+
+    def look(self, time_ns: int) -> None:
+        """What is to be done by the clock."""
+        if not self._peer.is_connected or self._generation is None or not self._peer.clock.is_known:
+            return
+        if self._pacing.pulls and time_ns > self._pull_until_ns:
+            self._pull()
+        if self._pacing.wants_probe(time_ns) and time_ns > self._probe_until_ns and self._count is not None:
+            self._probe()
+
+    def start_over(self) -> None:
+        """Generations and counts are others from now on."""
+        self._generation, self._newest, self._count = None, (0, 0), None
+
+    def lost(self) -> None:
+        """The robot is not heard any more."""
+        self._mirror.happened(self._name, DEAD)
+        self._pull_until_ns = 0
+
+    def clock_told(self) -> None:
+        """The robot's clock is known."""
+        if self._held and self._generation is not None:
+            self._take_held()
+
+    # -- generations ----------------------------------------------------------------------------------------------
+
+    def _ask_generation(self, number: int) -> None:
+        time_ns = now_ns()
+        if self._asked[0] == number and time_ns < self._asked[1]:
+            return
+        self._asked = number, time_ns + round(self._patience_s * NS_PER_S)
+        self._peer.ask(
+            self._peer.keys.of(self._name, "generation"),
+            lambda payload, _: self._take_generation(number, payload),
+            timeout_s=self._patience_s,
+            priority=Priority.CALLS,
+            parameters={"number": number},
+        )
+
+    def _take_generation(self, number: int, payload: bytes | None) -> None:
+        if self.is_over:
+            return
+        if self._asked[0] == number:
+            self._asked = 0, 0
+        if payload is None:
+            self._patience_s = min(2 * self._patience_s, _LAST_GENERATION_S)
+            return
+        self._peer.heard()
+        try:
+            about, head = split_generation(payload)
+            generation = Generation(head, self._name)
+        except (BridgeError, BadRecording) as error:
+            self._trouble(error, " cannot be read")
+            return
+        before = self._generation
+        if before is not None and generation.generation < before.generation:
+            return
+        self._generation, self._decoder = generation, None
+        if before is None or before.period_ns != generation.period_ns:
+            self._pacing = Pacing(generation.period_ns, self._mode)
+            self._subscribe()
+        self._mirror.operations[self._name] = about.operations
+        if self._held:
+            self._take_held()
+        elif not self._pacing.pulls:
+            self._pull()  # the newest one that there is, should no other come for long
+
+    # -- how frames come ------------------------------------------------------------------------------------------
+
+    def _subscribe(self) -> None:
+        """Have its frames come, as its pacing wants it."""
+        self._unsubscribe()
+        if self._pacing.pulls:
+            self._pull_until_ns = 0
+        else:
+            self._silence = self._peer.listen(self._peer.keys.of(self._name, "frame"), self._frame_came)
+
+    def _unsubscribe(self) -> None:
+        if self._silence is not None:
+            self._silence()
+            self._silence = None
+
+    def _frame_came(self, _key: str, message: bytes) -> None:
+        """In the thread that receives: a frame waits for no other thread."""
+        with self._mirror.lock:
+            self._take_frame(message)
+
+    def _pull(self) -> None:
+        self._pull_until_ns = now_ns() + round(2 * ANSWER_S * NS_PER_S)
+        number, sequence = self._newest
+        self._peer.ask(
+            self._peer.keys.of(self._name, "newest"),
+            lambda payload, _: self._take_pulled(payload),
+            timeout_s=2 * ANSWER_S,
+            priority=Priority.PULLED,
+            parameters={
+                "who": self._peer.who,
+                "generation": number,
+                "sequence": sequence,
+                "base": 0 if self._decoder is None else self._decoder.sequence,
+            },
+        )
+
+    def _take_pulled(self, message: bytes | None) -> None:
+        if self.is_over:
+            return
+        self._pull_until_ns = 0
+        if self._pacing.pulls and message is not None and self._peer.is_connected:
+            self._pull()  # the next one is on its way while this one is published
+        if message:
+            self._take_frame(message)
+
+    def _probe(self) -> None:
+        """Ask for a frame as it would be pushed, and look how long it is on its way."""
+        asked_ns = now_ns()
+        self._probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
+        self._peer.ask(
+            self._peer.keys.of(self._name, "newest"),
+            lambda payload, returned_ns: self._take_probe(returned_ns - asked_ns, payload),
+            timeout_s=2 * ANSWER_S,
+            priority=Priority.PULLED,
+            parameters={"form": RAW},
+        )
+
+    def _take_probe(self, took_ns: int, message: bytes | None) -> None:
+        if self.is_over:
+            return
+        self._probe_until_ns = 0
+        if message is not None:
+            self._peer.heard()
+        if self._pacing.probed(now_ns(), took_ns - self._peer.clock.round_trip_ns):
+            self._changed_mode()
+
+    def _changed_mode(self) -> None:
+        self._peer.tell({"event": "mode", "service": self._name, "mode": self._pacing.mode})
+        self._subscribe()
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def _take_held(self) -> None:
+        held, self._held = self._held, b""
+        self._take_frame(held)
+
+    def _take_frame(self, message: bytes) -> None:
+        if self.is_over:
+            return
+        self._peer.heard()
+        self.traffic.bytes += len(message)
+        try:
+            form, number = form_of(message), generation_of(message)
+        except BridgeError as error:
+            self._trouble(error)
+            return
+        generation = self._generation
+        if generation is None or generation.generation != number:
+            if generation is None or number > generation.generation:
+                self._held = message
+                self._ask_generation(number)
+            return
+        if not self._peer.clock.is_known:
+            self._held = message
+            return
+        try:
+            slot = self._slot(form, message, generation)
+        except BadRecording as error:
+            self._decoder = None
+            self._trouble(error)
+            return
+        self._publish(generation, slot)
+
+    def _slot(self, form: int, message: bytes, generation: Generation) -> Slot:
+        if form == RAW:
+            slot = slot_of(message)
+            if len(slot) != generation.slot_stride:
+                raise BadRecording(f"a frame of {len(slot)} bytes, not {generation.slot_stride}")
+            return slot
+        if self._decoder is None:
+            self._decoder = Decoder(generation.coded, generation.slot_stride)
+        return self._decoder.decode(coded_part(message))
+
+    def _publish(self, generation: Generation, slot: Slot) -> None:
+        frame = frame_of(generation, slot)
+        count = generation.published_before + frame.sequence
+        if frame.position <= self._newest:
+            return
+        age_ns = now_ns() - self._peer.clock.offset_ns(now_ns()) - frame.published_ns
+        try:
+            self._mirror.publish(self._name, frame, generation)
+        except NameInUse as error:
+            self._trouble(error, " cannot appear here")
+            return
+        except SkinwareError as error:
+            self._trouble(error)
+            return
+        if self._count is not None:
+            self.traffic.lost += max(0, count - self._count - 1)
+        self._count, self._newest = count, frame.position
+        self.traffic.frames += 1
+        self.traffic.ages_ns.append(age_ns)
+        if self._pacing.saw(now_ns(), age_ns):
+            self._changed_mode()
+
+    def _trouble(self, error: SkinwareError, what: str = "") -> None:
+        self._peer.say_once(self._name, f"service {self._name!r}{what}: {error}")
+
+
+__all__ = ["Follower", "Traffic"]

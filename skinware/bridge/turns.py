@@ -1,0 +1,45 @@
+"""What other threads want done, in the one that runs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Callable
+
+
+class Turns:
+    """Jobs that wait for their turn.
+
+    Attributes:
+        fd: can be read from while there are any.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: deque[Callable[[], None]] = deque()
+        self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+
+    def soon(self, job: Callable[[], None]) -> None:
+        """Have it done; from any thread."""
+        self._jobs.append(job)
+        self.ring()
+
+    def ring(self) -> None:
+        """Wake who waits; from any thread, and from a signal handler."""
+        with contextlib.suppress(OSError):  # closed
+            os.eventfd_write(self.fd, 1)
+
+    def take(self) -> None:
+        """Do what waits."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.fd)
+        for _ in range(len(self._jobs)):
+            self._jobs.popleft()()
+
+    def close(self) -> None:
+        """End it."""
+        fd, self.fd = self.fd, -1
+        os.close(fd)
+
+
+__all__ = ["Turns"]

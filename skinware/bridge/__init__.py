@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from skinware.errors import MissingExtra
 
-if find_spec("zenoh") is None or find_spec("mcap") is None:
+if find_spec("zenoh") is None:
     raise MissingExtra("bridges need packages that are not installed: pip install 'skinware[zenoh]'")
 
 from skinware.bridge.endpoints import DEFAULT_LISTEN, Endpoints, endpoints

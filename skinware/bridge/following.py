@@ -15,10 +15,10 @@ from skinware.bridge.pacing import Pacing
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.errors import BadRecording, BridgeError, NameInUse, SkinwareError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.recording.codec import Decoder
-from skinware.recording.frames import frame_of
-from skinware.recording.generation import Generation
-from skinware.recording.timeline import CLOSED, DEAD, LIVE, PAUSED
+from skinware.transfer.codec import Decoder
+from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
+from skinware.transfer.frames import frame_of
+from skinware.transfer.generation import Generation
 
 Slot = npt.NDArray[np.uint8]
 _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0

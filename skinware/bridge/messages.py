@@ -17,7 +17,7 @@ Keys of robot R: ``skinware/1/R/``...
 ``skinware/live/R/1/INSTANCE`` is a token of who serves the robot: version and a number of its own.
 
 A frame begins with a byte that tells its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
-``CODED``: a message of :mod:`skinware.recording.codec`.
+``CODED``: a message of :mod:`skinware.transfer.codec`.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def raw_message(frame: Frame) -> bytes:
 
 
 def coded_message(coded: bytes) -> bytes:
-    """A message of :mod:`skinware.recording.codec`, for the link."""
+    """A message of :mod:`skinware.transfer.codec`, for the link."""
     return _CODED_HEAD + coded
 
 

@@ -11,10 +11,10 @@ from typing import Any
 from skinware.bridge.messages import Answered
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.recording.frames import RecordedFrame
-from skinware.recording.generation import Generation
-from skinware.recording.republishing import Published, Republisher
 from skinware.service import Request
+from skinware.transfer.frames import RecordedFrame
+from skinware.transfer.generation import Generation
+from skinware.transfer.republishing import Published, Republisher
 
 Position = tuple[int, int]
 _LONGEST_NS = 5 * NS_PER_S
@@ -59,7 +59,7 @@ class Mirror(Republisher):
         self.operations: dict[str, Mapping[str, str]] = {}
 
     def watch(self, fd: int, call: Callable[[], object]) -> None:
-        """See :class:`skinware.recording.republishing.Republisher`."""
+        """See :class:`skinware.transfer.republishing.Republisher`."""
 
         def locked() -> None:
             with self.lock:
@@ -101,7 +101,7 @@ class Mirror(Republisher):
             self._give(name, self._newest.get(name, (0, 0)))
 
     def tidy(self) -> None:
-        """See :class:`skinware.recording.republishing.Republisher`."""
+        """See :class:`skinware.transfer.republishing.Republisher`."""
         super().tidy()
         for answers in self._answers.values():
             for late in [waiting for waiting in answers if now_ns() > waiting.until_ns]:

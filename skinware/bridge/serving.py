@@ -31,10 +31,10 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
-from skinware.recording.codec import CodedColumn, Encoder
-from skinware.recording.collecting import Collector
 from skinware.service import PendingRequest, ServiceReader
 from skinware.service.messages import Answer
+from skinware.transfer.codec import CodedColumn, Encoder
+from skinware.transfer.collecting import Collector
 
 _HELD_NS = NS_PER_S // 2
 """How long a question for the newest frame waits for one."""
@@ -159,7 +159,7 @@ class Server:
     # -- what the collector tells ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.recording.collecting.Listener`."""
+        """See :class:`skinware.transfer.collecting.Listener`."""
         segment = segments.recorded(head, service)
         columns = [CodedColumn.of(column) for column in segment.layout.slot]
         told = Service(segment.generation, self._states.get(service, Service()).state)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from skinware.conversion.tables import Source, Table
 from skinware.errors import BadRecording
-from skinware.recording.generation import Generation
+from skinware.transfer.generation import Generation
 
 FORMAT, VERSION = "skinware-arrays", 1
 

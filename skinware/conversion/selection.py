@@ -12,10 +12,10 @@ import numpy.typing as npt
 from skinware._columns import as_index
 from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
 from skinware.errors import ConfigurationError
-from skinware.recording.generation import PER_SENSOR
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
+from skinware.transfer.generation import PER_SENSOR
 
 
 @dataclass(frozen=True)

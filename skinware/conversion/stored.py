@@ -13,7 +13,7 @@ import numpy.typing as npt
 from skinware.conversion.description import description_of, generations_of
 from skinware.conversion.tables import TIME, ArrayFormat, Block, Span, Table
 from skinware.errors import BadRecording
-from skinware.recording.generation import Generation
+from skinware.transfer.generation import Generation
 
 _PIECE_BYTES = 4 << 20
 

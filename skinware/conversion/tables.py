@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.recording.generation import Generation
 from skinware.structure import Structure
+from skinware.transfer.generation import Generation
 
 FRAMES, COLUMNS, PHYSICAL = "frames/", "columns/", "physical/"
 """What names of arrays begin with: of what every frame has, of columns of the service, of values in their unit."""

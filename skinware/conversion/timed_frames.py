@@ -10,8 +10,8 @@ import numpy as np
 
 from skinware.conversion.tables import COLUMNS, TIME, Table
 from skinware.memory.file_layout import SLOT
-from skinware.recording.frames import RecordedFrame, frame_of
-from skinware.recording.generation import Generation
+from skinware.transfer.frames import RecordedFrame, frame_of
+from skinware.transfer.generation import Generation
 
 
 class TimedFrame(NamedTuple):

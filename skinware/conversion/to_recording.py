@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 from skinware.conversion.tables import Source
 from skinware.conversion.timed_frames import TimedFrame, timed_frames
 from skinware.realtime import NS_PER_S
-from skinware.recording.codec import Encoder
 from skinware.recording.files import Head, RecordingFile
-from skinware.recording.generation import Generation
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
+from skinware.transfer.codec import Encoder
+from skinware.transfer.generation import Generation
 
 _CHUNK_NS = NS_PER_S // 4
 _CHUNK_BYTES = 8 << 20

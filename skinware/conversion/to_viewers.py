@@ -16,10 +16,10 @@ from skinware.conversion.timed_frames import TimedFrame, timed_frames
 from skinware.conversion.viewers import Viewers
 from skinware.driver_frame import DriverFrame
 from skinware.errors import ConfigurationError
-from skinware.recording.generation import Generation
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import EVENTS, SCHEMAS, Channels
 from skinware.structure import Structure
+from skinware.transfer.generation import Generation
 
 _CHUNK_BYTES = 4 << 20
 _BAG_VERSION = 5

@@ -9,8 +9,8 @@ from skinware.conversion.showing import Message, Showing
 from skinware.driver_frame import DriverFrame
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S
-from skinware.recording.generation import Generation
 from skinware.structure import Structure
+from skinware.transfer.generation import Generation
 
 RATE_HZ = 30.0
 

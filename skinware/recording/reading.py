@@ -11,14 +11,15 @@ from typing import Any, Self
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.recording.frames import RecordedDriverFrame, RecordedSnapshot
-from skinware.recording.generation import Generation
 from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource
-from skinware.recording.timeline import GONE, LIVE, PAUSED, Moment, Timeline
+from skinware.recording.timeline import GONE, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
 from skinware.recording.wire_tracks import WireTrack
 from skinware.skin_layout import SkinLayout
+from skinware.transfer.collecting import LIVE, PAUSED
+from skinware.transfer.frames import RecordedDriverFrame, RecordedSnapshot
+from skinware.transfer.generation import Generation
 
 
 @dataclass

@@ -22,13 +22,13 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
-from skinware.recording.codec import CodedColumn, Encoder
-from skinware.recording.collecting import Collector
 from skinware.recording.files import Head, Target
-from skinware.recording.generation import Generation, disguised
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
+from skinware.transfer.codec import CodedColumn, Encoder
+from skinware.transfer.collecting import Collector
+from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
@@ -172,7 +172,7 @@ class Recorder:
     # -- what the collector tells ---------------------------------------------------------------------------------
 
     def began(self, service: str, head: bytes) -> None:
-        """See :class:`skinware.recording.collecting.Listener`."""
+        """See :class:`skinware.transfer.collecting.Listener`."""
         self._jobs.put(_Began(service, head))
 
     def took(self, service: str, frame: Frame) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.recording.reading import Recording
-from skinware.recording.republishing import Republisher
 from skinware.recording.timeline import GONE, Moment
+from skinware.transfer.republishing import Republisher
 
 _LATE_NS = 10_000_000
 _MOST_BEHIND_NS = 50_000_000

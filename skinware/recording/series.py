@@ -11,8 +11,8 @@ import numpy.typing as npt
 from skinware.errors import StructureError
 from skinware.freshness import age_limit_ns, is_fresh
 from skinware.realtime import NS_PER_S
-from skinware.recording.generation import Generation
 from skinware.structure import Structure
+from skinware.transfer.generation import Generation
 
 
 class Series:
@@ -20,7 +20,7 @@ class Series:
 
     Args:
         origin: one of their generations.
-        headers: (n,) of :data:`skinware.recording.codec.HEADER`.
+        headers: (n,) of :data:`skinware.transfer.codec.HEADER`.
         time_s: (n,) when each was published, s since the recording began.
         columns: (n, ...) by name.
 

@@ -8,10 +8,10 @@ from concurrent.futures import Executor, Future
 from itertools import accumulate
 from typing import NamedTuple, Protocol
 
-from skinware.recording.frames import RecordedFrame
 from skinware.recording.mcap_reading import ChunkPlace
+from skinware.transfer.collecting import CLOSED, DEAD
+from skinware.transfer.frames import RecordedFrame
 
-PAUSED, LIVE, CLOSED, DEAD = "paused", "live", "closed", "dead"
 GONE = (CLOSED, DEAD)
 _KEPT_CHUNKS = 3
 

@@ -12,12 +12,12 @@ import numpy.typing as npt
 from skinware._columns import as_index
 from skinware.errors import BadRecording, StructureError
 from skinware.realtime import NS_PER_S
-from skinware.recording.codec import HEADER, Run, runs
-from skinware.recording.frames import RecordedFrame, frames_of
-from skinware.recording.generation import PER_SENSOR, Generation
 from skinware.recording.mcap_reading import ChunkContents
 from skinware.recording.series import Series
 from skinware.structure import Index, Structure
+from skinware.transfer.codec import HEADER, Run, runs
+from skinware.transfer.frames import RecordedFrame, frames_of
+from skinware.transfer.generation import PER_SENSOR, Generation
 
 _FOR_DRIVERS = ("values", "status", "module_time_ns")
 

@@ -31,8 +31,8 @@ from skinware.bridge.pacing import Pacing
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
-from skinware.recording.codec import CodedColumn, Decoder, Encoder
 from skinware.service import ServiceReader
+from skinware.transfer.codec import CodedColumn, Decoder, Encoder
 from tests.bridge.rig import publish, structure
 from tests.streams.peers import free_port
 

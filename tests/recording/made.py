@@ -13,7 +13,7 @@ from skinware import Namespace, ServiceWriter, Structure
 from skinware.conversion.tables import COLUMNS, OF_FRAMES, Block, Table
 from skinware.conversion.to_recording import write_recording
 from skinware.memory import segments
-from skinware.recording.generation import Generation
+from skinware.transfer.generation import Generation
 from tests.cli.fake_skin import FakeSkin
 
 START_NS = 1_790_000_000_000_000_000

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from skinware.errors import BadRecording
 from skinware.memory import file_layout
 from skinware.memory.ring import Frame
-from skinware.recording.codec import HEADER, CodedColumn, Encoder, Run, runs
+from skinware.transfer.codec import HEADER, CodedColumn, Encoder, Run, runs
 
 DTYPES = ["u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<u8", "<i8", "<f8", "S7", "V13"]
 

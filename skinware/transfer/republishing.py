@@ -15,10 +15,10 @@ from skinware.errors import NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import STATIC_NAME
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.recording.frames import RecordedFrame
-from skinware.recording.generation import Generation
-from skinware.recording.timeline import CLOSED, DEAD, LIVE, PAUSED
 from skinware.service import Request, ServiceWriter
+from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
+from skinware.transfer.frames import RecordedFrame
+from skinware.transfer.generation import Generation
 
 _TIMES_OF_DRIVERS = ("module_time_ns", "bus_since_ns")
 """Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""

@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from skinware.driver_frame import DriverFrame
 from skinware.memory.ring import Frame
-from skinware.recording.codec import Run
-from skinware.recording.generation import Generation
 from skinware.snapshot import Snapshot
+from skinware.transfer.codec import Run
+from skinware.transfer.generation import Generation
 
 
 class RecordedFrame(Frame):

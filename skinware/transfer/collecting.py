@@ -17,6 +17,8 @@ from skinware.wire import KIND, WISH, service_name
 
 _DISCOVERY_NS = NS_PER_S // 50
 """Between two looks for new services: of a ring of 8 slots at 100 Hz nothing is lost meanwhile."""
+PAUSED, LIVE, CLOSED, DEAD = "paused", "live", "closed", "dead"
+"""How a service can be said to be."""
 _LIFE_NS = NS_PER_S // 5
 """Between two looks at who lives."""
 _MOST_AT_ONCE = 64
@@ -236,9 +238,9 @@ class Collector:
         reader.refresh()
         if reader.structure_changed:
             return  # it is back, and gone over to at the next take
-        state = "paused" if reader.paused else "live"
+        state = PAUSED if reader.paused else LIVE
         if not reader.alive:
-            state = "closed" if reader.moved_on else "dead"
+            state = CLOSED if reader.moved_on else DEAD
         if state != source.state:
             source.state = state
             self._tell(state, name)

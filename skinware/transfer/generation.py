@@ -13,8 +13,8 @@ from skinware import driver_service
 from skinware.errors import BadRecording, BadServiceFile, StructureError
 from skinware.memory import segments
 from skinware.memory.schema import STATIC_NAME, Schema
-from skinware.recording.codec import CodedColumn
 from skinware.structure import Index, Structure
+from skinware.transfer.codec import CodedColumn
 
 PER_SENSOR = ("values", "status")
 """Columns of a driver that have a number for each sensor."""

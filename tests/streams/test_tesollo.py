@@ -182,6 +182,6 @@ def test_a_connection_that_is_out_of_step_is_made_anew(namespace: object) -> Non
     with emulated_on(device, Stutters, pattern="cycle"):
         with emulated_skin("tesollo", bus=f"tcp://{LOCAL}:{port}") as skin:
             wait_until(lambda: Stutters.count > 60)
+            wait_until(lambda: skin.driver.status()["buses"][0]["skipped_bytes"] >= 100)
             frame = read_until(skin.reader, lambda f: (f.patch_state == PatchState.LIVE).all())
             assert len(set(frame.values.tolist())) == 1
-            assert skin.driver.status()["buses"][0]["skipped_bytes"] >= 100

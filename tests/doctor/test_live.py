@@ -6,7 +6,7 @@ import itertools
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -16,9 +16,9 @@ import pytest
 from skinware import BusReason, BusState, DriverWriter, Namespace, Status
 from skinware.realtime import now_ns
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Severity
+from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
-from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
@@ -26,22 +26,21 @@ from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.cli.test_regions import placed_structure
 from tests.cli.test_sensor_health import looked_after
-from tests.doctor.rig import found, found_until, looked, of
+from tests.doctor.rig import found, found_until, looked, nothing_found, of
 from tests.sdk.driving import driving, emulated
 
 Skins = Callable[..., EmulatedSkin]
 DRIVERS = sorted(entry_points(group="skinware.drivers").names)
 
 
+@pytest.mark.timeout(150)
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_nothing_is_wrong_with_emulated_hardware(driver: str) -> None:
-    """A busy machine may keep a driver waiting, which is rightly found, and remembered: not in every run of it."""
-
-    def is_healthy() -> bool:
+    def run_and_look() -> Sequence[Finding]:
         with emulated_skin(driver):
-            return found() == ()
+            return found()
 
-    wait_until(is_healthy)
+    nothing_found(run_and_look)
 
 
 def test_what_was_looked_at_and_what_could_not_be_is_told(skins: Skins) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from skinware_drivers.doctor.recorded import look_at
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
+from tests.doctor.rig import nothing_found
 from tests.recording.damaging import damaged
 from tests.recording.rig import has, publish, recording
 
@@ -43,14 +46,23 @@ def record(file: Path, skin: FakeSkin, *parts: Any) -> None:
             publish(skin, 25)
 
 
+@pytest.mark.timeout(150)
 def test_nothing_is_wrong_with_a_healthy_one(tmp_path: Path) -> None:
-    file = tmp_path / "walk.mcap"
-    with emulated_skin("roboskin", name="torso", boards=(7, 8)) as skin, recording(file) as recorder:
-        has(recorder, "torso")
-        for _ in range(15):
-            skin.reader.read(newer_than=skin.reader.latest)
-    evidence, findings = seen(file)
-    assert findings == {}
+    files = (tmp_path / f"walk{number}.mcap" for number in itertools.count())
+    kept: list[Evidence] = []
+
+    def run_and_look() -> Sequence[Finding]:
+        file = next(files)
+        with emulated_skin("roboskin", name="torso", boards=(7, 8)) as skin, recording(file) as recorder:
+            has(recorder, "torso")
+            for _ in range(15):
+                skin.reader.read(newer_than=skin.reader.latest)
+        evidence, findings = seen(file)
+        kept.append(evidence)
+        return list(findings.values())
+
+    nothing_found(run_and_look)
+    evidence = kept[-1]
     (driver,) = evidence.drivers
     assert (driver.name, driver.life, driver.restarts, driver.frames_lost) == ("torso", "live", 0, 0)
     assert driver.frames >= 15

@@ -74,6 +74,7 @@ def test_a_driver_that_is_killed_leaves_a_whole_capture(tmp_path: Path) -> None:
     path = tmp_path / "hand.mcap"
     with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", str(path)) as driver:
         frames_come(driver, "xela")
+        wait_until(lambda: len(received(path)) > 20)
         os.kill(driver.process.pid, signal.SIGKILL)
         driver.stop()
     shutil.rmtree(Namespace().path)  # what nobody cleared away

@@ -24,6 +24,12 @@ def module_names(
     One without a name of its own has its kind and, among several of that kind in its patch, a number from 0; the only
     module of a patch is called as the patch.
     """
+    pairs = zip(patches, names_in_patches(own_names, kinds, patches), strict=True)
+    return tuple(joined(names_of_patches[patch], name) for patch, name in pairs)
+
+
+def names_in_patches(own_names: Sequence[str], kinds: Sequence[str], patches: Sequence[int]) -> tuple[str, ...]:
+    """What ``module_names`` adds to the names of the patches; empty where it adds nothing."""
     in_patch = Counter(patches)
     of_kind = Counter(zip(patches, kinds, strict=True))
     seen: Counter[tuple[int, str]] = Counter()
@@ -34,7 +40,7 @@ def module_names(
         if not own and in_patch[patch] > 1:
             own = kind or "module"
             own = f"{own} {number}" if of_kind[patch, kind] > 1 else own
-        names.append(joined(names_of_patches[patch], own))
+        names.append(own)
     return tuple(names)
 
 

@@ -12,6 +12,7 @@ if find_spec("zenoh") is None:
 from skinware.bridge.endpoints import DEFAULT_LISTEN, Endpoints, endpoints
 from skinware.bridge.joining import Joiner
 from skinware.bridge.link import Link
+from skinware.bridge.messages import Wish
 from skinware.bridge.serving import Server
 
-__all__ = ["DEFAULT_LISTEN", "Endpoints", "Joiner", "Link", "Server", "endpoints"]
+__all__ = ["DEFAULT_LISTEN", "Endpoints", "Joiner", "Link", "Server", "Wish", "endpoints"]

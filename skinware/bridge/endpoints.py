@@ -13,11 +13,10 @@ from skinware.errors import ConfigurationError
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.%\w]+\]|[^\s/:\[\]]+):(\d{1,5})")
 DEFAULT_LISTEN = "tcp/127.0.0.1:7448"
-CALLS = "skinware/*/*/*/call/**"
-"""Keys of all calls."""
-
 _ALL = "skinware/**"
-_QUESTIONS = ["skinware/*/*/clock", "skinware/*/*/services", "skinware/*/*/*/generation", "skinware/*/*/*/newest"]
+_OF_A_ROBOT = "skinware/*/*/*"
+_CALLS = f"{_OF_A_ROBOT}/*/call/**"
+_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("clock", "services", "*/generation", "*/newest")]
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ def _rules(callers: Sequence[str]) -> str:
             "rules": [
                 {**rule, "id": "see", "messages": listening, "key_exprs": [_ALL]},
                 {**rule, "id": "ask", "key_exprs": _QUESTIONS},
-                {**rule, "id": "call", "key_exprs": [CALLS]},
+                {**rule, "id": "call", "key_exprs": [_CALLS]},
                 {**rule, "id": "tell", "messages": speaking, "flows": ["egress"], "key_exprs": [_ALL]},
             ],
             "subjects": [{"id": "all"}, subject],

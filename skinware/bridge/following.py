@@ -52,6 +52,7 @@ class Follower:
         peer: the robot.
         mirror: publishes it.
         mode: ``push`` or ``pull``; None: it finds out.
+        part: number of the wish for some of its sensors; empty: all of it.
 
     Attributes:
         state: of the service there.
@@ -59,8 +60,10 @@ class Follower:
         is_over: nothing that comes is taken any more.
     """
 
-    def __init__(self, name: str, told: Service, peer: Peer, mirror: Mirror, mode: str | None) -> None:
-        self._name, self._peer, self._mirror, self._mode = name, peer, mirror, mode
+    def __init__(
+        self, name: str, told: Service, peer: Peer, mirror: Mirror, *, mode: str | None = None, part: str = ""
+    ) -> None:
+        self._name, self._peer, self._mirror, self._mode, self._part = name, peer, mirror, mode, part
         self._pacing = Pacing(0, mode)
         self.state: str = told.state
         self.traffic = Traffic()
@@ -80,6 +83,15 @@ class Follower:
     def mode(self) -> str:
         """``push`` or ``pull``."""
         return self._pacing.mode
+
+    @property
+    def _of_part(self) -> dict[str, object]:
+        """What tells in questions which part is meant."""
+        return {"part": self._part} if self._part else {}
+
+    @property
+    def _frame_key(self) -> str:
+        return self._peer.keys.frame(self._name, self._part)
 
     def take(self, told: Service) -> None:
         """How it is there now."""
@@ -127,7 +139,7 @@ class Follower:
             lambda payload, _: self._take_generation(number, payload),
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
-            parameters={"number": number},
+            parameters={"number": number} | self._of_part,
         )
 
     def _take_generation(self, number: int, payload: bytes | None) -> None:
@@ -151,7 +163,7 @@ class Follower:
         self._generation, self._decoder = generation, None
         if before is None or before.period_ns != generation.period_ns:
             self._pacing = Pacing(generation.period_ns, self._mode)
-            self._subscribe()
+            self.subscribe()
         self._mirror.operations[self._name] = about.operations
         if self._held:
             self._take_held()
@@ -160,23 +172,23 @@ class Follower:
 
     # -- how frames come ------------------------------------------------------------------------------------------
 
-    def _subscribe(self) -> None:
+    def subscribe(self) -> None:
         """Have its frames come, as its pacing wants it."""
         self._unsubscribe()
-        if self._pacing.pulls:
-            self._pull_until_ns = 0
-        else:
-            self._silence = self._peer.listen(self._peer.keys.of(self._name, "frame"), self._frame_came)
+        self._pull_until_ns = 0
+        if self._generation is not None and not self._pacing.pulls:
+            self._silence = self._peer.listen(self._frame_key, self._frame_came)
 
     def _unsubscribe(self) -> None:
         if self._silence is not None:
             self._silence()
             self._silence = None
 
-    def _frame_came(self, _key: str, message: bytes) -> None:
+    def _frame_came(self, key: str, message: bytes) -> None:
         """In the thread that receives: a frame waits for no other thread."""
         with self._mirror.lock:
-            self._take_frame(message)
+            if key == self._frame_key:  # and not of a bridge that is not followed any more
+                self._take_frame(message)
 
     def _pull(self) -> None:
         self._pull_until_ns = now_ns() + round(2 * ANSWER_S * NS_PER_S)
@@ -191,6 +203,7 @@ class Follower:
                 "generation": number,
                 "sequence": sequence,
                 "base": 0 if self._decoder is None else self._decoder.sequence,
+                **self._of_part,
             },
         )
 
@@ -212,7 +225,7 @@ class Follower:
             lambda payload, returned_ns: self._take_probe(returned_ns - asked_ns, payload),
             timeout_s=2 * ANSWER_S,
             priority=Priority.PULLED,
-            parameters={"form": RAW},
+            parameters={"form": RAW} | self._of_part,
         )
 
     def _take_probe(self, took_ns: int, message: bytes | None) -> None:
@@ -226,7 +239,7 @@ class Follower:
 
     def _changed_mode(self) -> None:
         self._peer.tell({"event": "mode", "service": self._name, "mode": self._pacing.mode})
-        self._subscribe()
+        self.subscribe()
 
     # -- frames ---------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import msgspec
 from skinware.bridge.clock import PeerClock
 from skinware.bridge.following import Follower, Traffic
 from skinware.bridge.link import Link, Priority
-from skinware.bridge.messages import Answered, Service, Services
+from skinware.bridge.messages import Answered, Keys, Service, Services, Wish
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge.turns import Turns
@@ -32,6 +32,7 @@ class Joiner:
         link: to it.
         namespace: where its services appear.
         mode: ``push`` or ``pull``; None: it finds out for each service.
+        wish: some sensors that are wanted, and no services but drivers; None: all there is.
         why_not: why nobody is reached, a line for people, empty if somebody is; called in a thread, may wait.
         tell: is told what happens, as JSON has it.
     """
@@ -43,10 +44,13 @@ class Joiner:
         namespace: Namespace,
         *,
         mode: str | None = None,
+        wish: Wish | None = None,
         why_not: Callable[[], str] = str,
         tell: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> None:
-        self._mode = mode
+        self._mode, self._wish = mode, wish
+        self._missing = ""  # of the wish, when it was asked for last
+        self._tell = tell
         self._turns = Turns()
         self._mirror = Mirror(namespace, self._pass_on, lambda: self.clock.offset_ns(now_ns()))
         self._lock = self._mirror.lock
@@ -56,9 +60,8 @@ class Joiner:
         self._next_services_ns = 0
         self._mirror.watch(self._turns.fd, self._turns.take)
         self._peer = Peer(robot, link, self._turns, self, why_not=why_not, tell=tell)
-        link.listen(
-            self._peer.keys.services, lambda _key, payload: self._turns.soon(lambda: self._take_services(payload))
-        )
+        self._of_any = Keys(robot)
+        link.listen(self._of_any.services, lambda _, payload: self._turns.soon(lambda: self._services_changed(payload)))
 
     @property
     def is_connected(self) -> bool:
@@ -122,6 +125,16 @@ class Joiner:
         """See :class:`skinware.bridge.peer.Watcher`."""
         self._ask_services()
 
+    def moved(self) -> None:
+        """Likewise."""
+        for follower in self._followers.values():
+            follower.subscribe()
+
+    def restarted(self) -> None:
+        """Likewise."""
+        for follower in self._followers.values():
+            follower.start_over()
+
     def lost(self) -> None:
         """Likewise."""
         for follower in self._followers.values():
@@ -137,11 +150,18 @@ class Joiner:
     def _ask_services(self) -> None:
         self._next_services_ns = now_ns() + _SERVICES_NS
         self._peer.ask(
-            self._peer.keys.services,
+            self._of_any.services,
             lambda payload, _: self._take_services(payload),
             timeout_s=ANSWER_S,
             priority=Priority.CALLS,
+            payload=b"" if self._wish is None else msgspec.json.encode(self._wish),
         )
+
+    def _services_changed(self, payload: bytes) -> None:
+        if self._wish is None:
+            self._take_services(payload)
+        else:
+            self._ask_services()
 
     def _take_services(self, payload: bytes | None) -> None:
         if not payload:
@@ -151,13 +171,12 @@ class Joiner:
         except msgspec.MsgspecError as error:
             self._peer.say_once("services", f"robot {self._peer.robot} tells what cannot be read: {error}")
             return
-        self._peer.heard()
-        if not self._peer.follows(told.instance):
+        if not self._peer.follows(told.instance, told.start):
             return
-        if self._peer.counts_from(told.start):
-            for follower in self._followers.values():
-                follower.start_over()
         self._callers = told.callers
+        before, self._missing = self._missing, told.missing
+        if told.missing and told.missing != before:
+            self._tell({"event": "trouble", "about": "part", "why": f"robot {self._peer.robot}: {told.missing}"})
         for name, service in told.services.items():
             self._take_service(name, service)
         for name in [name for name in self._followers if name not in told.services]:
@@ -168,10 +187,14 @@ class Joiner:
         if follower is None:
             if told.state == "closed":
                 return
-            follower = self._followers[name] = Follower(name, told, self._peer, self._mirror, self._mode)
+            follower = self._followers[name] = self._new_follower(name, told)
         follower.take(told)
         if follower.is_over:
             del self._followers[name]
+
+    def _new_follower(self, name: str, told: Service) -> Follower:
+        part = "" if self._wish is None else self._wish.number
+        return Follower(name, told, self._peer, self._mirror, mode=self._mode, part=part)
 
     # -- requests -------------------------------------------------------------------------------------------------
 

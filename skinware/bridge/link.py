@@ -91,6 +91,35 @@ class _Question:
             self._query.reply_err(error)
 
 
+class Sender:
+    """Sends bytes to all who listen, and waits for nobody: a receiver that is too slow loses some.
+
+    Args:
+        publisher: of zenoh.
+        close: ends it.
+
+    Attributes:
+        close: ends it.
+    """
+
+    def __init__(self, publisher: zenoh.Publisher, close: Callable[[], None]) -> None:
+        self._publisher, self.close = publisher, close
+
+    def __call__(self, payload: Payload) -> None:
+        """Send them."""
+        with contextlib.suppress(zenoh.ZError):  # closed
+            self._publisher.put(payload)
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether anybody listens."""
+        try:
+            status: Any = self._publisher.matching_status
+        except zenoh.ZError:  # closed
+            return False
+        return bool(status.matching)
+
+
 class Link:
     """A session of zenoh.
 
@@ -108,21 +137,15 @@ class Link:
             raise BridgeError(f"{endpoints}: {_reason(error)}") from None
         self._declared: list[Any] = []
 
-    def sender(self, key: str) -> Callable[[Payload], None]:
-        """What sends bytes to all who listen to a key, and waits for nobody: a receiver that is too slow loses some."""
+    def sender(self, key: str) -> Sender:
+        """What sends bytes to all who listen to a key."""
         publisher = self._session.declare_publisher(
             key,
             congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
             priority=Priority.FRAMES,
             express=True,
         )
-        self._declared.append(publisher)
-
-        def send(payload: Payload) -> None:
-            with contextlib.suppress(zenoh.ZError):  # closed
-                publisher.put(payload)
-
-        return send
+        return Sender(publisher, self._undeclaring(publisher))
 
     def tell(self, key: str, payload: Payload) -> None:
         """Send something small, before any frames."""

@@ -1,20 +1,27 @@
 """What goes over a bridge, byte by byte, and under which keys.
 
-Keys of robot R: ``skinware/1/R/``...
+Keys of robot R: ``skinware/1/R/INSTANCE/``..., INSTANCE being the number of the bridge that serves it: two that serve
+robots of one name are never taken for each other.
 
 ======================  ===============================================================================================
 ``clock``               question; answer: two i64, CLOCK_MONOTONIC ns when it came and when it was answered
-``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes
+``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes.
+                        Asked with :class:`Wish` as JSON: answered for those sensors, and asked again once a second
+                        for as long as they are wanted
+``summary``             :class:`Summary` as JSON, once a second
 ``S/generation``        question with ``number``; answer: u4 size of JSON, :class:`About` as JSON, the service's file in
                         shared memory up to its slots, packed (zlib)
 ``S/frame``             every frame: ``RAW`` below
+``S/frame/PART``        likewise, some sensors of it: those of the wish of that number
 ``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``: that
                         frame's sequence if the asker still has it, else 0; answered with the newest frame as soon as
                         there is one, with nothing after half a second: ``CODED`` below, ``RAW`` with ``form=0``
 ``S/call/OPERATION``    question with arguments as JSON; answer: :class:`Answered` as JSON
 ======================  ===============================================================================================
 
-``skinware/live/R/1/INSTANCE`` is a token of who serves the robot: version and a number of its own.
+Questions for ``generation`` and ``newest`` may have ``part``: the number of a wish.
+
+``skinware/live/R/1/INSTANCE`` is a token of who serves the robot.
 
 A frame begins with a byte that tells its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
 ``CODED``: a message of :mod:`skinware.transfer.codec`.
@@ -22,6 +29,7 @@ A frame begins with a byte that tells its form and seven that are 0. ``RAW``: u6
 
 from __future__ import annotations
 
+import hashlib
 import re
 import struct
 import zlib
@@ -32,6 +40,8 @@ import numpy.typing as npt
 
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.memory.ring import Frame
+from skinware.tactile.choosing import SensorChoice
+from skinware.tactile.regions import Region, Regions
 
 VERSION = 1
 RAW, CODED = 0, 1
@@ -65,12 +75,41 @@ class Services(msgspec.Struct, frozen=True):
             and other generations.
         callers: who may call, by the names in their certificates; empty: whoever is let in.
         services: by name.
+        missing: what of a wish is not there, a line for people; empty if nothing is missing.
     """
 
     instance: str
     start: str = ""
     callers: tuple[str, ...] = ()
     services: dict[str, Service] = {}
+    missing: str = ""
+
+
+class Wish(msgspec.Struct, frozen=True):
+    """Some sensors that are wanted: those of which all of it is true.
+
+    Attributes:
+        patches: names; empty: all.
+        in_regions: names of regions; empty: all.
+        regions: what they are, and those that they refer to.
+    """
+
+    patches: tuple[str, ...] = ()
+    in_regions: tuple[str, ...] = ()
+    regions: tuple[Region, ...] = ()
+
+    @property
+    def number(self) -> str:
+        """The same for the same wish."""
+        return hashlib.blake2b(msgspec.json.encode(self), digest_size=8).hexdigest()
+
+    def choice(self) -> SensorChoice:
+        """The wish as others know it.
+
+        Raises:
+            ConfigurationError: the regions contradict each other.
+        """
+        return SensorChoice((), self.patches, Regions(self.regions), self.in_regions)
 
 
 class About(msgspec.Struct, frozen=True):
@@ -108,27 +147,34 @@ class Keys:
 
     Args:
         robot: its name.
+        instance: number of the bridge that serves it; ``*``: of whichever does.
 
     Raises:
         ConfigurationError: it is no name.
     """
 
-    def __init__(self, robot: str) -> None:
+    def __init__(self, robot: str, instance: str = "*") -> None:
         if not _NAME.fullmatch(robot):
             raise ConfigurationError(
                 f"robot {robot!r}: give 1 to 47 letters, digits, '_' or '-', the first a letter or digit"
             )
-        self.robot = robot
-        self._root = f"skinware/{VERSION}/{robot}"
+        self.robot, self._instance = robot, instance
+        self._root = f"skinware/{VERSION}/{robot}/{instance}"
         self.clock, self.services = f"{self._root}/clock", f"{self._root}/services"
+        self.summary = f"{self._root}/summary"
 
-    def token(self, instance: str) -> str:
-        """Of a bridge that serves it."""
-        return f"skinware/live/{self.robot}/{VERSION}/{instance}"
+    @property
+    def token(self) -> str:
+        """Of the bridge that serves it."""
+        return f"skinware/live/{self.robot}/{VERSION}/{self._instance}"
 
     def of(self, service: str, what: str) -> str:
         """Of something of a service; either may be ``*``."""
         return f"{self._root}/{service}/{what}"
+
+    def frame(self, service: str, part: str = "") -> str:
+        """Of the frames of a service, or of a part of it."""
+        return self.of(service, f"frame/{part}" if part else "frame")
 
     def call(self, service: str, operation: str) -> str:
         """Of an operation; likewise."""
@@ -138,7 +184,7 @@ class Keys:
 def parts_of(key: str) -> tuple[str, str]:
     """(service, operation or what else) of a key of a service."""
     parts = key.split("/")
-    return parts[3], parts[-1]
+    return parts[4], parts[-1]
 
 
 def token_parts(key: str) -> tuple[str, int, str]:

@@ -26,6 +26,12 @@ class Watcher(Protocol):
     def appeared(self) -> None:
         """A bridge serves it."""
 
+    def moved(self) -> None:
+        """Another bridge serves it than before: its keys are others."""
+
+    def restarted(self) -> None:
+        """Its clock and its generations are others than before."""
+
     def lost(self) -> None:
         """It was heard, and is not any more."""
 
@@ -45,10 +51,9 @@ class Peer:
         tell: is told what happens, as JSON has it.
 
     Attributes:
-        keys: of the robot.
+        keys: of the robot, by the bridge that is followed; before one is, of any.
         who: this end, in questions.
         clock: of the robot.
-        instance: of the bridge that is followed, empty before one is.
         is_connected: whether it is heard.
     """
 
@@ -65,7 +70,7 @@ class Peer:
         self.keys = Keys(robot)
         self.who: str = os.urandom(8).hex()
         self.clock = PeerClock()
-        self.instance, self._start = "", ""
+        self._instance, self._start = "", ""
         self.is_connected = False
         self.tell = tell
         self._link, self._turns, self._watcher = link, turns, watcher
@@ -110,21 +115,25 @@ class Peer:
         """See :meth:`skinware.bridge.link.Link.listen`: it is heard in the thread that receives."""
         return self._link.listen(key, heard)
 
-    def follows(self, instance: str) -> bool:
-        """Whether what the bridge of a number says counts: not if the one that is followed is still there."""
-        if self.instance and instance != self.instance and self.instance in self._there:
+    def follows(self, instance: str, start: str) -> bool:
+        """Whether what a bridge says of itself counts: not if another one is followed and still there.
+
+        Args:
+            instance: its number.
+            start: from which its clock counts.
+        """
+        if self._instance and instance != self._instance and self._instance in self._there:
             self.say_once("robot", f"robot {self.robot} is served by two bridges: give each robot a name of its own")
             return False
-        self.instance = instance
-        return True
-
-    def counts_from(self, start: str) -> bool:
-        """Its clock counts from a start; whether from another than before."""
-        if start == self._start:
-            return False
-        self._start = start
-        self.clock = PeerClock()
-        self._ask_clock()
+        self.heard()
+        if instance != self._instance:
+            self._instance, self.keys = instance, Keys(self.robot, instance)
+            self._watcher.moved()
+        if start != self._start:
+            self._start = start
+            self.clock = PeerClock()
+            self._ask_clock()
+            self._watcher.restarted()
         return True
 
     def heard(self) -> None:
@@ -168,8 +177,7 @@ class Peer:
             )
         elif there:
             self._watcher.appeared()
-            self._ask_clock()
-        elif instance == self.instance:
+        elif instance == self._instance:
             self._lose("its bridge ended")
 
     def _lose(self, why: str) -> None:
@@ -195,12 +203,15 @@ class Peer:
     def _ask_clock(self) -> None:
         asked_ns = self._pinged_ns = now_ns()
         self._next_clock_ns = asked_ns + self.clock.pause_ns()
-        self.ask(
-            self.keys.clock,
-            lambda payload, returned_ns: self._take_clock(asked_ns, payload, returned_ns),
-            timeout_s=ANSWER_S,
-            priority=Priority.CLOCK,
-        )
+        instance = self._instance
+        if not instance:
+            return
+
+        def returned(payload: bytes | None, returned_ns: int) -> None:
+            if instance == self._instance:
+                self._take_clock(asked_ns, payload, returned_ns)
+
+        self.ask(self.keys.clock, returned, timeout_s=ANSWER_S, priority=Priority.CLOCK)
 
     def _take_clock(self, asked_ns: int, payload: bytes | None, returned_ns: int) -> None:
         if payload is None or len(payload) != CLOCK.size:

@@ -26,7 +26,7 @@ class Turns:
 
     def ring(self) -> None:
         """Wake who waits; from any thread, and from a signal handler."""
-        with contextlib.suppress(OSError):  # closed
+        with contextlib.suppress(OSError, ValueError):  # closed
             os.eventfd_write(self.fd, 1)
 
     def take(self) -> None:

@@ -10,6 +10,7 @@ import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
+    DEFAULT_REGIONS,
     examples,
     json_option,
     namespace_option,
@@ -19,10 +20,11 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
+from skinware.errors import ConfigurationError
 from skinware.realtime import now_ns
 
 if TYPE_CHECKING:
-    from skinware.bridge import Joiner, Server
+    from skinware.bridge import Joiner, Server, Wish
 
 _PORT = 7448
 _tls_option = click.option(
@@ -142,6 +144,7 @@ class _Serving:
     epilog=examples(
         "skin-bridge join icub --connect tcp/192.168.1.10:7448     then: skin-top --namespace icub",
         "skin-bridge join icub --connect tls/icub.local:7448 --tls certs --into default",
+        "skin-bridge join icub --connect tcp/192.168.1.10:7448 --region palm --into palm   only those sensors travel",
     ),
 )
 @click.argument("robot", metavar="R")
@@ -155,11 +158,34 @@ class _Serving:
     show_default=True,
     help="Every frame as it comes, or only the newest as fast as the link takes them.",
 )
+@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated.")
+@click.option(
+    "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
+)
+@click.option(
+    "--regions",
+    "region_files",
+    metavar="FILE",
+    multiple=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
+)
 @json_option
-def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | None, mode: str, as_json: bool) -> None:
+def join(
+    robot: str,
+    connect: tuple[str, ...],
+    into: str | None,
+    tls: Path | None,
+    mode: str,
+    patches: tuple[str, ...],
+    in_regions: tuple[str, ...],
+    region_files: tuple[Path, ...],
+    as_json: bool,
+) -> None:
     """Have the services of robot R here: same names, structures, states and operations, for all programs and readers.
 
-    Times are moved to the clock of this machine. What the link cannot take is left out, and counted as lost.
+    Times are moved to the clock of this machine. What the link cannot take is left out, and counted as lost. With
+    --patch or --region only those sensors of its drivers travel, and no other services.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -167,6 +193,7 @@ def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | Non
     from skinware.bridge.diagnosis import why_unreachable
     from skinware.memory.namespace import Namespace
 
+    wish = _wish(patches, in_regions, region_files)
     place = Namespace(into or robot)
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:
@@ -176,6 +203,7 @@ def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | Non
             link,
             place,
             mode=None if mode == "auto" else mode,
+            wish=wish,
             why_not=lambda: " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect))),
             tell=status.happened,
         )
@@ -185,6 +213,20 @@ def join(robot: str, connect: tuple[str, ...], into: str | None, tls: Path | Non
             else:
                 click.echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
             joiner.run(lambda: status.tell(joiner))
+
+
+def _wish(patches: tuple[str, ...], in_regions: tuple[str, ...], region_files: tuple[Path, ...]) -> Wish | None:
+    """Which sensors are wanted; None: all, and all services."""
+    from skinware.bridge import Wish
+    from skinware.tactile.choosing import unknown
+    from skinware.tactile.region_files import read_regions
+
+    if region_files and not in_regions:
+        raise click.UsageError("--regions says where regions are: say which with --region")
+    regions = read_regions(*(region_files or (Path(DEFAULT_REGIONS),))) if in_regions else ()
+    for why in unknown("region", in_regions, [region.name for region in regions]):
+        raise ConfigurationError(why)
+    return Wish(patches, in_regions, tuple(regions)) if patches or in_regions else None
 
 
 class _Joined:

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from skinware._columns import as_index
 from skinware.conversion.tables import COLUMNS, Block, DerivedSource, Source, Table
 from skinware.errors import ConfigurationError
-from skinware.skin_layout import SkinLayout
-from skinware.structure import Structure
+from skinware.tactile.choosing import SensorChoice, unknown
 from skinware.tactile.regions import Regions
 from skinware.transfer.generation import PER_SENSOR
 
@@ -38,9 +37,9 @@ class Selection:
     in_regions: Collection[str] = ()
 
     @property
-    def is_of_sensors(self) -> bool:
-        """Whether it takes some sensors only."""
-        return bool(self.types or self.patches or self.in_regions)
+    def sensors(self) -> SensorChoice:
+        """Which sensors are wanted."""
+        return SensorChoice(self.types, self.patches, self.regions, self.in_regions)
 
     def of(self, source: Source) -> SelectedSource:
         """What of a source is wanted.
@@ -48,50 +47,25 @@ class Selection:
         Raises:
             ConfigurationError: the source has no service, type or patch of a name, or nothing that is wanted.
         """
-        self._check(source)
+        sensors = self.sensors
+        structures = [table.structure for table in source.tables if table.structure is not None]
+        services = unknown("service", self.services, [table.service for table in source.tables])
+        for why in (*services, *sensors.unknown(structures)):
+            raise ConfigurationError(f"{source.path}: {why}")
         tables = [table for table in source.tables if not self.services or table.service in self.services]
-        if self.is_of_sensors:
-            tables = [narrowed for table in tables for narrowed in self._narrowed(table)]
+        if sensors:
+            tables = [narrowed for table in tables for narrowed in _narrowed(table, sensors)]
             if not tables:
                 raise ConfigurationError(f"{source.path}: no sensor in it is of what was asked for")
         return SelectedSource(source, tables)
 
-    def _check(self, source: Source) -> None:
-        structures = [table.structure for table in source.tables if table.structure is not None]
-        for what, wanted, there_are in (
-            ("service", self.services, [table.service for table in source.tables]),
-            ("sensor type", self.types, [each.name for structure in structures for each in structure.types]),
-            ("patch", self.patches, [name for structure in structures for name in structure.patch_names]),
-            ("region", self.in_regions, [region.name for region in self.regions]),
-        ):
-            for name in wanted:
-                if name not in there_are:
-                    listed = ", ".join(dict.fromkeys(there_are)) or "none"
-                    raise ConfigurationError(f"{source.path}: no {what} {name!r}; there are: {listed}")
 
-    def _narrowed(self, table: Table) -> Iterator[Table]:
-        structure = table.structure
-        if structure is None:
-            return
-        wanted = np.zeros(structure.n_sensors, bool)
-        for sensor_type in structure.types:
-            if not self.types or sensor_type.name in self.types:
-                wanted[structure.index(sensor_type.name)] = self._in_regions(table.service, structure, sensor_type.name)
-        if self.patches:
-            numbers = [row for row, name in enumerate(structure.patch_names) if name in self.patches]
-            wanted &= np.isin(structure.sensor_patch, numbers)
+def _narrowed(table: Table, sensors: SensorChoice) -> Iterator[Table]:
+    """A driver's table with some of its sensors, if it has any of them."""
+    if table.structure is not None:
+        wanted = sensors.of(table.service, table.structure)
         if wanted.any():
             yield NarrowedTable(table, np.flatnonzero(wanted))
-
-    def _in_regions(self, driver: str, structure: Structure, type_name: str) -> npt.NDArray[np.bool_]:
-        """(n,) bool: which sensors of a type are in the regions."""
-        inside = np.full(len(structure.module_of(type_name)), not self.in_regions)
-        if self.in_regions and len(inside):
-            found = self.regions.of(SkinLayout((driver,), (structure,)), type_name)
-            for name in self.in_regions:
-                if name in found:  # others are of sensors of other types
-                    inside[found[name]] = True
-        return inside
 
 
 class NarrowedTable(Table):

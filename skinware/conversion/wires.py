@@ -55,7 +55,7 @@ def convert_wires(
         OSError: it cannot be read, or the new one cannot be written.
     """
     form, selection = WIRE_FORMATS[format_name], selection or Selection()
-    if selection.is_of_sensors:
+    if selection.sensors:
         raise ConfigurationError(f"{format_name} has what went over the wires: frames, not sensors, can be selected")
     target = new_target(path, target, form.suffix)
     with contextlib.closing(Recording(path)) as recording, begun_beside(target) as begun:

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from skinware.bridge.link import Link, Payload, Reply
+from skinware.bridge.link import Link, Payload, Reply, Sender
 
 
 class _Asked:
@@ -55,6 +55,12 @@ class Net:
             self._jobs.put(job)
         self.offered += kind == "frame"
 
+    def idle(self) -> None:
+        """Wait until what was sent so far has arrived."""
+        arrived = threading.Event()
+        self._jobs.put(arrived.set)
+        arrived.wait()
+
     def close(self) -> None:
         """End it."""
         self._jobs.put(None)
@@ -65,6 +71,25 @@ class Net:
             job()
 
 
+class _Sender(Sender):
+    def __init__(self, net: Net, key: str) -> None:
+        self._net, self._key = net, key
+
+    def __call__(self, payload: Payload) -> None:
+        for heard in self._listeners():
+            self._net.carry("frame", self._key, lambda heard=heard: heard(self._key, payload))  # type: ignore[misc]
+
+    def close(self) -> None:
+        pass
+
+    @property
+    def is_heard(self) -> bool:
+        return bool(self._listeners())
+
+    def _listeners(self) -> list[Callable[[str, Payload], None]]:
+        return [heard for pattern, heard in list(self._net.listeners) if fnmatch.fnmatchcase(self._key, pattern)]
+
+
 class NetLink(Link):
     """An end of a :class:`Net`."""
 
@@ -72,13 +97,8 @@ class NetLink(Link):
         self._net = net
         self._own: list[str] = []
 
-    def sender(self, key: str) -> Callable[[Payload], None]:
-        def send(payload: Payload) -> None:
-            for pattern, heard in list(self._net.listeners):
-                if fnmatch.fnmatchcase(key, pattern):
-                    self._net.carry("frame", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]
-
-        return send
+    def sender(self, key: str) -> Sender:
+        return _Sender(self._net, key)
 
     def tell(self, key: str, payload: Payload) -> None:
         for pattern, heard in list(self._net.listeners):
@@ -107,7 +127,7 @@ class NetLink(Link):
     ) -> None:
         texts = {name: str(value) for name, value in (parameters or {}).items()}
         for pattern, asked in list(self._net.answerers):
-            if fnmatch.fnmatchcase(key, pattern):
+            if fnmatch.fnmatchcase(key, pattern) or fnmatch.fnmatchcase(pattern, key):
                 question = _Asked(self._net, key, texts, payload, answered)
                 self._net.carry("question", key, lambda asked=asked, question=question: asked(question))  # type: ignore[misc]
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from skinware import DriverWriter, Structure
 from skinware.bridge.joining import Joiner
+from skinware.bridge.messages import Wish
 from skinware.bridge.serving import Server
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
@@ -87,12 +88,36 @@ def serving(net: Net, namespace: Namespace, robot: str = ROBOT) -> Iterator[Serv
 
 
 @contextmanager
+def network() -> Iterator[Net]:
+    net = Net()
+    try:
+        yield net
+    finally:
+        net.close()
+
+
+@contextmanager
 def joined(namespace: Namespace, mode: str | None = None, robot: str = ROBOT) -> Iterator[Ends]:
     """A joiner of what is served over a new network, into a namespace of its own."""
-    net, here = Net(), Namespace(f"{namespace.name}-here")
+    with network() as net, joining(net, namespace, mode, robot) as ends:
+        yield ends
+
+
+@contextmanager
+def joining(
+    net: Net,
+    namespace: Namespace,
+    mode: str | None = None,
+    robot: str = ROBOT,
+    *,
+    wish: Wish | None = None,
+    into: str = "here",
+) -> Iterator[Ends]:
+    """A joiner of what is served over a network, into a namespace of its own."""
+    here = Namespace(f"{namespace.name}-{into}")
     events: list[dict[str, Any]] = []
     link = NetLink(net)
-    joiner = Joiner(robot, link, here, mode=mode, tell=events.append)
+    joiner = Joiner(robot, link, here, mode=mode, wish=wish, tell=events.append)
     thread = threading.Thread(target=joiner.run, name="join")
     thread.start()
     try:
@@ -101,7 +126,7 @@ def joined(namespace: Namespace, mode: str | None = None, robot: str = ROBOT) ->
         joiner.stop()
         thread.join()
         link.close()
-        net.close()
+        net.idle()
         joiner.close()
         left = files_left(here.path)
         shutil.rmtree(here.path, ignore_errors=True)

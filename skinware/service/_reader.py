@@ -317,10 +317,10 @@ class ServiceReader(Attachment[FrameT]):
             except Overrun:
                 self._accounts.record.overruns += 1
                 raise
-            if frame is not None:
+            if frame is not None and (known is None or frame.position > known):
                 self._count(frame)
                 return frame
-            look_around = True
+            look_around = frame is None
 
     def _structure_changed(self) -> StructureChanged:
         return StructureChanged(

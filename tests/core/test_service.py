@@ -189,6 +189,19 @@ def test_a_signal_ends_a_wait() -> None:
         signal.signal(signal.SIGALRM, before)
 
 
+def test_a_frame_that_is_still_to_come_is_waited_for() -> None:
+    """Also past those that are published while the reader sleeps."""
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        got: list[int] = []
+        wanted = writer.generation, 30
+        thread = threading.Thread(target=lambda: got.append(reader.read(newer_than=wanted, timeout_s=60).sequence))
+        thread.start()
+        wait_until(lambda: publish(writer, 2) is None and bool(got))
+        thread.join()
+        assert got[0] > 30
+
+
 def test_a_timeout_is_not_early() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
         with pytest.raises(ServiceTimeout, match="published nothing so far"):

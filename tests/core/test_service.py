@@ -197,7 +197,12 @@ def test_a_frame_that_is_still_to_come_is_waited_for() -> None:
         wanted = writer.generation, 30
         thread = threading.Thread(target=lambda: got.append(reader.read(newer_than=wanted, timeout_s=60).sequence))
         thread.start()
-        wait_until(lambda: publish(writer, 2) is None and bool(got))
+
+        def published_until_got() -> bool:
+            publish(writer, 2)
+            return bool(got)
+
+        wait_until(published_until_got)
         thread.join()
         assert got[0] > 30
 

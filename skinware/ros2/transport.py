@@ -5,10 +5,17 @@ A carrier (DDS, zenoh) is a module with one class that is a :class:`Node`, made 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
+
+from skinware.errors import ConfigurationError
+
+HIGHEST_DOMAIN = 232
+"""With one above, DDS would need ports that there are not."""
+_NAME = "[A-Za-z_][A-Za-z0-9_]*"
 
 Cdr = bytes
 """A message with the four bytes that tell its encapsulation before it: CDR of version 1, little-endian."""
@@ -32,12 +39,28 @@ class Identity:
         namespace: of the node, absolute: ``/`` or ``/robot_1``.
         domain: id of the graph, as ``ROS_DOMAIN_ID`` has it.
         distro: of those who are to understand it.
+
+    Raises:
+        ConfigurationError: there is no such node; the message says why.
     """
 
     name: str
     namespace: str = "/"
     domain: int = 0
     distro: Distro = Distro.JAZZY
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(_NAME, self.name):
+            raise ConfigurationError(f"node {self.name!r}: give letters, digits and underscores, no digit first")
+        if not re.fullmatch(rf"/|(/{_NAME})+", self.namespace):
+            raise ConfigurationError(f"namespace {self.namespace!r} of ROS: give / or names after slashes, as /robot_1")
+        if not 0 <= self.domain <= HIGHEST_DOMAIN:
+            raise ConfigurationError(f"domain {self.domain} of ROS: give 0 to {HIGHEST_DOMAIN}")
+
+    @property
+    def prefix(self) -> str:
+        """Of absolute names of topics and services in the namespace."""
+        return self.namespace.rstrip("/")
 
 
 @dataclass(frozen=True)
@@ -149,6 +172,7 @@ def _dds_name(name: str) -> str:
 
 
 __all__ = [
+    "HIGHEST_DOMAIN",
     "Cdr",
     "Distro",
     "Handler",

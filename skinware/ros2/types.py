@@ -41,31 +41,31 @@ TEXTS = {
 """Definitions, by type; those of messages are called without ``msg``."""
 
 POINTS = MessageType(
-    "sensor_msgs/msg/PointCloud2", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+    "sensor_msgs/msg/PointCloud2", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
 )
-IMAGE = MessageType("sensor_msgs/msg/Image", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000")
+IMAGE = MessageType("sensor_msgs/msg/Image", "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47")
 SKIN_FRAME = MessageType(
-    "skinware_msgs/msg/SkinFrame", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+    "skinware_msgs/msg/SkinFrame", "RIHS01_4c6c7978ff329a043a35d3762fc01b81ab8bfbf3d39510eaae7762e0c88d6654"
 )
 SENSORS = MessageType(
-    "skinware_msgs/msg/Sensors", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+    "skinware_msgs/msg/Sensors", "RIHS01_223f66244e68a28a02cb2d2591b01679d9264cfe19da5262d3f45178f7c40799"
 )
 DIAGNOSTICS = MessageType(
-    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
 )
 TRIGGER = ServiceType(
     "std_srvs/srv/Trigger",
-    "RIHS01_0000000000000000000000000000000000000000000000000000000000000000",
+    "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
     MessageType(
-        "std_srvs/srv/Trigger_Request", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+        "std_srvs/srv/Trigger_Request", "RIHS01_d010825374ce8918e72bfd826c82603e60f45419e932ea976f807b74a863a199"
     ),
     MessageType(
-        "std_srvs/srv/Trigger_Response", "RIHS01_0000000000000000000000000000000000000000000000000000000000000000"
+        "std_srvs/srv/Trigger_Response", "RIHS01_2d946c21e2fc3f1e9ca6986a8191d85fcc70097a8bb7771a053564bc47009cdf"
     ),
 )
 PARTICIPANT = MessageType(
     "rmw_dds_common/msg/ParticipantEntitiesInfo",
-    "RIHS01_0000000000000000000000000000000000000000000000000000000000000000",
+    "RIHS01_e725f4a506958c79f95dd693b965722c57b19cd18e7eff984f49561b93dc985d",
 )
 OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
 """Types of what is shown, by the names of their definitions."""

@@ -83,7 +83,7 @@ def command(
         check_name(name, "driver")
     place = Namespace(namespace)
     identity = Identity(f"skinware_{_plain(place.name)}", ros_namespace, domain, Distro(distro))
-    with contextlib.closing(_node(rmw, identity)) as node:
+    with contextlib.closing(_NODES[rmw](identity)) as node:
         server = Ros2Server(
             node, place, names, prefix=identity.prefix, rate_hz=rate, is_read_only=read_only, trouble=warn
         )
@@ -98,10 +98,14 @@ def command(
             server.run(status.tell)
 
 
-def _node(rmw: str, identity: Identity) -> Node:
+def _dds_node(identity: Identity) -> Node:
     from skinware.ros2.dds import DdsNode
 
     return DdsNode(identity)
+
+
+_NODES = {"dds": _dds_node}
+"""What makes a node, by what carries its messages."""
 
 
 def _plain(name: str) -> str:

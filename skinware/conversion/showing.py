@@ -64,14 +64,14 @@ class Showing:
 
     def __init__(self, name: str, structure: Structure, *, json_state: bool = True) -> None:
         self._name, self._structure, self._json_state = name, structure, json_state
-        self._clouds = list(_clouds(name, structure))
-        self.has_points: bool = bool(self._clouds)
-        self._images = list(_images(name, structure, only_grids=self.has_points))
+        clouds = list(_clouds(name, structure))
+        self.has_points: bool = bool(clouds)
+        self._shown: list[_Cloud | _Image] = [*clouds, *_images(name, structure, only_grids=self.has_points)]
 
     @property
     def topics(self) -> dict[str, Schema]:
         """Of its point clouds and images, with what their messages are."""
-        return {each.topic: each.schema for each in (*self._clouds, *self._images)}
+        return {each.topic: each.schema for each in self._shown}
 
     def messages(self, frame: DriverFrame, time_ns: int) -> Iterator[Message]:
         """What is shown of a frame.
@@ -89,7 +89,7 @@ class Showing:
         time_ns: int,
         *,
         status: npt.NDArray[np.uint8] | None = None,
-        wanted: Callable[[str], bool] = lambda topic: True,
+        wanted: Callable[[str], bool] = lambda _: True,
     ) -> Iterator[Message]:
         """The point clouds and images of a frame.
 
@@ -100,7 +100,7 @@ class Showing:
             wanted: tells of a topic whether its message is made.
         """
         status = frame.status if status is None else status
-        shown = [each for each in (*self._clouds, *self._images) if wanted(each.topic)]
+        shown = [each for each in self._shown if wanted(each.topic)]
         names = {each.type_name for each in shown}
         values = {name: self._structure.physical(frame.values, name) for name in names}
         stamp_ns = acquired_ns(frame, time_ns)

@@ -6,7 +6,6 @@ as long for a point cloud. Nothing is called back in threads of DDS: they would 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import threading
@@ -70,7 +69,7 @@ _NO_LIMIT = (
     "<WhcAdaptive>false</WhcAdaptive><WhcHigh>1 GB</WhcHigh>"
     "</Watermarks></Internal></Domain></CycloneDDS>"
 )
-"""What nobody has acknowledged does not keep others from the next message: the history, which is short, is the limit."""
+"""What one reader has not acknowledged keeps no other from the next message: the limit is the short history."""
 _THIS_MACHINE = (
     "<CycloneDDS><Domain id='any'><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
     "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
@@ -94,13 +93,11 @@ class DdsNode:
         self._identity = identity
         try:
             self._domain = Domain(identity.domain, _configuration())
-            self._participant = DomainParticipant(
-                identity.domain, DdsQos(Policy.Userdata(discovery.PARTICIPANT_DATA))
-            )
+            self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(discovery.PARTICIPANT_DATA)))
         except DDSException as error:
             raise BridgeError(
-                f"domain {identity.domain} of DDS cannot be joined ({_reason(error)}); is a network interface up, and is"
-                " CYCLONEDDS_URI in order?"
+                f"domain {identity.domain} of DDS cannot be joined ({_reason(error)}); is a network interface up,"
+                " and is CYCLONEDDS_URI in order?"
             ) from None
         self._lock = threading.RLock()
         self._writers: list[_Writer] = []
@@ -201,9 +198,7 @@ class DdsNode:
             if self._participant is not None:
                 readers = [service.id for service in self._services]
                 writers = [writer.id for writer in self._writers]
-                self._info.publish(
-                    discovery.entities(self._identity, self._participant.guid.bytes, readers, writers)
-                )
+                self._info.publish(discovery.entities(self._identity, self._participant.guid.bytes, readers, writers))
 
 
 class _Writer:
@@ -256,14 +251,16 @@ class _Service:
         """All that was asked so far."""
         if self._reader is None:
             return
-        for request in self._reader.take(_REQUESTS_AT_ONCE):
+        try:
+            requests = self._reader.take(_REQUESTS_AT_ONCE)
+        except DDSException:
+            return
+        for request in requests:
             if isinstance(request, IdlStruct):  # otherwise who asked is gone
                 asked = request.serialize()
                 after_id = _ENCAPSULATION + _REQUEST_ID_SIZE
                 answer = self._handler(asked[:_ENCAPSULATION] + asked[after_id:])
-                self._writer.publish(
-                    answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:]
-                )
+                self._writer.publish(answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:])
 
     def close(self) -> None:
         self._worker.detach(self._condition)
@@ -322,7 +319,8 @@ def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
             kind = idl.sequence[kind]
         fields[field["name"]] = kind
     plain = message_type.name.rpartition("/")[2]
-    return make_idl_struct(plain, message_type.dds_name.replace("::", "."), fields)
+    made: type[IdlStruct] = make_idl_struct(plain, message_type.dds_name.replace("::", "."), fields)
+    return made
 
 
 def _part(name: str) -> MessageType:

@@ -98,7 +98,10 @@ def main() -> None:
     options = parser.parse_args()
     participant = DomainParticipant(options.domain)
     threads = [
-        *(threading.Thread(target=listen, args=(participant, *each), kwargs={"late": False}) for each in options.listen),
+        *(
+            threading.Thread(target=listen, args=(participant, *each), kwargs={"late": False})
+            for each in options.listen
+        ),
         *(
             threading.Thread(target=listen, args=(participant, *each), kwargs={"late": True})
             for each in options.listen_late

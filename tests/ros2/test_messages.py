@@ -112,7 +112,7 @@ def test_frames_and_sensors() -> None:
 
 
 def test_points_and_images() -> None:
-    """What a reader of its own makes of the fields is looked at where recordings are converted; here it is the bytes."""
+    """What another reader makes of the fields is looked at where recordings are converted; here it is the bytes."""
     with FakeSkin("torso", fake_structure(1, 2)) as skin, DriverReader("torso") as reader:
         skin.publish()
         frame = reader.read()
@@ -137,7 +137,7 @@ def test_ages_of_points_are_those_of_their_modules() -> None:
         skin.writer.commit(now_ns)
         frame = reader.read()
     (points, *_) = Showing("torso", structure).pictures(frame, SECOND_NS)
-    message = STORE.deserialize_cdr(points.data, "sensor_msgs/msg/PointCloud2")
+    message: Any = STORE.deserialize_cdr(points.data, "sensor_msgs/msg/PointCloud2")
     age = next(field for field in message.fields if field.name == "age")
     data = np.asarray(message.data).reshape(-1, message.point_step)
     ages = data[:, age.offset : age.offset + 4].copy().view("<f4")[:, 0]

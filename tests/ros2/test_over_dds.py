@@ -6,7 +6,6 @@ import base64
 import os
 import signal
 import sys
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +21,7 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import Running, refused, running
 from tests.recording.test_viewers import placed
+from tests.ros2.alone import own_domain
 from tests.ros2.store import typestore
 from tests.ros2.test_serving import tareable
 
@@ -33,18 +33,7 @@ POINTS = ("rt/skin/arm/points/pressure", "sensor_msgs/msg/PointCloud2")
 
 @pytest.fixture
 def domain(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Of this test: no other can be in it, nor anybody beyond this machine."""
-    number = zlib.crc32(namespace.name.encode()) % 200 + 1
-    monkeypatch.setenv(
-        "CYCLONEDDS_URI",
-        "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
-        "<AllowMulticast>false</AllowMulticast></General><Discovery>"
-        f"<Tag>{namespace.name}-{os.getpid()}</Tag><ParticipantIndex>auto</ParticipantIndex>"
-        "<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
-        "<SPDPInterval>0.2 s</SPDPInterval></Discovery></Domain></CycloneDDS>",
-    )
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    return number
+    return own_domain(namespace, monkeypatch)
 
 
 def bridge(*options: str) -> Any:
@@ -93,8 +82,9 @@ def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namesp
             if same.sequence == sequence:
                 assert np.array_equal(same.value[skin.structure.index("pressure")], of_ring.physical("pressure"))
                 assert np.array_equal(same.status, of_ring.status)
-            points = message(theirs, *POINTS)
-            assert points.width == int(skin.structure.geometry.known[skin.structure.index("pressure")].sum())  # type: ignore[union-attr]
+            points, geometry = message(theirs, *POINTS), skin.structure.geometry
+            assert geometry is not None
+            assert points.width == int(geometry.known[skin.structure.index("pressure")].sum())
         ours.wait_for("status", lambda event: event["drivers"]["arm"]["messages"] > 10)
 
 
@@ -110,8 +100,10 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
             told = message(
                 theirs,
                 *info,
-                lambda each: found["key"]
-                in [bytes(gid.data).hex() for of in each.node_entities_info_seq for gid in of.writer_gid_seq],
+                lambda each: (
+                    found["key"]
+                    in [bytes(gid.data).hex() for of in each.node_entities_info_seq for gid in of.writer_gid_seq]
+                ),
             )
             (of_node,) = told.node_entities_info_seq
             assert of_node.node_namespace + of_node.node_name == node

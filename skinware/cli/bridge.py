@@ -1,4 +1,4 @@
-"""``skin-bridge``: a namespace of one machine on another."""
+"""``skin-bridge``: a namespace of one machine on another, and in a ROS 2 graph."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from skinware.cli import bridge_ros2
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     DEFAULT_REGIONS,
@@ -38,10 +39,13 @@ _tls_option = click.option(
 @click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
 @version_option
 def command() -> None:
-    """Have the drivers and services of one machine on another, as if they ran there.
+    """Have the drivers and services of one machine on another, as if they ran there; or in a ROS 2 graph.
 
-    On the robot: skin-bridge serve. Elsewhere: skin-bridge join.
+    On the robot: skin-bridge serve. Elsewhere: skin-bridge join. For ROS 2: skin-bridge ros2.
     """
+
+
+command.add_command(bridge_ros2.command)
 
 
 @command.command(

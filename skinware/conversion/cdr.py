@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +38,7 @@ class Cdr:
         self._append(data)
         return self
 
-    def texts(self, texts: list[str]) -> Cdr:
+    def texts(self, texts: Sequence[str]) -> Cdr:
         """A sequence of strings."""
         self.numbers("I", len(texts))
         for text in texts:

@@ -70,7 +70,7 @@ float64[] x
 float64[] y
 float64[] z
 """
-_TEXTS = {
+TEXTS = {
     "builtin_interfaces/Time": _TIME,
     "std_msgs/Header": _HEADER,
     "std_msgs/String": "string data\n",
@@ -80,6 +80,7 @@ _TEXTS = {
     "skinware_msgs/SkinFrame": _SKIN_FRAME,
     "skinware_msgs/Sensors": _SENSORS,
 }
+"""Definitions of messages, by type, as ``.msg`` files have them."""
 _HEADER_PARTS = ("std_msgs/Header", "builtin_interfaces/Time")
 _STATE = {
     "type": "object",
@@ -94,7 +95,7 @@ _STATE = {
 
 
 def _ros(number: int, name: str, *parts: str) -> Schema:
-    text = "".join([_TEXTS[name], *(f"{'=' * 80}\nMSG: {part}\n{_TEXTS[part]}" for part in parts)])
+    text = "".join([TEXTS[name], *(f"{'=' * 80}\nMSG: {part}\n{TEXTS[part]}" for part in parts)])
     return Schema(number, text.encode(), "ros2msg", name.replace("/", "/msg/"))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,9 @@ from mcap.records import Schema
 from skinware._names import distinct
 from skinware.conversion import definitions
 from skinware.conversion.cdr import Cdr
+from skinware.conversion.skin_messages import acquired_ns
 from skinware.driver_frame import DriverFrame
+from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import BusState, PatchState
 from skinware.structure import Index, Structure
@@ -23,7 +25,10 @@ from skinware.views.shapes import shape_of
 
 _FLOAT32, _UINT8 = 7, 2
 """Types of fields of a PointCloud2."""
-_FIELDS = (("x", _FLOAT32), ("y", _FLOAT32), ("z", _FLOAT32), ("intensity", _FLOAT32), ("status", _UINT8))
+_FIELDS = (
+    *((name, _FLOAT32) for name in ("x", "y", "z", "intensity", "age")),
+    ("status", _UINT8),
+)
 _POINT = np.dtype([(name, "<f4" if kind == _FLOAT32 else "u1") for name, kind in _FIELDS])
 _GRID = re.compile(r"[1-9]\d*x[1-9]\d*")
 _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
@@ -59,9 +64,14 @@ class Showing:
 
     def __init__(self, name: str, structure: Structure, *, json_state: bool = True) -> None:
         self._name, self._structure, self._json_state = name, structure, json_state
-        self._clouds = list(_clouds(name, structure))
-        self.has_points: bool = bool(self._clouds)
-        self._images = list(_images(name, structure, only_grids=self.has_points))
+        clouds = list(_clouds(name, structure))
+        self.has_points: bool = bool(clouds)
+        self._shown: list[_Cloud | _Image] = [*clouds, *_images(name, structure, only_grids=self.has_points)]
+
+    @property
+    def topics(self) -> dict[str, Schema]:
+        """Of its point clouds and images, with what their messages are."""
+        return {each.topic: each.schema for each in self._shown}
 
     def messages(self, frame: DriverFrame, time_ns: int) -> Iterator[Message]:
         """What is shown of a frame.
@@ -70,13 +80,32 @@ class Showing:
             frame: it.
             time_ns: when it was published, wall clock.
         """
-        acquired_ns = time_ns - frame.published_ns + frame.acquired_ns if frame.acquired_ns else time_ns
-        values = {each.name: self._structure.physical(frame.values, each.name) for each in self._structure.types}
-        for cloud in self._clouds:
-            yield cloud.message(values[cloud.type_name], frame.status, acquired_ns)
-        for image in self._images:
-            yield image.message(values[image.sensor_type.name], frame.status, acquired_ns)
+        yield from self.pictures(frame, time_ns)
         yield self._state(frame)
+
+    def pictures(
+        self,
+        frame: DriverFrame,
+        time_ns: int,
+        *,
+        status: npt.NDArray[np.uint8] | None = None,
+        wanted: Callable[[str], bool] = lambda _: True,
+    ) -> Iterator[Message]:
+        """The point clouds and images of a frame.
+
+        Args:
+            frame: it.
+            time_ns: when it was published, wall clock.
+            status: (n_sensors,) of the sensors; default: as of the frame.
+            wanted: tells of a topic whether its message is made.
+        """
+        status = frame.status if status is None else status
+        shown = [each for each in self._shown if wanted(each.topic)]
+        names = {each.type_name for each in shown}
+        values = {name: self._structure.physical(frame.values, name) for name in names}
+        stamp_ns = acquired_ns(frame, time_ns)
+        for each in shown:
+            yield each.message(frame, values[each.type_name], status, stamp_ns)
 
     def _state(self, frame: DriverFrame) -> Message:
         structure = self._structure
@@ -120,21 +149,34 @@ def _name(kind: Any, number: int) -> str:
 class _Cloud:
     """Sensors of one type whose places are known in one coordinate frame."""
 
+    schema = definitions.POINTS
+
     def __init__(
         self, topic: str, type_name: str, frame: str, index: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]
     ) -> None:
-        self.type_name = type_name
-        self._topic, self._frame, self._index, self._rows = topic, frame, index, rows
+        self.topic, self.type_name = topic, type_name
+        self._frame, self._index, self._rows = frame, index, rows
         self.points = np.zeros(len(rows), _POINT)
 
-    def message(self, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int) -> Message:
+    def message(
+        self, frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
+    ) -> Message:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
+        self.points["age"] = _ages_s(frame)[frame.structure.sensor_module[self._index]]
         cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
         for number, (name, kind) in enumerate(_FIELDS):
             cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
         cdr.numbers("?", False).numbers("I", _POINT.itemsize, self.points.nbytes).array(self.points)
         is_dense = bool(np.isfinite(self.points["intensity"]).all())
-        return Message(self._topic, "cdr", definitions.POINTS, cdr.numbers("?", is_dense).done())
+        return Message(self.topic, "cdr", self.schema, cdr.numbers("?", is_dense).done())
+
+
+def _ages_s(frame: DriverFrame) -> npt.NDArray[np.float32]:
+    """(n_modules,) how old the data of each was when the frame was published, s; NaN: never seen."""
+    seen_ns = frame.module_time_ns
+    ages_s: npt.NDArray[np.float32] = ((frame.published_ns - seen_ns) / NS_PER_S).astype(np.float32)
+    ages_s[seen_ns == 0] = np.nan
+    return ages_s
 
 
 def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:
@@ -158,18 +200,22 @@ def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:
 class _Image:
     """Sensors of one type of a patch, side by side; the brighter, the more. Black: no sensor, or no good value."""
 
+    schema = definitions.IMAGE
+
     def __init__(
         self, topic: str, frame: str, sensor_type: SensorType, index: Index, pixels: npt.NDArray[np.int64]
     ) -> None:
-        self.sensor_type = sensor_type
-        self._topic, self._frame, self._index, self._pixels = topic, frame, index, pixels
+        self.topic, self.type_name = topic, sensor_type.name
+        self._type, self._frame, self._index, self._pixels = sensor_type, frame, index, pixels
         self._is_bounded = math.isfinite(sensor_type.minimum) and math.isfinite(sensor_type.maximum)
 
-    def message(self, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int) -> Message:
+    def message(
+        self, _frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
+    ) -> Message:
         good = (status[self._index] == 0) & np.isfinite(values)
         if self._is_bounded:
-            span = max(self.sensor_type.maximum - self.sensor_type.minimum, 1e-30)
-            scaled = np.clip((values - self.sensor_type.minimum) / span, 0, 1) * 65534 + 1
+            span = max(self._type.maximum - self._type.minimum, 1e-30)
+            scaled = np.clip((values - self._type.minimum) / span, 0, 1) * 65534 + 1
             shown = np.where(good, scaled, 0).astype("<u2")
         else:
             shown = np.where(good, values, 0).astype("<f4")
@@ -177,7 +223,7 @@ class _Image:
         height, width = image.shape
         cdr = Cdr().header(time_ns, self._frame).numbers("I", height, width)
         cdr.text("mono16" if self._is_bounded else "32FC1").numbers("B", 0).numbers("I", width * image.itemsize)
-        return Message(self._topic, "cdr", definitions.IMAGE, cdr.array(image.reshape(-1).view(np.uint8)).done())
+        return Message(self.topic, "cdr", self.schema, cdr.array(image.reshape(-1).view(np.uint8)).done())
 
 
 def _images(name: str, structure: Structure, *, only_grids: bool) -> Iterator[_Image]:

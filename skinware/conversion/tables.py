@@ -127,13 +127,15 @@ class Table(ABC):
     @cached_property
     def sensor_names(self) -> list[str]:
         """Of each sensor of a driver, as people know it."""
-        structure = self.structure
-        if structure is None:
-            return []
-        names = np.zeros(structure.n_sensors, object)
-        for sensor_type in structure.types:
-            names[structure.index(sensor_type.name)] = structure.sensor_names(sensor_type.name)
-        return [str(name) for name in names]
+        return [] if self.structure is None else sensor_names(self.structure)
+
+
+def sensor_names(structure: Structure) -> list[str]:
+    """Name of each sensor of a structure, as people know it."""
+    names = np.zeros(structure.n_sensors, object)
+    for sensor_type in structure.types:
+        names[structure.index(sensor_type.name)] = structure.sensor_names(sensor_type.name)
+    return [str(name) for name in names]
 
 
 class Source(Protocol):

@@ -6,10 +6,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from skinware.conversion import definitions
-from skinware.conversion.cdr import Cdr
+from skinware.conversion import definitions, skin_messages
 from skinware.conversion.showing import Message, Showing, in_topic
 from skinware.conversion.tables import Source, Table
 from skinware.conversion.timed_frames import TimedFrame, timed_frames
@@ -97,38 +94,15 @@ def _drivers(source: Source) -> list[Table]:
 
 
 def _skin_frame(timed: TimedFrame) -> Message:
-    frame, structure = DriverFrame(timed.generation, timed.frame.slot), timed.generation.context
-    assert isinstance(structure, Structure)  # noqa: S101, of a driver
-    values = np.zeros(structure.n_sensors)
-    for sensor_type in structure.types:
-        values[structure.index(sensor_type.name)] = structure.physical(frame.values, sensor_type.name)
-    cdr = Cdr().header(_acquired_ns(timed), "").numbers("Q", frame.generation, frame.sequence)
-    cdr.numbers("q", frame.acquired_ns, frame.published_ns)
-    data = cdr.array(values).array(frame.status).array(frame.module_time_ns).done()
+    data = skin_messages.skin_frame(DriverFrame(timed.generation, timed.frame.slot), timed.time_ns)
     return Message(f"/skin/{in_topic(timed.service)}/frame", "cdr", definitions.SKIN_FRAME, data)
 
 
 def _sensors(timed: TimedFrame, table: Table) -> Message:
     structure = timed.generation.context
     assert isinstance(structure, Structure)  # noqa: S101, of a driver
-    types = {each.id: each for each in structure.types}
-    of_sensors = [types[type_id] for type_id in structure.sensor_type.tolist()]
-    cdr = Cdr().header(timed.time_ns, "").numbers("Q", timed.generation.generation).array(structure.sensor_uid)
-    cdr.texts(table.sensor_names).texts([each.name for each in of_sensors]).texts([each.unit for each in of_sensors])
-    cdr.array(np.array([each.scale for each in of_sensors])).array(np.array([each.offset for each in of_sensors]))
-    cdr.array(structure.sensor_module)
-    geometry = structure.geometry
-    places = np.full((structure.n_sensors, 3), np.nan) if geometry is None else geometry.position_m
-    cdr.texts([""] * structure.n_sensors if geometry is None else geometry.frame.tolist())
-    for axis in range(3):
-        cdr.array(places[:, axis])
-    return Message(f"/skin/{in_topic(timed.service)}/sensors", "cdr", definitions.SENSORS, cdr.done())
-
-
-def _acquired_ns(timed: TimedFrame) -> int:
-    """When the newest data of a frame was acquired, wall clock; when it was published, if it has none."""
-    frame = timed.frame
-    return timed.time_ns - (frame.published_ns - frame.acquired_ns if frame.acquired_ns else 0)
+    data = skin_messages.sensors(structure, table.sensor_names, timed.generation.generation, timed.time_ns)
+    return Message(f"/skin/{in_topic(timed.service)}/sensors", "cdr", definitions.SENSORS, data)
 
 
 class _Writer:

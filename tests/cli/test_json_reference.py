@@ -49,6 +49,7 @@ from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device
 from tests.icub.test_positions import TRIANGLE, positions
 from tests.recording.test_wire_export import ON_VCAN1, keep, write_recording
+from tests.ros2.alone import own_domain
 from tests.streams.peers import free_port
 from tests.virtual.test_emulate import HostBus
 
@@ -332,6 +333,13 @@ def test_bridge(namespace: Namespace) -> None:
             check("`skin-bridge join`", ready, trouble, unknown, *seen)
     finally:
         shutil.rmtree(Namespace(here).path, ignore_errors=True)
+
+
+def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    own_domain(namespace, monkeypatch)
+    with publishing(FakeSkin("torso")), running("skin-bridge", "ros2") as bridge:
+        ready = bridge.wait_for("ready")
+        check("`skin-bridge ros2`", ready, bridge.wait_for("status", lambda status: "torso" in status["drivers"]))
 
 
 def _has_ages(services: dict[str, Any]) -> bool:

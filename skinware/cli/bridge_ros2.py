@@ -1,0 +1,131 @@
+"""``skin-bridge ros2``: drivers in a ROS 2 graph."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import click
+
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    examples,
+    json_option,
+    namespace_option,
+    print_json,
+    signals_end,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from skinware.ros2.serving import Ros2Server
+    from skinware.ros2.transport import Identity, Node
+
+
+@click.command(
+    "ros2",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-bridge ros2                                       then, where ROS is: ros2 topic list",
+        "skin-bridge ros2 arm --domain 7 --ros-namespace /icub  /icub/skin/arm/points/pressure ... in domain 7",
+    ),
+)
+@click.argument("names", metavar="[NAME]...", nargs=-1)
+@click.option(
+    "--rmw", type=click.Choice(["dds"]), default="dds", show_default=True, help="What carries the graph's messages."
+)
+@click.option(
+    "--domain",
+    type=int,
+    metavar="N",
+    envvar="ROS_DOMAIN_ID",
+    default=0,
+    help="Which graph.  [default: $ROS_DOMAIN_ID, else 0]",
+)
+@click.option("--ros-namespace", metavar="NAME", default="/", show_default=True, help="Before all topics: /robot_1.")
+@click.option(
+    "--distro",
+    type=click.Choice(["humble", "jazzy"]),
+    default=lambda: "humble" if os.environ.get("ROS_DISTRO") == "humble" else "jazzy",
+    help="Who is to understand it: Humble, or Jazzy and all from Iron on.  [default: as $ROS_DISTRO, else jazzy]",
+)
+@click.option(
+    "--rate", type=float, default=20.0, show_default=True, metavar="HZ", help="Of point clouds and images, at most."
+)
+@click.option("--read-only", is_flag=True, help="Nobody of the graph may tare.")
+@namespace_option
+@json_option
+def command(
+    names: tuple[str, ...],
+    rmw: str,
+    domain: int,
+    ros_namespace: str,
+    distro: str,
+    rate: float,
+    read_only: bool,
+    namespace: str | None,
+    as_json: bool,
+) -> None:
+    """Have drivers NAME..., or all there are and come, in a ROS 2 graph. ROS need not be installed.
+
+    Of each: every frame, point clouds, images, diagnostics, and a service that tares it. Who listens there and is slow,
+    stopped or gone costs the drivers nothing.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage.
+    """
+    from skinware.memory.namespace import Namespace, check_name
+    from skinware.ros2.serving import Ros2Server
+    from skinware.ros2.transport import Distro, Identity
+
+    for name in names:
+        check_name(name, "driver")
+    place = Namespace(namespace)
+    identity = Identity(f"skinware_{_plain(place.name)}", ros_namespace, domain, Distro(distro))
+    with contextlib.closing(_NODES[rmw](identity)) as node:
+        server = Ros2Server(
+            node, place, names, prefix=identity.prefix, rate_hz=rate, is_read_only=read_only, trouble=warn
+        )
+        with contextlib.closing(server), signals_end(server.stop):
+            where = f"{identity.prefix}/{identity.name}"
+            if as_json:
+                told = {"rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
+                print_json({"event": "ready", **told})
+            else:
+                click.echo(f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
+            status = _Status(server, as_json)
+            server.run(status.tell)
+
+
+def _dds_node(identity: Identity) -> Node:
+    from skinware.ros2.dds import DdsNode
+
+    return DdsNode(identity)
+
+
+_NODES = {"dds": _dds_node}
+"""What makes a node, by what carries its messages."""
+
+
+def _plain(name: str) -> str:
+    from skinware.conversion.showing import in_topic
+
+    return in_topic(name)
+
+
+class _Status:
+    """Tells each second what was told."""
+
+    def __init__(self, server: Ros2Server, as_json: bool) -> None:
+        self._server, self._as_json = server, as_json
+        self._known: dict[str, str] = {}
+
+    def tell(self) -> None:
+        drivers = self._server.drivers()
+        if self._as_json:
+            print_json({"event": "status", "drivers": {name: asdict(told) for name, told in drivers.items()}})
+        for name, told in drivers.items():
+            if not self._as_json and self._known.get(name) != told.state:
+                click.echo(f"{name}: {told.state}")
+            self._known[name] = told.state

@@ -1,0 +1,340 @@
+"""A node of a ROS 2 graph over DDS, as ROS has them with rmw_cyclonedds and rmw_fastrtps. All of Cyclone DDS is here.
+
+Messages that are ready are given to Cyclone DDS as they are: its own way, from objects of Python, takes a hundred times
+as long for a point cloud. Nothing is called back in threads of DDS: they would wait for the interpreter.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Callable
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+from skinware.errors import BridgeError, MissingExtra
+from skinware.ros2 import discovery, types
+from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
+
+if find_spec("cyclonedds") is None:
+    raise MissingExtra("ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'")
+
+from cyclonedds.core import (
+    DDSException,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import types as idl
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy
+from cyclonedds.qos import Qos as DdsQos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+try:
+    from cyclonedds._clayer import ddspy_write as _write_bytes
+except ImportError:  # it is not public
+    _write_bytes = None
+
+_SERVICE_QOS = Qos(depth=10)
+_REQUESTS_AT_ONCE = 16
+_ENCAPSULATION = 4
+_REQUEST_ID = {"guid": idl.uint64, "sequence": idl.int64}
+_REQUEST_ID_SIZE = 16
+"""Before what is asked and answered, as rmw_cyclonedds has it."""
+_FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
+_PLAIN = {
+    "bool": bool,
+    "byte": idl.uint8,
+    "float64": idl.float64,
+    "int32": idl.int32,
+    "int64": idl.int64,
+    "string": str,
+    "uint8": idl.uint8,
+    "uint32": idl.uint32,
+    "uint64": idl.uint64,
+}
+
+_NO_LIMIT = (
+    "<CycloneDDS><Domain id='any'><Internal><Watermarks>"
+    "<WhcAdaptive>false</WhcAdaptive><WhcHigh>1 GB</WhcHigh>"
+    "</Watermarks></Internal></Domain></CycloneDDS>"
+)
+"""What one reader has not acknowledged keeps no other from the next message: the limit is the short history."""
+_THIS_MACHINE = (
+    "<CycloneDDS><Domain id='any'><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
+    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    "<Peers><Peer address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
+)
+
+
+class DdsNode:
+    """See :class:`skinware.ros2.transport.Node`.
+
+    ``CYCLONEDDS_URI``, ``ROS_AUTOMATIC_DISCOVERY_RANGE`` and ``ROS_LOCALHOST_ONLY`` are obeyed as by nodes of ROS.
+
+    Args:
+        identity: of the node.
+
+    Raises:
+        BridgeError: it cannot be made; the message says why.
+    """
+
+    def __init__(self, identity: Identity) -> None:
+        self._identity = identity
+        try:
+            self._domain = Domain(identity.domain, _configuration())
+            self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(discovery.PARTICIPANT_DATA)))
+        except DDSException as error:
+            raise BridgeError(
+                f"domain {identity.domain} of DDS cannot be joined ({_reason(error)}); is a network interface up,"
+                " and is CYCLONEDDS_URI in order?"
+            ) from None
+        self._lock = threading.RLock()
+        self._writers: list[_Writer] = []
+        self._services: list[_Service] = []
+        self._worker: _Worker | None = None
+        self._info = self._writer(discovery.TOPIC, types.PARTICIPANT, Qos(depth=1, latched=True), is_told=False)
+        self._tell()
+
+    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
+        """See the protocol."""
+        writer = self._writer(f"rt{topic}", message_type, qos)
+        self._tell()
+        return writer
+
+    def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
+        """See the protocol."""
+        with self._lock:
+            reader = self._made(
+                lambda: DataReader(
+                    self._participant,
+                    Topic(self._participant, f"rq{name}Request", _type(service_type.request, with_id=True)),
+                    self._qos(service_type.request, _SERVICE_QOS),
+                ),
+                name,
+            )
+            writer = self._writer(f"rr{name}Reply", service_type.response, _SERVICE_QOS, with_id=True)
+            if self._worker is None:
+                self._worker = _Worker(self._participant)
+            service = _Service(reader, writer, handler, self._worker)
+            self._services.append(service)
+            self._tell()
+
+        def end() -> None:
+            with self._lock:
+                if service in self._services:
+                    self._services.remove(service)
+                    service.close()
+                    self._tell()
+
+        return end
+
+    def close(self) -> None:
+        """Leave the graph. Idempotent."""
+        with self._lock:
+            if self._worker is not None:
+                self._worker.close()
+            for service in self._services:
+                service.close()
+            for writer in list(self._writers):
+                writer.close()
+            self._services.clear()
+            self._info.close()
+            self._participant = self._domain = self._worker = None
+
+    def _writer(
+        self,
+        topic: str,
+        message_type: MessageType,
+        qos: Qos,
+        *,
+        with_id: bool = False,
+        is_told: bool = True,
+    ) -> _Writer:
+        def make() -> DataWriter[Any]:
+            made = Topic(self._participant, topic, _type(message_type, with_id))
+            return DataWriter(self._participant, made, self._qos(message_type, qos))
+
+        with self._lock:
+            writer = _Writer(self._made(make, topic), self._closed if is_told else lambda _: None, qos.latched)
+            if is_told:
+                self._writers.append(writer)
+            return writer
+
+    def _made(self, make: Callable[[], Any], what: str) -> Any:
+        try:
+            return make()
+        except DDSException as error:
+            raise BridgeError(f"{what}: {_reason(error)}") from None
+
+    def _qos(self, message_type: MessageType, qos: Qos) -> DdsQos:
+        return DdsQos(
+            Policy.Reliability.Reliable(max_blocking_time=0) if qos.reliable else Policy.Reliability.BestEffort,
+            Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(qos.depth),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(discovery.endpoint_data(message_type.hash, self._identity.distro)),
+        )
+
+    def _closed(self, writer: _Writer) -> None:
+        with self._lock:
+            if writer in self._writers:
+                self._writers.remove(writer)
+                self._tell()
+
+    def _tell(self) -> None:
+        """All of the graph which endpoints are of this node."""
+        with self._lock:
+            if self._participant is not None:
+                readers = [service.id for service in self._services]
+                writers = [writer.id for writer in self._writers]
+                self._info.publish(discovery.entities(self._identity, self._participant.guid.bytes, readers, writers))
+
+
+class _Writer:
+    """See :class:`skinware.ros2.transport.Publisher`."""
+
+    def __init__(self, writer: DataWriter[Any], closed: Callable[[_Writer], None], is_latched: bool) -> None:
+        self._writer: DataWriter[Any] | None = writer
+        self._ref: int = writer._ref  # noqa: SLF001, what is written to without objects of Python
+        self._closed, self._is_latched = closed, is_latched
+        self.id: bytes = writer.guid.bytes
+
+    @property
+    def is_wanted(self) -> bool:
+        """See the protocol."""
+        if self._writer is None:
+            return False
+        return self._is_latched or self._writer.get_publication_matched_status().current_count > 0
+
+    def publish(self, message: Cdr) -> bool:
+        """See the protocol."""
+        writer = self._writer
+        if writer is None:
+            return False
+        if _write_bytes is not None:
+            return bool(_write_bytes(self._ref, message + bytes(-len(message) % 4)) >= 0)
+        try:
+            writer.write(writer.data_type.deserialize(message))
+        except DDSException:
+            return False
+        return True
+
+    def close(self) -> None:
+        """See the protocol."""
+        if self._writer is not None:
+            self._writer = None  # which deletes it
+            self._closed(self)
+
+
+class _Service:
+    """Answers what comes in."""
+
+    def __init__(self, reader: DataReader[Any], writer: _Writer, handler: Handler, worker: _Worker) -> None:
+        self._reader: DataReader[Any] | None = reader
+        self._writer, self._handler, self._worker = writer, handler, worker
+        self.id: bytes = reader.guid.bytes
+        self._condition = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Alive)
+        worker.attach(self._condition, self.answer)
+
+    def answer(self) -> None:
+        """All that was asked so far."""
+        if self._reader is None:
+            return
+        try:
+            requests = self._reader.take(_REQUESTS_AT_ONCE)
+        except DDSException:
+            return
+        for request in requests:
+            if isinstance(request, IdlStruct):  # otherwise who asked is gone
+                asked = request.serialize()
+                after_id = _ENCAPSULATION + _REQUEST_ID_SIZE
+                answer = self._handler(asked[:_ENCAPSULATION] + asked[after_id:])
+                self._writer.publish(answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:])
+
+    def close(self) -> None:
+        self._worker.detach(self._condition)
+        self._reader = self._condition = None
+        self._writer.close()
+
+
+class _Worker:
+    """A thread in which requests are answered."""
+
+    def __init__(self, participant: DomainParticipant) -> None:
+        self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
+        self._waitset.attach(self._woken)
+        self._lock = threading.Lock()
+        self._answers: dict[ReadCondition, Callable[[], None]] = {}
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="skinware ros2 requests", daemon=True)
+        self._thread.start()
+
+    def attach(self, condition: ReadCondition, answer: Callable[[], None]) -> None:
+        with self._lock:
+            self._answers[condition] = answer
+            self._waitset.attach(condition)
+
+    def detach(self, condition: ReadCondition) -> None:
+        with self._lock:
+            if self._answers.pop(condition, None) is not None:
+                self._waitset.detach(condition)
+
+    def close(self) -> None:
+        self._ended = True
+        self._woken.set(True)
+        self._thread.join()
+        self._answers.clear()
+
+    def _run(self) -> None:
+        while not self._ended:
+            self._waitset.wait(duration(infinite=True))
+            with self._lock:
+                for answer in self._answers.values():
+                    if not self._ended:
+                        answer()
+
+
+@cache
+def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
+    """A type as Cyclone DDS wants it, which looks whether what comes is one."""
+    fields: dict[str, Any] = dict(_REQUEST_ID) if with_id else {}
+    for field in _FIELD.finditer(types.definition(message_type)):
+        kind: Any = _PLAIN.get(field["type"]) or _type(_part(field["type"]))
+        if field["bound"]:
+            kind = idl.bounded_str[int(field["bound"])]
+        if field["length"]:
+            kind = idl.array[kind, int(field["length"])]
+        elif field["length"] is not None:
+            kind = idl.sequence[kind]
+        fields[field["name"]] = kind
+    plain = message_type.name.rpartition("/")[2]
+    made: type[IdlStruct] = make_idl_struct(plain, message_type.dds_name.replace("::", "."), fields)
+    return made
+
+
+def _part(name: str) -> MessageType:
+    """The type of a field: ``std_msgs/Header``."""
+    return MessageType(name.replace("/", "/msg/"), "")
+
+
+def _configuration() -> str:
+    """For Cyclone DDS; later parts overrule."""
+    of_range = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
+    is_local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or of_range == "LOCALHOST"
+    parts = [_NO_LIMIT, *([_THIS_MACHINE] if is_local else []), os.environ.get("CYCLONEDDS_URI", "")]
+    return ",".join(filter(None, parts))
+
+
+def _reason(error: DDSException) -> str:
+    return str(error).partition("] ")[2].partition(".")[0] or str(error)

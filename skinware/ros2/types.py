@@ -1,0 +1,90 @@
+"""Types of messages and services that are used in a ROS 2 graph: their definitions and the hashes of these."""
+
+from __future__ import annotations
+
+from skinware.conversion import definitions
+from skinware.ros2.transport import MessageType, ServiceType
+
+_KEY_VALUE = "string key\nstring value\n"
+_DIAGNOSTIC_STATUS = """\
+byte OK=0
+byte WARN=1
+byte ERROR=2
+byte STALE=3
+byte level
+string name
+string message
+string hardware_id
+diagnostic_msgs/KeyValue[] values
+"""
+_PARTICIPANT_ENTITIES = """\
+rmw_dds_common/Gid gid
+rmw_dds_common/NodeEntitiesInfo[] node_entities_info_seq
+"""
+_NODE_ENTITIES = """\
+string<=256 node_namespace
+string<=256 node_name
+rmw_dds_common/Gid[] reader_gid_seq
+rmw_dds_common/Gid[] writer_gid_seq
+"""
+TEXTS = {
+    **definitions.TEXTS,
+    "diagnostic_msgs/KeyValue": _KEY_VALUE,
+    "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
+    "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
+    "rmw_dds_common/Gid": "uint8[16] data\n",
+    "rmw_dds_common/NodeEntitiesInfo": _NODE_ENTITIES,
+    "rmw_dds_common/ParticipantEntitiesInfo": _PARTICIPANT_ENTITIES,
+    "std_srvs/srv/Trigger_Request": "uint8 structure_needs_at_least_one_member\n",
+    "std_srvs/srv/Trigger_Response": "bool success\nstring message\n",
+}
+"""Definitions, by type; those of messages are called without ``msg``."""
+
+POINTS = MessageType(
+    "sensor_msgs/msg/PointCloud2", "RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5"
+)
+IMAGE = MessageType("sensor_msgs/msg/Image", "RIHS01_d31d41a9a4c4bc8eae9be757b0beed306564f7526c88ea6a4588fb9582527d47")
+SKIN_FRAME = MessageType(
+    "skinware_msgs/msg/SkinFrame", "RIHS01_4c6c7978ff329a043a35d3762fc01b81ab8bfbf3d39510eaae7762e0c88d6654"
+)
+SENSORS = MessageType(
+    "skinware_msgs/msg/Sensors", "RIHS01_223f66244e68a28a02cb2d2591b01679d9264cfe19da5262d3f45178f7c40799"
+)
+DIAGNOSTICS = MessageType(
+    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+)
+TRIGGER = ServiceType(
+    "std_srvs/srv/Trigger",
+    "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
+    MessageType(
+        "std_srvs/srv/Trigger_Request", "RIHS01_d010825374ce8918e72bfd826c82603e60f45419e932ea976f807b74a863a199"
+    ),
+    MessageType(
+        "std_srvs/srv/Trigger_Response", "RIHS01_2d946c21e2fc3f1e9ca6986a8191d85fcc70097a8bb7771a053564bc47009cdf"
+    ),
+)
+PARTICIPANT = MessageType(
+    "rmw_dds_common/msg/ParticipantEntitiesInfo",
+    "RIHS01_e725f4a506958c79f95dd693b965722c57b19cd18e7eff984f49561b93dc985d",
+)
+OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
+"""Types of what is shown, by the names of their definitions."""
+
+
+def definition(message_type: MessageType) -> str:
+    """The text of a type's definition, as its ``.msg`` file has it."""
+    return TEXTS[message_type.name.replace("/msg/", "/")]
+
+
+__all__ = [
+    "DIAGNOSTICS",
+    "IMAGE",
+    "OF_SCHEMAS",
+    "PARTICIPANT",
+    "POINTS",
+    "SENSORS",
+    "SKIN_FRAME",
+    "TEXTS",
+    "TRIGGER",
+    "definition",
+]

@@ -1,0 +1,211 @@
+"""The command, and programs of the other side in processes of their own, over real DDS of this machine alone."""
+
+from __future__ import annotations
+
+import base64
+import os
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skinware import DriverReader, Namespace
+from skinware.conversion.showing import in_topic
+from skinware.errors import BridgeError, ConfigurationError
+from skinware.ros2 import dds, types
+from skinware.ros2.transport import Distro, Identity, Qos
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
+from tests.commands import Running, refused, running
+from tests.recording.test_viewers import placed
+from tests.ros2.alone import own_domain
+from tests.ros2.store import typestore
+from tests.ros2.test_serving import tareable
+
+STORE = typestore()
+FRAME = ("rt/skin/arm/frame", "skinware_msgs/msg/SkinFrame")
+SENSORS = ("rt/skin/arm/sensors", "skinware_msgs/msg/Sensors")
+POINTS = ("rt/skin/arm/points/pressure", "sensor_msgs/msg/PointCloud2")
+
+
+@pytest.fixture
+def domain(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> int:
+    return own_domain(namespace, monkeypatch)
+
+
+def bridge(*options: str) -> Any:
+    return running("skin-bridge", "ros2", *options)
+
+
+def peer(domain: int, *options: str) -> Any:
+    return running("python", "-m", "tests.ros2.peer", str(domain), *options)
+
+
+def message(of: Running, topic: str, name: str, condition: Callable[[Any], bool] = lambda _: True) -> Any:
+    """A message that a peer got, as rosbags reads it, and which fulfils a condition."""
+    found: list[Any] = []
+
+    def fulfils(event: dict[str, Any]) -> bool:
+        if event["topic"] != topic:
+            return False
+        found[:] = [STORE.deserialize_cdr(base64.b64decode(event["data"]), name)]
+        return condition(found[0])
+
+    of.wait_for("message", fulfils)
+    return found[0]
+
+
+def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namespace, domain: int) -> None:
+    with publishing(FakeSkin("arm", placed(fake_structure(2, 8)))) as skin, bridge() as ours:
+        told = ours.wait_for("ready")
+        assert told == {
+            "event": "ready",
+            "rmw": "dds",
+            "domain": domain,
+            "node": f"/skinware_{in_topic(namespace.name)}",
+            "namespace": namespace.name,
+        }
+        with peer(domain, "--look", "--listen", *FRAME, "--listen", *POINTS, "--listen-late", *SENSORS) as theirs:
+            sensors = message(theirs, *SENSORS)
+            assert np.array_equal(sensors.uid, skin.structure.sensor_uid)
+            frame = message(theirs, *FRAME)
+            assert len(frame.value) == skin.structure.n_sensors
+            assert frame.generation == sensors.generation
+            with DriverReader("arm", namespace=namespace) as reader:
+                frames = reader.in_order(timeout_s=10)
+                sequence = next(frames).sequence + 5
+                of_ring = next(each for each in frames if each.sequence == sequence)
+            same = message(theirs, *FRAME, lambda each: each.sequence >= sequence)
+            if same.sequence == sequence:
+                assert np.array_equal(same.value[skin.structure.index("pressure")], of_ring.physical("pressure"))
+                assert np.array_equal(same.status, of_ring.status)
+            points, geometry = message(theirs, *POINTS), skin.structure.geometry
+            assert geometry is not None
+            assert points.width == int(geometry.known[skin.structure.index("pressure")].sum())
+        ours.wait_for("status", lambda event: event["drivers"]["arm"]["messages"] > 10)
+
+
+def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, domain: int) -> None:
+    info = ("ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo")
+    with FakeSkin("arm", placed(fake_structure(1, 2))) as skin, bridge() as ours:
+        skin.publish()
+        node = ours.wait_for("ready")["node"]
+        with peer(domain, "--look", "--listen-late", *info) as theirs:
+            found = theirs.wait_for("publication", lambda event: event["topic"] == POINTS[0])
+            assert found["type"] == "sensor_msgs::msg::dds_::PointCloud2_"
+            assert found["data"] == f"typehash={types.POINTS.hash};"
+            told = message(
+                theirs,
+                *info,
+                lambda each: (
+                    found["key"]
+                    in [bytes(gid.data).hex() for of in each.node_entities_info_seq for gid in of.writer_gid_seq]
+                ),
+            )
+            (of_node,) = told.node_entities_info_seq
+            assert of_node.node_namespace + of_node.node_name == node
+
+
+def test_a_service_tares(namespace: Namespace, domain: int) -> None:
+    with tareable(namespace), bridge() as ours:
+        ours.wait_for("ready")
+        with peer(domain, "--call", "/skin/arm/tare") as theirs:
+            answers = [theirs.wait_for("answer") for _ in range(2)]
+        assert [(each["guid"], each["sequence"]) for each in answers] == [(2**63 + 7, 1), (5, 2)]
+        assert all((each["success"], each["message"]) == (True, "") for each in answers)
+        with DriverReader("arm", namespace=namespace) as reader:
+            wait_until(lambda: bool((reader.read().values == 2).all()))
+
+
+def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: Namespace, domain: int) -> None:
+    """With messages that are larger than what Cyclone DDS keeps for a reader by default before it makes others wait."""
+    skin = FakeSkin("arm", placed(fake_structure(20, 64)), slots=64)
+    with publishing(skin, 50), bridge("--rate", "50") as ours:
+        ours.wait_for("ready")
+        with peer(domain, "--listen", *POINTS) as stopped, peer(domain, "--listen", *FRAME) as theirs:
+            message(stopped, *POINTS)
+            message(theirs, *FRAME)
+            os.kill(stopped.process.pid, signal.SIGSTOP)
+            try:
+                begin = message(theirs, *FRAME).sequence
+                frames = [message(theirs, *FRAME).sequence for _ in range(60)]
+                assert frames[0] > begin
+                assert frames == sorted(set(frames))
+                with DriverReader("arm", namespace=namespace) as reader:
+                    newest = reader.read().sequence
+                message(theirs, *FRAME, lambda each: each.sequence >= newest)
+            finally:
+                os.kill(stopped.process.pid, signal.SIGCONT)
+            message(stopped, *POINTS, lambda each: each.width > 0)
+            stopped.process.kill()
+            begin = message(theirs, *FRAME).sequence
+            message(theirs, *FRAME, lambda each: each.sequence > begin + 20)
+
+
+def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
+    monkeypatch.setattr(dds, "_write_bytes", None)
+    node = dds.DdsNode(Identity("skin", domain=domain))
+    try:
+        with peer(domain, "--listen", "rt/x", types.SKIN_FRAME.name) as theirs:
+            publisher = node.publisher("/x", types.SKIN_FRAME, Qos())
+            assert not publisher.is_wanted or theirs
+            wait_until(lambda: publisher.is_wanted)
+            sent = made_frame()
+            wait_until(lambda: publisher.publish(sent))
+            data = theirs.wait_for("message")["data"]
+            assert base64.b64decode(data)[: len(sent)] == sent
+    finally:
+        node.close()
+    assert not publisher.publish(b"")
+
+
+def made_frame() -> bytes:
+    with FakeSkin("leg", fake_structure(1, 1)) as skin, DriverReader("leg") as reader:
+        skin.publish()
+        from skinware.conversion.skin_messages import skin_frame
+
+        return skin_frame(reader.read(), 10**18)
+
+
+def test_wrong_usage_is_one_clear_line(domain: int) -> None:
+    for options, told in (
+        (["--domain", "233"], "domain 233 of ROS: give 0 to 232"),
+        (["--ros-namespace", "robot"], "namespace 'robot' of ROS: give / or names after slashes, as /robot_1"),
+        (["--rate", "0"], "rate of 0.0 Hz"),
+    ):
+        done = refused("skin-bridge", "ros2", *options)
+        assert done.returncode == 2
+        assert told in done.stderr
+        assert len(done.stderr.splitlines()) == 1
+    assert refused("skin-bridge", "ros2", "--domain", "x").returncode == 2
+
+
+def test_a_network_that_is_not_there(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(
+        "CYCLONEDDS_URI",
+        "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface name='none0'/></Interfaces></General>"
+        "</Domain></CycloneDDS>",
+    )
+    with pytest.raises(BridgeError, match=rf"domain {domain} of DDS cannot be joined"):
+        dds.DdsNode(Identity("skin", domain=domain))
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.delitem(sys.modules, "skinware.ros2.dds")
+    done = refused("skin-bridge", "ros2")
+    assert done.returncode == 1
+    assert done.stderr == (
+        "skin-bridge: ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'\n"
+    )
+
+
+@pytest.mark.parametrize("fields", [{"name": "1st"}, {"name": "a b"}, {"namespace": "x"}, {"domain": -1}])
+def test_identities_that_ros_does_not_know(fields: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError):
+        Identity(**{"name": "skin", **fields})
+    assert Identity("skin", "/", 0, Distro.HUMBLE).prefix == ""

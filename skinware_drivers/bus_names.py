@@ -15,7 +15,7 @@ _PLACING: dict[str, dict[str, str]] = {
     "socketcand": {"host": "", "port": ""},
 }
 """By interface: options that say, beside the channel, which bus it is; and what they are unless given."""
-NETWORKS = ("tcp", "udp", "websocket")
+NETWORKS = ("tcp", "udp", "websocket", "yarp")
 """Interfaces of serial devices that are reached over a network."""
 
 
@@ -41,7 +41,8 @@ def parse_bus_name(name: str) -> BusName:
 
     ``vcan0`` is ``socketcan:vcan0``, ``virtual`` an emulated skin in this process. A path, which has a slash in it
     (``/dev/ttyUSB0``, ``./port``), is a serial port; ``tcp://HOST:PORT`` and ``udp://HOST:PORT`` are streams over a
-    network. pyserial's URLs (``rfc2217://host:port``) are serial, too.
+    network, ``yarp://HOST:PORT/NAME`` is a port of a robot that runs YARP. pyserial's URLs (``rfc2217://host:port``)
+    are serial, too.
     python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:

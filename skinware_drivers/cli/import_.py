@@ -37,6 +37,7 @@ def command() -> None:
         "skin-import icub iCubGenova02 -o skin             a whole robot",
         "skin-import icub iCubGenova02 positions -o skin   with skinGui's positions",
         "skin-import icub torso.xml --bus 1=can0           one device, on stdout",
+        "skin-import icub iCubGenova02 -o skin --yarp yarp:///icub/skin   to read the ports of the running robot",
     ),
 )
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path(path_type=Path, exists=True))
@@ -51,6 +52,12 @@ def command() -> None:
 @click.option(
     "--positions", multiple=True, metavar="PART=FILE", help="Position file of a body part, if it is not clear."
 )
+@click.option(
+    "--yarp",
+    "root",
+    metavar="BUS",
+    help="Read YARP ports instead of CAN: what they begin with, as yarp://HOST:PORT/icub/skin.",
+)
 @json_option
 @click.option("-v", "--verbose", is_flag=True, help="Also list remarks that need no action.")
 def icub(
@@ -60,6 +67,7 @@ def icub(
     only: tuple[str, ...],
     buses: tuple[str, ...],
     positions: tuple[str, ...],
+    root: str | None,
     as_json: bool,
     verbose: bool,
 ) -> None:
@@ -71,6 +79,7 @@ def icub(
     from skinware_drivers.icub.importer import import_files
     from skinware_drivers.icub.notes import Notes
 
+    root = _root(root)
     notes = Notes()
     try:
         done = import_files(
@@ -79,22 +88,25 @@ def icub(
             only=only,
             positions={name: Path(file) for name, file in _pairs(positions, "--positions PART=FILE")},
             bus_names={_patch(patch): name for patch, name in _pairs(buses, "--bus PATCH=NAME")},
+            wants_buses=not root,
         )
+        if root:
+            done.parts = [part for part in done.parts if part.yarp]
         if not done.parts:
-            raise ConfigurationError("no part could be translated")
+            raise ConfigurationError(f"no part could be translated{' that has ports' if root else ''}")
     except ConfigurationError:
         _report(notes.all(), verbose)
         raise
     if output is None and len(done.parts) > 1 and not as_json:
         names = ", ".join(part.part.name for part in done.parts)
         raise ConfigurationError(f"{len(done.parts)} parts ({names}): choose one with --part, or give -o DIR")
-    written = [] if output is None else _write(done.parts, output, force)
+    written = [] if output is None else _write(done.parts, output, force, root)
     if as_json:
-        print_json(_as_data(done, notes.all(), written))
+        print_json(_as_data(done, notes.all(), written, root))
         return
     _report(notes.all(), verbose)
     if output is None:
-        click.echo(done.parts[0].configuration(), nl=False)
+        click.echo(_configuration(done.parts[0], root), nl=False)
         if done.parts[0].groups:
             click.echo("skin-import: with -o DIR, there is a geometry file too", err=True)
         return
@@ -123,19 +135,38 @@ def _patch(text: str) -> int:
     return int(text)
 
 
-def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dict[str, str]]:
+def _root(text: str | None) -> str:
+    """With what the names of ports begin; empty: no ports are wanted."""
+    from skinware_drivers.streams.yarp_bus import split_channel
+
+    if text is None:
+        return ""
+    scheme, _, rest = text.rstrip("/").partition("://")
+    if scheme != "yarp":
+        raise ConfigurationError(f"--yarp {text}: write yarp://HOST:PORT/icub/skin, or yarp:///icub/skin")
+    split_channel(f"{rest}/port")
+    return f"yarp://{rest}"
+
+
+def _configuration(part: ImportedPart, root: str, geometry: str = "") -> str:
+    return part.yarp_configuration(root, geometry) if root else part.configuration(geometry)
+
+
+def _write(parts: Sequence[ImportedPart], folder: Path, force: bool, root: str) -> list[dict[str, str]]:
     """Write all files or, where one is in the way, none."""
     texts: dict[Path, str] = {}
     written = []
     for part in parts:
         files = {"config": folder / f"{part.name}.toml"}
-        if part.groups:
+        geometry = part.yarp_geometry() if root else part.geometry() if part.groups else ""
+        regions = part.yarp_regions_text() if root else part.regions_text() if part.regions else ""
+        if geometry:
             files["geometry"] = folder / f"{part.name}.geometry.toml"
-            texts[files["geometry"]] = part.geometry()
-        if part.regions:
+            texts[files["geometry"]] = geometry
+        if regions:
             files["regions"] = folder / f"{part.name}.regions.toml"
-            texts[files["regions"]] = part.regions_text()
-        texts[files["config"]] = part.configuration(files["geometry"].name if part.groups else "")
+            texts[files["regions"]] = regions
+        texts[files["config"]] = _configuration(part, root, files["geometry"].name if geometry else "")
         written.append({kind: str(path) for kind, path in files.items()})
     in_the_way = [str(path) for path in texts if path.exists()]
     if in_the_way and not force:
@@ -146,12 +177,12 @@ def _write(parts: Sequence[ImportedPart], folder: Path, force: bool) -> list[dic
     return written
 
 
-def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, str]]) -> dict[str, object]:
+def _as_data(done: Import, notes: Sequence[Note], written: Sequence[dict[str, str]], root: str) -> dict[str, object]:
     from skinware_drivers.icub.notes import shown
 
     parts = []
     for number, part in enumerate(done.parts):
-        files = written[number] if written else {"configuration_text": part.configuration()}
+        files = written[number] if written else {"configuration_text": _configuration(part, root)}
         parts.append({**part.figures(), **files})
     return {"parts": parts, "notes": notes, "files": [shown(path) for path in done.files]}
 

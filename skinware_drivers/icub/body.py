@@ -60,7 +60,7 @@ def read_body(
     """Put position files and drawings, by name of the body part, on the boards of a part."""
     body = Body()
     for port in ports:
-        channels = _channels(part, port, notes)
+        channels = triangles_of(part, port, notes)
         if port.name in positions:
             _place(body, port, positions[port.name], channels, notes)
         elif port.name in drawings:
@@ -68,7 +68,7 @@ def read_body(
     return body
 
 
-def _channels(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
+def triangles_of(part: Part, port: Port, notes: Notes) -> dict[int, Place]:
     """Place of every triangle of a port, by its number in the body part."""
     order = part.host_order
     triangles: dict[int, Place] = {}
@@ -171,7 +171,7 @@ def check_drawings(body: Body, triangles: Mapping[str, set[Place]], enabled: set
 def places_of(part: Part, ports: Sequence[Port]) -> dict[str, set[Place]]:
     """All places of each body part."""
     quiet = Notes()
-    return {port.name: set(_channels(part, port, quiet).values()) for port in ports}
+    return {port.name: set(triangles_of(part, port, quiet).values()) for port in ports}
 
 
 def places_text(places: Sequence[Place] | set[Place]) -> str:
@@ -182,4 +182,4 @@ def places_text(places: Sequence[Place] | set[Place]) -> str:
     return "; ".join(f"patch {p} board {b}: {runs_text(triangles)}" for (p, b), triangles in boards.items())
 
 
-__all__ = ["Body", "Place", "check_drawings", "places_of", "places_text", "read_body"]
+__all__ = ["Body", "Place", "check_drawings", "places_of", "places_text", "read_body", "triangles_of"]

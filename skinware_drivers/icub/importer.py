@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec.structs
+
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
 from skinware.tactile.region_files import regions_to_toml
@@ -19,10 +21,11 @@ from skinware_drivers.icub.notes import Level, Notes, shown
 from skinware_drivers.icub.part import DEVICE_TYPES, ETHERNET, Part, read_part
 from skinware_drivers.icub.positions import Positions, is_positions, read_positions, read_text
 from skinware_drivers.icub.regions import regions_of
-from skinware_drivers.icub.toml_text import configuration_text
+from skinware_drivers.icub.toml_text import configuration_text, yarp_configuration_text
 from skinware_drivers.icub.translate import TranslatedBus, enabled_places, service_name, translate
 from skinware_drivers.icub.wrapper import WRAPPER, Port, Wrapper, read_wrapper
 from skinware_drivers.icub.xml_tree import Element
+from skinware_drivers.icub.yarp import YarpPort, yarp_ports
 
 _SUFFIXES = (".xml", ".txt", ".ini")
 _MOST_FILES = 20_000
@@ -38,6 +41,7 @@ class ImportedPart:
         part: what the files say.
         ports: body parts in its index.
         buses: in the order of the configuration.
+        yarp: its ports.
         groups: places of its sensors, also of those that are switched off.
         regions: its body parts.
         triangles: number of triangles that are switched on.
@@ -48,6 +52,7 @@ class ImportedPart:
     part: Part
     ports: Sequence[Port]
     buses: list[TranslatedBus]
+    yarp: list[YarpPort]
     groups: list[GeometryGroup]
     regions: list[Region]
     triangles: int
@@ -70,6 +75,37 @@ class ImportedPart:
         """The text of its geometry file."""
         lines = f"Places of the sensors of {self.name}, made by skin-import: its driver publishes them."
         return geometry_to_toml(self.groups, lines)
+
+    def yarp_configuration(self, root: str, geometry: str = "") -> str:
+        """The text of a configuration file that reads its compensated ports.
+
+        Args:
+            root: what the names of the ports' buses begin with, as ``yarp:///icub/skin``.
+            geometry: the file beside it with the places of the sensors.
+        """
+        where = shown(self.part.element.file.name)
+        lines = f"The ports of {shown(self.part.name)}, made by skin-import from {where}.\nFor what its boards send, "
+        lines += 'leave _comp out of the names and add values = "raw".'
+        buses = [(f"{root}/{port.name}_comp", port.options) for port in self.yarp]
+        return yarp_configuration_text(self.name, buses, lines, geometry)
+
+    def yarp_geometry(self) -> str:
+        """The text of a geometry file for that."""
+        groups = [
+            msgspec.structs.replace(group, uid=tuple(bus << 32 | uid for uid in group.uid))
+            for bus, port in enumerate(self.yarp)
+            for group in port.groups
+        ]
+        lines = f"Places of the sensors of {self.name} by their ports, made by skin-import: its driver publishes them."
+        return geometry_to_toml(groups, lines) if groups else ""
+
+    def yarp_regions_text(self) -> str:
+        """The text of a file of regions for that: each port is one."""
+        regions = [
+            Region(port.name, "pressure", (self.name,), tuple(bus << 32 | uid for uid in port.uids), ())
+            for bus, port in enumerate(self.yarp)
+        ]
+        return regions_to_toml(regions, f"Ports of {self.name} as regions, made by skin-import.")
 
     def regions_text(self) -> str:
         """The text of its file of regions."""
@@ -118,6 +154,7 @@ def import_files(
     only: Sequence[str] = (),
     positions: Mapping[str, Path] | None = None,
     bus_names: Mapping[int, str] | None = None,
+    wants_buses: bool = True,
 ) -> Import:
     """Translate the skin devices in files and folders.
 
@@ -127,6 +164,7 @@ def import_files(
         only: devices to translate, by name; all if empty.
         positions: position file of a body part, where the names of the files leave it open.
         bus_names: bus of each patch; only for one device.
+        wants_buses: whether their buses are to be connected to this computer.
 
     Raises:
         ConfigurationError: a file cannot be read, there is no skin device, or one that was named is not there.
@@ -145,7 +183,7 @@ def import_files(
         part = read_part(device.name or "skin", device.attributes["type"], reader.group_of(device), notes)
         ports = wrappers.ports_of(part, notes)
         body = read_body(part, ports, *files.of_ports(ports), notes)
-        buses = translate(part, body, bus_names or {}, notes)
+        buses = translate(part, body, bus_names or {}, notes, wants_names=wants_buses)
         if not buses:
             continue
         enabled, places = enabled_places(buses), places_of(part, ports)
@@ -154,7 +192,8 @@ def import_files(
         placed = sum(len(group.uid) for place in enabled for group in body.groups.get(place, ()))
         patches = [bus.patch for bus in buses]
         groups, regions = body.groups_of(patches), regions_of(name, places, enabled, patches)
-        parts.append(ImportedPart(name, part, ports, buses, groups, regions, len(enabled), placed))
+        yarp = yarp_ports(part, ports, buses, body, notes)
+        parts.append(ImportedPart(name, part, ports, buses, yarp, groups, regions, len(enabled), placed))
     if not only:
         wrappers.name_unused(notes)
     files.name_unused({port.name for part in parts for port in part.ports})

@@ -53,7 +53,9 @@ class TranslatedBus:
     options: RoboskinOptions
 
 
-def translate(part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes) -> list[TranslatedBus]:
+def translate(
+    part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes, *, wants_names: bool = True
+) -> list[TranslatedBus]:
     """The buses of a part, in order of their patches; those on which nothing is switched on are left out.
 
     Args:
@@ -61,6 +63,7 @@ def translate(part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes
         body: what is known of its triangles.
         bus_names: names of buses that the user gave, by patch.
         notes: takes what is odd.
+        wants_names: whether a bus without a name is to be filled in.
     """
     buses = []
     for patch in sorted(part.boards):
@@ -82,7 +85,7 @@ def translate(part: Part, body: Body, bus_names: Mapping[int, str], notes: Notes
     for patch in bus_names:
         if patch not in part.boards:
             raise ConfigurationError(f"--bus {patch}={bus_names[patch]}: {part.name} has no patch {patch}")
-    to_fill_in = [str(bus.patch) for bus in buses if not bus.name]
+    to_fill_in = [str(bus.patch) for bus in buses if wants_names and not bus.name]
     if to_fill_in and part.device_type == ETHERNET:
         text = (
             "the boards are behind an Ethernet board: connect a CAN interface to the bus itself and fill in its name;"

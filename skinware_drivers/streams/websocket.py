@@ -5,19 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 from urllib.parse import urlsplit
 
-import msgspec
-from msgspec import Meta
-
-from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.realtime import now_ns
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.streams.address import parse_address
+from skinware_drivers.streams.bus import ServerBus
 
 if TYPE_CHECKING:
     from skinware_drivers.streams.websocket_port import WebSocketPort
@@ -27,17 +23,6 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _HTTP = 80
 _MOST_MESSAGES = 256
 """Messages of a take, before other buses have their turn."""
-
-
-class WebSocketOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a bus over a websocket."""
-
-    patience_s: Annotated[
-        int, Meta(ge=2, le=600, description="seconds without a sign of the other end until the connection is given up")
-    ] = 5
-    silence_s: Annotated[
-        float, Meta(ge=0, le=3600, description="seconds without a message until it is connected anew; 0: never")
-    ] = 5.0
 
 
 def split_url(channel: str) -> str:
@@ -65,7 +50,7 @@ def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any
     return WebSocketServerBus(channel, options, **more)
 
 
-class WebSocketBus(SerialBus):
+class WebSocketBus(ServerBus):
     """A connection to a websocket server. Its name is ``websocket:ws://HOST:PORT/PATH?key=value``.
 
     A framing finds frames in its messages, each of which ends with an end of line (those within it become spaces).
@@ -74,7 +59,7 @@ class WebSocketBus(SerialBus):
 
     Args:
         channel: the URL.
-        options: see :class:`WebSocketOptions`.
+        options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
         payload_size: longest body that fits into a batch.
         listen_only: makes no difference: nothing is ever sent.
 
@@ -87,28 +72,16 @@ class WebSocketBus(SerialBus):
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         _need_package(self.name)
-        self._options = options_from_strings(WebSocketOptions, options or {})
         self._address = parse_address("ws", split_url(channel), default_port=_HTTP)
         self._web: WebSocketPort | None = None
-        self._heard_ns = 0
         self._unusable = 0
 
     @property
     def name(self) -> str:
         """As a user writes it."""
         return f"bus websocket:{self.channel}"
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has none."""
-        return 0
-
-    @property
-    def reads_natively(self) -> bool:
-        """No: the protocol is spoken in Python."""
-        return False
 
     def open(self) -> None:
         """Connect; a message that came with the server's greeting is read at once.
@@ -117,7 +90,6 @@ class WebSocketBus(SerialBus):
             BusNotAvailable: nobody answers there, or no websocket server.
         """
         super().open()
-        self._heard_ns = now_ns()
         self._stay_readable(self._web is not None and self._web.waiting > 0)
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
@@ -143,26 +115,6 @@ class WebSocketBus(SerialBus):
         self._stay_readable(more or not batch.free)
         return taken
 
-    def check(self) -> None:
-        """Whether the server still says something.
-
-        Raises:
-            BusNotAvailable: it has not for too long.
-        """
-        super().check()
-        silence_s = self._options.silence_s
-        if self._port is not None and silence_s and now_ns() - self._heard_ns > silence_s * NS_PER_S:
-            raise BusNotAvailable(f"{self.name}: connected, but no message for {silence_s:g} s; connecting anew")
-
-    def send(self, identifier: int, payload: bytes) -> None:
-        """Refuse: a server is only read.
-
-        Raises:
-            BusSendError: always.
-        """
-        self.counters.send_failures += 1
-        raise BusSendError(f"{self.name} is only read ({identifier:#x}, {len(payload)} bytes)")
-
     def _open_port(self) -> Port:
         from skinware_drivers.streams.websocket_port import WebSocketPort
 
@@ -172,8 +124,7 @@ class WebSocketBus(SerialBus):
     def _read(self, port: Port) -> None:
         """One message."""
         if message := port.read(0):
-            self._heard_ns = now_ns()
-            self._hear(message, self._heard_ns)
+            self._hear(message, now_ns())
 
     def _count_unusable(self) -> None:
         if self._web is None or not self._web.unusable:
@@ -185,4 +136,4 @@ class WebSocketBus(SerialBus):
         self._unusable += 1
 
 
-__all__ = ["WebSocketBus", "WebSocketOptions", "split_url"]
+__all__ = ["WebSocketBus", "split_url"]

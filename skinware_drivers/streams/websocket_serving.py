@@ -13,8 +13,9 @@ from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.streams.address import Address, parse_address
+from skinware_drivers.streams.bus import ServerOptions
 from skinware_drivers.streams.tcp import ListeningPort
-from skinware_drivers.streams.websocket import WebSocketOptions, split_url
+from skinware_drivers.streams.websocket import split_url
 
 _MOST_UNSENT = 1 << 20
 """Bytes that a caller may be behind; what is sent to one that is further behind is for nobody."""
@@ -87,7 +88,7 @@ class WebSocketServerBus(SerialBus):
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(WebSocketOptions, options or {})
+        self._options = options_from_strings(ServerOptions, options or {})
         self._address = parse_address(self.scheme, split_url(channel), needs_host=False)
 
     @property

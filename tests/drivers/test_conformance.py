@@ -35,6 +35,7 @@ from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.streams.icub_eth import IcubEthDriver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
+from skinware_drivers.streams.yarp import YarpDriver
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
 from skinware_drivers.virtual.devices.agni import EmulatedAgni
@@ -63,6 +64,7 @@ from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela
 from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer
+from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -272,6 +274,22 @@ class TestXelaServerCounts(DriverConformance):
     driver = XelaServerDriver
     emulator = EmulatedXelaServer
     emulator_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3), "model": "uSCuAH", "calibrated": False}
+
+
+class TestYarp(DriverConformance):
+    driver = YarpDriver
+    emulator = EmulatedYarp
+    emulator_options: ClassVar[Mapping[str, Any]] = {"length": 41, "envelope": False}
+
+
+class TestYarpOfARobotsFiles(DriverConformance):
+    driver = YarpDriver
+    emulator = EmulatedYarp
+    driver_options: ClassVar[Mapping[str, Any]] = {
+        "length": 48,
+        "triangles": [{"board": 7, "first": 0, "triangles": [0, 1, 2, 3], "kind": "fingertip"}],
+    }
+    emulator_options: ClassVar[Mapping[str, Any]] = {"length": 48}
 
 
 class TestIcubEth(DriverConformance):

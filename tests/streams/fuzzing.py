@@ -19,10 +19,12 @@ from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _
 from skinware_drivers.streams.icub_rops import rops
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.streams.xela_messages import XelaMessages
+from skinware_drivers.streams.yarp_text import YarpText
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
 from skinware_drivers.virtual.devices.xela_server import EmulatedXelaServer, EmulatedXelaServerOptions
+from skinware_drivers.virtual.devices.yarp import EmulatedYarp, EmulatedYarpOptions
 from tests.serial.spoken import Spoken
 
 _ROWS = 64
@@ -41,6 +43,11 @@ def _xela() -> tuple[Framing, list[bytes]]:
     return XelaMessages(), server.answers(b"", 100)
 
 
+def _yarp() -> tuple[Framing, list[bytes]]:
+    port = Spoken(EmulatedYarp(EmulatedYarpOptions(length=96)))
+    return YarpText(96, tuple((number, 12 * number) for number in range(8))), port.answers(b"", 500)
+
+
 def _icub() -> tuple[Framing, list[bytes]]:
     return rops(1), Spoken(EmulatedIcubEth(EmulatedIcubEthOptions(boards=(1, 7)))).answers(b"", 500)
 
@@ -56,6 +63,7 @@ def _dsa() -> tuple[Framing, list[bytes]]:
 DEVICES: dict[str, Callable[[], tuple[Framing, list[bytes]]]] = {
     "tesollo": _tesollo,
     "xela_server": _xela,
+    "yarp": _yarp,
     "icub_eth": _icub,
     "weiss_dsa": _dsa,
 }

@@ -1,0 +1,173 @@
+"""A port of a robot that runs YARP as a bus that is only read: found by its name, listened to in the text carrier.
+
+The port never waits for us. What has come is read whenever the loop comes round, as much as there is; if more has piled
+up than is read at once otherwise, because this machine was held up, only the newest message of it is used, and the
+others are counted as lost.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.realtime import now_ns
+from skinware.status import BusReason
+from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server, is_port_name
+from skinware_drivers.bus import Bus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.serial.stream import CHUNK
+from skinware_drivers.streams.address import Address, parse_address
+from skinware_drivers.streams.bus import ServerBus
+from skinware_drivers.streams.tcp import TcpPort, connect
+from skinware_drivers.streams.yarp_text import LONGEST_LINE
+
+_ROOM = 1 << 20
+"""Wanted of the kernel, for what comes while this machine is held up."""
+_PILE = 1 << 20
+_MOST_PILES = 8
+_LINES_OF_A_MESSAGE = 2
+_CARRIERS = ("tcp", "fast_tcp", "text", "text_ack")
+"""As what ports register that can be called by TCP."""
+
+
+def split_channel(channel: str) -> tuple[Address | None, str]:
+    """Name server, None if it is not given, and port of ``HOST:PORT/NAME``.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    place, slash, name = channel.partition("/")
+    if not is_port_name(slash + name):
+        raise ConfigurationError(
+            f"bus yarp://{channel}: which port? Write yarp://HOST:PORT/NAME with the name server's host and port, as"
+            " yarp://192.168.1.10:10000/icub/skin/left_hand_comp, or yarp:///NAME"
+        )
+    return parse_address("yarp", place, default_port=DEFAULT_PORT) if place else None, slash + name
+
+
+def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
+    """A name server with one port; see :class:`skinware_drivers.streams.yarp_serving.YarpServerBus`."""
+    from skinware_drivers.streams.yarp_serving import YarpServerBus
+
+    return YarpServerBus(channel, options, **more)
+
+
+class YarpPort(TcpPort):
+    """A connection to a port. Gives whole messages: each a line that says so, and a line with what it is.
+
+    Attributes:
+        passed_over: messages that were not used as newer ones had come already.
+    """
+
+    def __init__(self, name: str, address: Address, patience_s: int) -> None:
+        connection = connect(address)
+        try:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
+            super().__init__(name, connection, patience_s)
+            connection.sendall(f"CONNECT {WHO}\nr\n".encode())  # a few bytes into an empty buffer
+        except OSError as error:
+            connection.close()
+            raise BusNotAvailable(f"{name}: the port has hung up ({error.strerror or error})") from None
+        self._rest = b""
+        self.passed_over = 0
+
+    def read(self, size: int) -> bytes:  # noqa: ARG002
+        """The messages that have come, at most about 64 KiB; what is no message is given too, once it is a line.
+
+        Raises:
+            BusNotAvailable: the port is gone.
+        """
+        pile = self._rest
+        for _ in range(_MOST_PILES):
+            more = super().read(_PILE)
+            pile = self._newest(pile + more)
+            if len(more) < _PILE:
+                break
+        whole, self._rest = _whole_messages(pile)
+        if len(self._rest) > LONGEST_LINE:  # whoever counts lines is to know of it
+            whole, self._rest = pile, b""
+        return whole
+
+    def _newest(self, pile: bytes) -> bytes:
+        """Of more than can be used at once, the newest whole message and what follows."""
+        if len(pile) <= CHUNK:
+            return pile
+        whole, rest = _whole_messages(pile)
+        at = _last_head(whole)
+        if at < 0:
+            return pile[-2 * CHUNK :]  # of no message, it does not matter what it is
+        self.passed_over += whole.count(b"\n", 0, at) // _LINES_OF_A_MESSAGE
+        return whole[max(0, at - 1) :] + rest  # with the end of the line before, which may be known in part
+
+
+class YarpBus(ServerBus):
+    """A port of a robot. Its name is ``yarp://HOST:PORT/NAME?key=value``, with host and port of the name server.
+
+    ``yarp:///NAME`` asks the name server that YARP's own programs use. The port is looked up whenever it is connected
+    to, so that a robot whose programs were restarted is found again.
+
+    Args:
+        channel: ``HOST:PORT/NAME`` or ``/NAME``.
+        options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
+        payload_size: longest body that fits into a batch.
+        listen_only: makes no difference: nothing is sent but what asks the port to speak.
+
+    Raises:
+        ConfigurationError: no such name, or an option is unknown or has a bad value.
+    """
+
+    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self._server, self._name = split_channel(channel)
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus yarp://{self.channel}"
+
+    def _open_port(self) -> Port:
+        server = NameServer(*(self._server or configured_server()))
+        try:
+            contact = server.query(self._name)
+        except OSError as error:
+            raise BusNotAvailable(f"{self.name}: {error}") from None
+        if contact is None:
+            raise BusNotAvailable(f"{self.name}: {server} knows no port {self._name}: does the robot's program run?")
+        if contact.carrier not in _CARRIERS:
+            raise BusNotAvailable(
+                f"{self.name}: the port is called by {contact.carrier}, not by tcp", reason=BusReason.FAILED
+            )
+        return YarpPort(f"yarp://{self.channel}", Address(contact.host, contact.port), self._options.patience_s)
+
+    def _read(self, port: Port) -> None:
+        if messages := port.read(CHUNK):
+            time_ns = now_ns()
+            for start in range(0, len(messages), CHUNK):
+                self._hear(messages[start : start + CHUNK], time_ns)
+        if isinstance(port, YarpPort):
+            self.counters.lost += port.passed_over
+            port.passed_over = 0
+
+
+def _last_head(text: bytes) -> int:
+    """Where the last line begins that says that a message follows; -1: nowhere."""
+    at = max(text.rfind(b"\nd"), text.rfind(b"\nD"))
+    return at + 1 if at >= 0 else (0 if text[:1] in (b"d", b"D") else -1)
+
+
+def _whole_messages(pile: bytes) -> tuple[bytes, bytes]:
+    """What can be used now, and what has to wait for its end."""
+    at = _last_head(pile)
+    if at >= 0 and pile.count(b"\n", at) < _LINES_OF_A_MESSAGE:
+        return pile[:at], pile[at:]
+    end = pile.rfind(b"\n") + 1
+    return pile[:end], pile[end:]
+
+
+__all__ = ["YarpBus", "YarpPort", "split_channel"]

@@ -1,0 +1,1 @@
+"""YARP: ports that are read, and ports that are served."""

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
@@ -72,14 +73,16 @@ class Running:
 
     def wait_for(self, event: str, condition: Callable[[dict[str, Any]], bool] = lambda _found: True) -> dict[str, Any]:
         """The next event of a kind that fulfils a condition."""
-        for _ in range(500):
+        others, end = 0, time.monotonic() + PATIENCE_S
+        while (left_s := end - time.monotonic()) > 0:
             try:
-                found = self._events.get(timeout=PATIENCE_S)
+                found = self._events.get(timeout=left_s)
             except queue.Empty:
-                raise AssertionError(f"no event {event!r}; stderr: {self.errors}") from None
+                break
             if found["event"] == event and condition(found):
                 return found
-        raise AssertionError(f"no event {event!r} of 500 fulfils the condition {condition}")
+            others += 1
+        raise AssertionError(f"no event {event!r} as {condition} wants it, of {others}; stderr: {self.errors}")
 
     def stop(self, number: int = signal.SIGINT) -> dict[str, Any]:
         """Interrupt it; its last event, if it had the time to say one."""
@@ -98,7 +101,8 @@ class Running:
 
     def _read_events(self, stream: IO[str]) -> None:
         for line in stream:
-            self._events.put(json.loads(line))
+            if line.endswith("\n"):  # one that was killed may leave half a line
+                self._events.put(json.loads(line))
 
     def _read_errors(self, stream: IO[str]) -> None:
         self._errors.extend(stream)

@@ -23,6 +23,11 @@ def pyarrow() -> Any:
     return _package("pyarrow", "Parquet")
 
 
+def pillow() -> Any:
+    """The module ``PIL.Image``; likewise."""
+    return _package("PIL.Image", "a data set with images")
+
+
 def _package(name: str, what: str) -> Any:
     try:
         return import_module(name)

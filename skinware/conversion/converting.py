@@ -60,11 +60,13 @@ class Converted:
         path: of the new file or folder.
         frames: of each table in it.
         notes: what is wrong with the old file, and what is not in the new one; a line each.
+        episodes: of a learning set; None: it is none.
     """
 
     path: Path
     frames: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
+    episodes: int | None = None
 
 
 def convert(
@@ -99,7 +101,7 @@ def convert(
     with contextlib.closing(opened(path, start_s, end_s)) as whole:
         if not whole.tables:
             raise BadRecording(f"{path}: no frames in it that can be used")
-        source = _Watched((selection or Selection()).of(whole), is_stopped)
+        source = Watched((selection or Selection()).of(whole), is_stopped)
         with begun_beside(target) as begun:
             form.write(source, begun)
             if not source.frames.total():
@@ -159,7 +161,7 @@ def begun_beside(target: Path) -> Iterator[Path]:
         raise
 
 
-class _Watched(DerivedSource):
+class Watched(DerivedSource):
     """A source whose frames are counted as they are written, until somebody stops that."""
 
     def __init__(self, source: Source, is_stopped: Callable[[], bool]) -> None:

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from skinware.cli._command import exit_status
-from skinware.cli.convert import _FORMATS, _WIRE_FORMATS
+from skinware.cli._learning import _NAMES
+from skinware.cli.convert import _FORMATS, _LEARNING_FORMATS, _WIRE_FORMATS
 from skinware.cli.convert import command as convert
 from skinware.conversion import FORMATS, WIRE_FORMATS
+from skinware.conversion.learning import LEARNING_FORMATS
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
 from tests.commands import BIN, PATIENCE_S
@@ -65,6 +67,17 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "npz", "--region", "palm"], 2, "regions.toml"),
         (["walk.mcap", "--to", "npz", "--regions", "r.toml"], 2, "say which with --region"),
         (["walk.mcap", "--to", "npz", "--start", "9"], 2, "nothing was recorded of what was asked for in that time"),
+        (["walk.mcap", "--to", "npz", "--fps", "30"], 2, "--fps is for --to lerobot"),
+        (["walk.mcap", "--to", "npz", "--each-structure"], 2, "--each-structure is for --to lerobot"),
+        (["walk.mcap", "--to", "lerobot", "--fps", "0"], 2, "0 is not in the range"),
+        (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of frames, nor all"),
+        (["walk.mcap", "--to", "lerobot", "--episode", "2..1"], 2, "is not START..END in seconds"),
+        (["walk.mcap", "--to", "lerobot", "--episode", "7..8"], 2, "no time in the episode 7..8 has everything"),
+        (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 1, "no.csv: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--join", "action=no.csv"], 1, "no.csv: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--also", "no.mcap"], 1, "no.mcap: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--start", "9"], 2, "no frames of a driver are in it"),
+        (["walk.mcap", "--to", "lerobot", "-o", "walk.mcap"], 1, "walk.mcap: exists already: give another name"),
     ],
 )
 def test_mistakes_are_one_line(
@@ -84,7 +97,7 @@ def test_mistakes_are_one_line(
     assert file.read_bytes() == before
 
 
-@pytest.mark.parametrize("format_name", ["csv", "npz"])
+@pytest.mark.parametrize("format_name", ["csv", "npz", "lerobot"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, number: int) -> None:
     file, out = tmp_path / "long.mcap", tmp_path / "out"
@@ -99,7 +112,7 @@ def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, num
     assert list(tmp_path.iterdir()) == [file]
 
 
-@pytest.mark.parametrize("format_name", sorted(FORMATS))
+@pytest.mark.parametrize("format_name", sorted([*FORMATS, *LEARNING_FORMATS]))
 def test_no_room_is_one_line_and_leaves_nothing(file: Path, tmp_path: Path, format_name: str) -> None:
     done = subprocess.run(
         [BIN / "skin-convert", file, "--to", format_name, "-o", "out"],
@@ -136,7 +149,7 @@ def test_no_permission_is_one_line(file: Path, tmp_path: Path) -> None:
         assert len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize(("package", "format_name"), [("h5py", "hdf5"), ("pyarrow", "parquet")])
+@pytest.mark.parametrize(("package", "format_name"), [("h5py", "hdf5"), ("pyarrow", "parquet"), ("pyarrow", "lerobot")])
 def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: str, format_name: str) -> None:
     code = f"import sys; sys.modules[{package!r}] = None\nfrom skinware.cli.convert import main; main()"
     command = [sys.executable, "-c", code, str(file), "--to", format_name]
@@ -146,6 +159,28 @@ def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: st
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_learning_set_for_people_and_programs(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    episodes = ["--episode", "0..0.5", "--episode", "0.6..0.8"]
+    assert exit_status(convert, [str(file), "--to", "lerobot", "--fps", "10", *episodes]) == 0
+    assert capsys.readouterr().out == "walk-lerobot: 7 frames of torso in 2 episodes\n"
+    assert json.loads(Path("walk-lerobot/meta/info.json").read_text())["fps"] == 10
+    Path("joints.csv").write_text("time_s,hip,knee\n" + "".join(f"{n / 10},{n},{-n}\n" for n in range(10)))
+    options = ["--window", "all", "--task", "walk", "--join", "action=joints.csv:knee", "--match", "nearest"]
+    assert exit_status(convert, [str(file), "--to", "lerobot", "-o", "set", "--fps", "10", "--json", *options]) == 0
+    told = {"file": "set", "format": "lerobot", "frames": {"torso": 10}, "episodes": 1, "notes": []}
+    assert json.loads(capsys.readouterr().out) == {"event": "converted", **told}
+    info = json.loads(Path("set/meta/info.json").read_text())
+    assert info["features"]["observation.tactile.torso.pressure"]["shape"] == [10, 40]
+    assert info["features"]["action"] == {"dtype": "float32", "shape": [1], "names": ["knee"]}
+
+
+def test_all_options_of_learning_sets_are_known_as_such() -> None:
+    others = ["names", "format_name", "output", "types", "patches", "in_regions", "region_files"]
+    names = {each.name for each in convert.params} - {*others, "file", "start_s", "end_s", "as_json", "version"}
+    assert names == set(_NAMES)
+
+
 def test_it_offers_what_there_is() -> None:
+    assert set(_LEARNING_FORMATS) == set(LEARNING_FORMATS)
     assert set(_FORMATS) == set(FORMATS)
     assert set(_WIRE_FORMATS) == set(WIRE_FORMATS)

@@ -295,7 +295,8 @@ def test_a_recording(printing: Print, tmp_path: Path) -> None:
             status = record.wait_for("status", lambda status: bool(status["messages"]))
             check("`skin-record`", ready, status, record.stop())
     check("`skin-recover`", *printing(recover, str(file)))
-    check("`skin-convert`", *printing(convert, str(file), "--to", "csv"))
+    converted = [*printing(convert, str(file), "--to", "csv"), *printing(convert, str(file), "--to", "lerobot")]
+    check("`skin-convert`", *converted)
     check("`skin-replay`", *printing(replay, str(file), "--speed", "2"))
     wire = tmp_path / "wire.mcap"
     write_recording(wire, lambda taps: keep(taps, "torso", "can0", ON_VCAN1))

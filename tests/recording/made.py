@@ -41,6 +41,7 @@ class MadeTable(Table):
         n: frames.
         rate_hz: of the frames.
         rows: in a block.
+        numbers: (n,) of the frames, each a period after the one before; what is left out was lost. Default: 0 to n.
     """
 
     def __init__(
@@ -50,9 +51,11 @@ class MadeTable(Table):
         n: int,
         rate_hz: float = 100.0,
         rows: int = 7,
+        numbers: npt.ArrayLike | None = None,
     ) -> None:
         super().__init__(generation.name, generation.name, [generation])
         self.columns, self.n, self._period_ns, self._rows = columns, n, round(1e9 / rate_hz), rows
+        self._numbers: npt.NDArray[np.int64] = np.arange(n) if numbers is None else np.asarray(numbers, np.int64)
 
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
         for first in range(0, self.n, self._rows):
@@ -65,7 +68,7 @@ class MadeTable(Table):
             begin = {"time_ns": START_NS, "generation": self.origin.generation, "flags": 0}.get(name[7:], 1 << 40)
             step = {"generation": 0, "flags": 0, "sequence": 1}.get(name[7:], self._period_ns)
             begin = 1 if name.endswith("sequence") else begin
-            return (begin + step * numbers).astype(OF_FRAMES[name])
+            return (begin + step * self._numbers[numbers]).astype(OF_FRAMES[name])
         shape, dtype = self.arrays[name]
         column = self.columns.get(name.removeprefix(COLUMNS))
         return np.zeros((len(numbers), *shape), dtype) if column is None else column[numbers]

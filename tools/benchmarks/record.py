@@ -1,7 +1,7 @@
 """Recording: what it costs, how large it is, what it loses, and what a killed recorder leaves; as people start it.
 
 tools/bench record [cost|kills|convert|losses] [--viewers] [--seconds S] [--kills N] [--minutes M] [--busy N]
-                    [--slots N] [--sensors N ...] [--pattern NAME ...]
+                    [--slots N] [--sensors N ...] [--pattern NAME ...] [--formats NAME ...]
 """
 
 from __future__ import annotations
@@ -40,6 +40,10 @@ BIN = Path(sys.executable).parent
 RATE_HZ = 100
 SMALL, LARGE = 768, 30_848
 PATTERNS = ("analogue", "quiet")
+FORMAT_OPTIONS = {name: [name] for name in FORMATS} | {
+    "lerobot": ["lerobot", "--fps", "30"],
+    "lerobot-windows": ["lerobot", "--fps", "30", "--window", "all"],
+}
 PER_MODULE, PER_PATCH = 16, 16
 NOISE = 2.0
 SHARE = 0.05
@@ -310,7 +314,7 @@ def losses(minutes: float, n_busy: int, slots: int | None, skins: list[int], pat
             file.unlink()
 
 
-def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
+def convert(seconds: float, skins: list[int], patterns: list[str], formats: list[str], folder: Path) -> None:
     """How long a conversion takes, how large its result is, and how much memory it had."""
     for sensors in skins:
         for pattern in patterns:
@@ -321,11 +325,11 @@ def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path)
             with skinware.recording.open(file) as opened:
                 frames = len(opened["large"].read(["latency_ns"]))
             print(f"  {sensors:6} sensors, {pattern}: {frames} frames", flush=True)
-            for name in FORMATS:
+            for name in formats:
                 target = folder / f"converted-{name}"
                 begin_s = time.monotonic()
                 process = subprocess.Popen(
-                    [BIN / "skin-convert", file, "--to", name, "-o", target],
+                    [BIN / "skin-convert", file, "-o", target, "--to", *FORMAT_OPTIONS[name]],
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                 )
@@ -333,11 +337,11 @@ def convert(seconds: float, skins: list[int], patterns: list[str], folder: Path)
                 process.returncode = os.waitstatus_to_exitcode(status)
                 passed_s = time.monotonic() - begin_s
                 assert not process.returncode
-                files = [target] if target.is_file() else list(target.iterdir())
+                files = [target] if target.is_file() else [each for each in target.rglob("*") if each.is_file()]
                 size = sum(each.stat().st_size for each in files)
                 print(
-                    f"    {name:<8} {1e3 * passed_s / frames:7.2f} ms a frame, {size / frames / 1e3:7.1f} kB a frame,"
-                    f" at most {usage.ru_maxrss / 1024:.0f} MiB",
+                    f"    {name:<16} {1e3 * passed_s / frames:7.2f} ms a frame, {size / frames / 1e3:7.1f} kB a frame,"
+                    f" {60 * RATE_HZ * passed_s / frames:5.1f} s a minute, at most {usage.ru_maxrss / 1024:.0f} MiB",
                     flush=True,
                 )
                 shutil.rmtree(target) if target.is_dir() else target.unlink()
@@ -353,6 +357,7 @@ def main() -> None:
     parser.add_argument("--slots", type=int, metavar="N", help="of losses: of the driver's ring")
     parser.add_argument("--sensors", type=int, nargs="+", default=[LARGE, SMALL], metavar="N")
     parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
+    parser.add_argument("--formats", nargs="+", choices=FORMAT_OPTIONS, default=list(FORMAT_OPTIONS), help="of convert")
     parser.add_argument("--viewers", action="store_true", help="cost of a recorder with --viewers")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -362,7 +367,7 @@ def main() -> None:
         if options.what in (None, "kills"):
             kills(options.kills, options.sensors, Path(folder))
         if options.what in (None, "convert"):
-            convert(options.seconds, options.sensors, options.pattern, Path(folder))
+            convert(options.seconds, options.sensors, options.pattern, options.formats, Path(folder))
         if options.what == "losses":
             skins, patterns = options.sensors, options.pattern
             losses(options.minutes, options.busy, options.slots, skins, patterns, Path(folder))

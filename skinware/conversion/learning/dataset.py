@@ -1,0 +1,284 @@
+"""LeRobot's dataset format v3.0, written by pyarrow alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.conversion._packages import pyarrow
+from skinware.conversion.learning.features import IMAGE, Batch, Feature, pixel_count, pixels_of
+from skinware.conversion.learning.statistics import TOLD, Moments, Statistics
+
+VERSION = "v3.0"
+_CHUNK_FILES, _FILE_MB, _VIDEO_MB = 1000, 100, 200
+_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_OF_ALL = {
+    "timestamp": Feature("float32", (1,)),
+    "frame_index": Feature("int64", (1,)),
+    "episode_index": Feature("int64", (1,)),
+    "index": Feature("int64", (1,)),
+    "task_index": Feature("int64", (1,)),
+}
+_SET_SAMPLE_BYTES, _EPISODE_SAMPLE_BYTES = 64 << 20, 16 << 20
+_IMAGES = 100
+"""How many images of an episode its statistics are of, at most."""
+
+
+class DatasetWriter:
+    """A dataset that is written episode by episode.
+
+    Args:
+        folder: in which it is made; there is none yet.
+        fps: rows a second.
+        features: of a row, by name, besides those that all datasets have.
+        lengths: rows of each episode that there will be.
+
+    Raises:
+        MissingExtra: pyarrow is not installed.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, folder: Path, fps: int, features: Mapping[str, Feature], lengths: Sequence[int]) -> None:
+        self._arrow = pyarrow()
+        self._folder, self._fps = folder, fps
+        self._features: dict[str, Feature] = {**features, **_OF_ALL}
+        (folder / "meta").mkdir(parents=True)
+        schema = self._arrow.schema([(name, _type(self._arrow, each)) for name, each in self._features.items()])
+        self._data = _Files(folder / "data", schema)
+        self._episodes = _Files(folder / "meta" / "episodes", self._episode_schema())
+        self._tasks: dict[str, int] = {}
+        self._rows = self._count = 0
+        self._whole = _FeatureStatistics(self._features, lengths, _SET_SAMPLE_BYTES)
+
+    def add_episode(self, task: str, length: int, batches: Iterable[Batch]) -> None:
+        """Write an episode.
+
+        Args:
+            task: what is done in it.
+            length: its rows.
+            batches: these, some at a time.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        place = self._data.next_place()
+        task_index = self._tasks.setdefault(task, len(self._tasks))
+        statistics = _FeatureStatistics(self._features, [length], _EPISODE_SAMPLE_BYTES)
+        done = 0
+        for batch in batches:
+            count = len(next(iter(batch.values())))
+            number = np.arange(done, done + count)
+            rows = batch | {
+                "timestamp": (number / self._fps).astype(np.float32)[:, np.newaxis],
+                "frame_index": number[:, np.newaxis],
+                "episode_index": np.full((count, 1), self._count),
+                "index": self._rows + number[:, np.newaxis],
+                "task_index": np.full((count, 1), task_index),
+            }
+            arrays = [_column(self._arrow, each, rows[name]) for name, each in self._features.items()]
+            self._data.write(arrays)
+            for name, numbers in self._numbers(rows, number, length):
+                moments = Moments.of(numbers)
+                statistics.add(name, numbers, moments)
+                self._whole.add(name, numbers, moments)
+            done += count
+        self._write_episode(task, done, place, statistics.told())
+        self._rows, self._count = self._rows + done, self._count + 1
+
+    def close(self) -> None:
+        """Close its files, complete or not. Idempotent."""
+        self._data.close()
+        self._episodes.close()
+
+    def finish(self) -> None:
+        """Write what is told of the whole.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.close()
+        meta = self._folder / "meta"
+        _write_tasks(self._arrow, self._tasks, meta / "tasks.parquet")
+        with (meta / "stats.json").open("w", encoding="utf-8") as stream:
+            told = self._whole.told()
+            json.dump({name: {what: each.tolist() for what, each in of.items()} for name, of in told.items()}, stream)
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": None,
+            "total_episodes": self._count,
+            "total_frames": self._rows,
+            "total_tasks": len(self._tasks),
+            "chunks_size": _CHUNK_FILES,
+            "data_files_size_in_mb": _FILE_MB,
+            "video_files_size_in_mb": _VIDEO_MB,
+            "fps": self._fps,
+            "splits": {"train": f"0:{self._count}"},
+            "data_path": f"data/{_PLACE}",
+            "video_path": None,
+            "features": {
+                name: {"dtype": each.dtype, "shape": list(each.shape), "names": each.names and list(each.names)}
+                for name, each in self._features.items()
+            },
+        }
+        (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
+
+    def _numbers(
+        self, rows: Batch, number: npt.NDArray[np.int64], length: int
+    ) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+        """Of what statistics are told, by feature: the numbers of all rows, and pixels of some images."""
+        for name, each in self._features.items():
+            if each.dtype != IMAGE:
+                yield name, rows[name]
+                continue
+            chosen = rows[name][number % _image_step(length) == 0]
+            if len(chosen):
+                yield name, np.concatenate([pixels_of(png) for png in chosen])
+
+    def _episode_schema(self) -> Any:
+        arrow = self._arrow
+        integers = ("dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
+        fields = [("episode_index", arrow.int64()), ("tasks", arrow.list_(arrow.string())), ("length", arrow.int64())]
+        fields += [(name, arrow.int64()) for name in integers]
+        for name, each in self._features.items():
+            depth = 3 if each.dtype == IMAGE else len(each.shape)
+            for what in TOLD:
+                item, nested = (arrow.int64(), 1) if what == "count" else (arrow.float64(), depth)
+                for _ in range(nested):
+                    item = arrow.list_(item)
+                fields.append((f"stats/{name}/{what}", item))
+        fields += [(f"meta/episodes/{name}", arrow.int64()) for name in ("chunk_index", "file_index")]
+        return arrow.schema(fields)
+
+    def _write_episode(
+        self, task: str, length: int, place: Mapping[str, int], statistics: Mapping[str, Mapping[str, Any]]
+    ) -> None:
+        own = self._episodes.next_place()
+        row = {
+            "episode_index": self._count,
+            "tasks": [task],
+            "length": length,
+            "dataset_from_index": self._rows,
+            "dataset_to_index": self._rows + length,
+            **{f"data/{name}": number for name, number in place.items()},
+            **{f"stats/{name}/{what}": each.tolist() for name, of in statistics.items() for what, each in of.items()},
+            **{f"meta/episodes/{name}": number for name, number in own.items()},
+        }
+        schema = self._episodes.schema
+        self._episodes.write([self._arrow.array([row[field.name]], field.type) for field in schema])
+
+
+class _Files:
+    """Parquet files of one schema in folders of many: a new one when the last is large."""
+
+    def __init__(self, folder: Path, schema: Any) -> None:
+        self._folder, self.schema = folder, schema
+        self._number, self._writer, self._path = -1, None, folder
+
+    def next_place(self) -> dict[str, int]:
+        """Where the next rows go that belong together: number of the folder, and of the file in it."""
+        if self._writer is None or self._path.stat().st_size > _FILE_MB << 20:
+            self.close()
+            self._number += 1
+            self._path = self._folder / _PLACE.format(**self._place)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pyarrow().parquet.ParquetWriter(self._path, self.schema, compression="zstd")
+        return self._place
+
+    def write(self, arrays: Sequence[Any]) -> None:
+        """Some rows."""
+        table = pyarrow().Table.from_arrays(list(arrays), schema=self.schema)
+        assert self._writer is not None  # noqa: S101, there is a place for them
+        self._writer.write_table(table, row_group_size=len(table))
+
+    def close(self) -> None:
+        """Complete the last file. Idempotent."""
+        if self._writer is not None:
+            writer, self._writer = self._writer, None
+            writer.close()
+
+    @property
+    def _place(self) -> dict[str, int]:
+        chunk, file = divmod(self._number, _CHUNK_FILES)
+        return {"chunk_index": chunk, "file_index": file}
+
+
+class _FeatureStatistics:
+    """Of all features of some rows.
+
+    Args:
+        features: by name.
+        lengths: of the episodes that will be shown.
+        most_bytes: of the rows that quantiles of a feature are taken of.
+    """
+
+    def __init__(self, features: Mapping[str, Feature], lengths: Sequence[int], most_bytes: int) -> None:
+        self._of: dict[str, Statistics] = {}
+        for name, each in features.items():
+            if each.dtype == IMAGE:
+                images = sum(len(range(0, length, _image_step(length))) for length in lengths)
+                pixels = pixel_count(each.shape)
+                self._of[name] = Statistics((3, 1, 1), np.float32, images * pixels, most_bytes, pixels)
+            else:
+                self._of[name] = Statistics(each.shape, each.dtype, sum(lengths), most_bytes)
+
+    def add(self, name: str, rows: npt.NDArray[Any], moments: Moments) -> None:
+        """Rows of a feature; of images pixels."""
+        self._of[name].add(rows, moments)
+
+    def told(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """By feature."""
+        return {name: each.told() for name, each in self._of.items()}
+
+
+def _image_step(length: int) -> int:
+    """Of how many images of an episode one is looked at."""
+    return max(1, -(-length // _IMAGES))
+
+
+def _type(arrow: Any, feature: Feature) -> Any:
+    """Of a column, as LeRobot's reader expects it."""
+    if feature.dtype == IMAGE:
+        return arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
+    item = arrow.from_numpy_dtype(np.dtype(feature.dtype))
+    if feature.shape == (1,):
+        return item
+    if len(feature.shape) == 1:
+        return arrow.list_(item, feature.shape[0])
+    return arrow.list_(arrow.list_(item))
+
+
+def _column(arrow: Any, feature: Feature, rows: npt.NDArray[Any]) -> Any:
+    """Rows of a feature as a column."""
+    kind = _type(arrow, feature)
+    if feature.dtype == IMAGE:
+        return arrow.array([{"bytes": png, "path": None} for png in rows], kind)
+    items = arrow.array(np.ascontiguousarray(rows).reshape(-1))
+    if feature.shape == (1,):
+        return items
+    if len(feature.shape) == 1:
+        return arrow.FixedSizeListArray.from_arrays(items, type=kind)
+    per_row, per_list = feature.shape
+    lists = arrow.ListArray.from_arrays(np.arange(len(rows) * per_row + 1, dtype=np.int32) * per_list, items)
+    return arrow.ListArray.from_arrays(np.arange(len(rows) + 1, dtype=np.int32) * per_row, lists)
+
+
+def _write_tasks(arrow: Any, tasks: Mapping[str, int], path: Path) -> None:
+    """Tasks by their text, as pandas keeps a table whose index that is."""
+    table = arrow.table(
+        {"task_index": arrow.array(list(tasks.values()), arrow.int64()), "task": arrow.array(list(tasks))}
+    )
+    number = {"field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
+    text = {"field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [{"name": None, **text, "field_name": None, "metadata": {"encoding": "UTF-8"}}],
+        "columns": [{"name": each["field_name"], **each, "metadata": None} for each in (number, text)],
+        "creator": {"library": "pyarrow", "version": arrow.__version__},
+        "pandas_version": "2.0.0",
+    }
+    arrow.parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)

@@ -1,0 +1,245 @@
+"""Features of a learning set: what drivers felt, and what was joined, as arrays with a row for each of the set's."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.conversion._packages import pillow
+from skinware.conversion.learning.joined import Joined
+from skinware.conversion.tables import COLUMNS, TIME, Block, Table
+from skinware.errors import ConfigurationError
+from skinware.freshness import age_limit_ns
+from skinware.realtime import NS_PER_S
+from skinware.status import Status
+from skinware.structure import Structure
+
+MOST_NAMES = 4096
+"""Of sensors, in the description of a feature; the side file has them all."""
+IMAGE = "image"
+_PNG, _RGB = b"\x89PNG\r\n\x1a\n", (8, 2)
+_NEEDED = (COLUMNS + "values", COLUMNS + "status", COLUMNS + "module_time_ns", TIME)
+_MORE = ("frames/acquired_ns", "frames/published_ns")
+
+Batch = dict[str, npt.NDArray[Any]]
+"""Some rows of features, by name; of images PNG as bytes objects."""
+
+
+class Feature(NamedTuple):
+    """What a row of a feature is.
+
+    Attributes:
+        dtype: name of numpy's, or ``image``.
+        shape: of a row; (1,): one number.
+        names: of its numbers, or of its axes; None: not told.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: Sequence[str] | None = None
+
+
+class SkinFeatures:
+    """Features of a driver: of each type of its sensors values in its unit, and their status; the age of its frames.
+
+    Args:
+        service: name of the driver.
+        structure: of it.
+        sensor_names: of its sensors, in the order of its values.
+        window: of how many frames a row has the values, the oldest first.
+        period_ns: the driver's nominal period, 0 if it has none.
+    """
+
+    def __init__(
+        self, service: str, structure: Structure, sensor_names: Sequence[str], window: int, period_ns: int
+    ) -> None:
+        self._structure, self._window = structure, window
+        self._limit_ns = age_limit_ns(period_ns)
+        self._prefix = "observation.tactile." + service.replace("/", "_")
+        self._types = {
+            each.name: np.arange(structure.n_sensors)[structure.index(each.name)]
+            for each in structure.types
+            if len(structure.module_of(each.name))
+        }
+        self._names = sensor_names
+
+    @property
+    def descriptions(self) -> dict[str, Feature]:
+        """What they are, by name."""
+        described = {}
+        for type_name, positions in self._types.items():
+            shape: tuple[int, ...] = (len(positions),)
+            names = [self._names[position] for position in positions.tolist()] if len(positions) <= MOST_NAMES else None
+            if self._window > 1:
+                shape, names = (self._window, *shape), ["frame", "sensor"]
+            described[f"{self._prefix}.{type_name}"] = Feature("float32", shape, names)
+            described[f"{self._prefix}.{type_name}_status"] = Feature("uint8", shape, names)
+        return described | {f"{self._prefix}.age": Feature("float32", (self._window,))}
+
+    def rows(self, frames: Block, numbers: npt.NDArray[np.int64], rows_ns: npt.NDArray[np.int64]) -> Batch:
+        """Their values in t rows.
+
+        Args:
+            frames: some frames of the driver.
+            numbers: (t, window) which of these a row has, the newest last.
+            rows_ns: (t,) time of each row, wall clock.
+        """
+        late_ns = rows_ns - frames[TIME][numbers[:, -1]]
+        status = self._status(frames, numbers, late_ns)
+        batch: Batch = {}
+        for type_name, positions in self._types.items():
+            physical = self._structure.physical(frames[COLUMNS + "values"], type_name).astype(np.float32, copy=False)
+            batch[f"{self._prefix}.{type_name}"] = self._in_rows(physical[numbers])
+            batch[f"{self._prefix}.{type_name}_status"] = self._in_rows(status[..., positions])
+        acquired_ns, published_ns = frames["frames/acquired_ns"], frames["frames/published_ns"]
+        before_ns = np.where(acquired_ns > 0, published_ns - acquired_ns, 0)
+        age_ns = rows_ns[:, np.newaxis] - frames[TIME][numbers] + before_ns[numbers]
+        return batch | {f"{self._prefix}.age": (age_ns / NS_PER_S).astype(np.float32)}
+
+    def _status(
+        self, frames: Block, numbers: npt.NDArray[np.int64], late_ns: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.uint8]:
+        """(t, window, n) status, with what was too old by the time of the row.
+
+        Frames before the newest are judged as late as that one was: a driver that fell silent makes all of them stale.
+        """
+        time_ns = frames[COLUMNS + "module_time_ns"][numbers]  # (t, window, modules)
+        at_ns = frames["frames/published_ns"][numbers] + late_ns[:, np.newaxis]
+        is_old = (time_ns > 0) & (time_ns < at_ns[..., np.newaxis] - self._limit_ns)
+        status: npt.NDArray[np.uint8] = frames[COLUMNS + "status"][numbers]
+        if is_old.any():
+            status |= np.where(is_old[..., self._structure.sensor_module], np.uint8(Status.STALE), np.uint8(0))
+        return status
+
+    def _in_rows(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(t, window, n) as rows have it."""
+        return rows if self._window > 1 else rows[:, 0]
+
+
+class Frames:
+    """Frames of a driver by their number, taken from one pass over its table.
+
+    Args:
+        table: of the driver.
+        window: how many frames before the last one may be asked for again.
+    """
+
+    def __init__(self, table: Table, window: int) -> None:
+        self._blocks = table.blocks((*_NEEDED, *_MORE))
+        self._window = window
+        self._kept: list[tuple[int, Block]] = []
+        self._next = 0
+
+    def take(self, numbers: npt.NDArray[np.int64]) -> Block:
+        """The frames with some numbers, ascending; none but the last of a window is before the last of the take before.
+
+        Raises:
+            BadRecording, OSError: they cannot be read.
+        """
+        needed = int(numbers[-1]) - self._window + 1
+        parts: list[Block] = []
+        kept: list[tuple[int, Block]] = []
+        for first, block in self._until(int(numbers[-1])):
+            end = first + len(block[TIME])
+            inside = numbers[(numbers >= first) & (numbers < end)] - first
+            if len(inside):
+                parts.append({name: block[name][inside] for name in (*_NEEDED, *_MORE)})
+            if end > needed:
+                kept.append((first, block))
+        self._kept = kept
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def _until(self, last: int) -> Iterator[tuple[int, Block]]:
+        """The blocks that are kept, and those that come, up to the one with a frame."""
+        yield from self._kept
+        while self._next <= last:
+            block = next(self._blocks)
+            first, self._next = self._next, self._next + len(block[TIME])
+            yield first, block
+
+
+class JoinedFeature:
+    """A feature of what was joined.
+
+    Args:
+        joined: numbers or paths of images.
+
+    Raises:
+        ConfigurationError: the first image is not what is joined.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, joined: Joined) -> None:
+        self._joined, self.name = joined, joined.name
+        if joined.is_of_images:
+            width, height = _png_size(Path(joined.rows[0]))[1:]
+            self.description = Feature(IMAGE, (height, width, 3), ["height", "width", "channels"])
+        else:
+            self.description = Feature("float32", (joined.rows.shape[1],), joined.names)
+
+    def rows(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
+        """(t, n) float32; (t,) PNG as bytes objects.
+
+        Raises:
+            ConfigurationError: an image is not like the first.
+            OSError: it cannot be read.
+        """
+        chosen = self._joined.rows[numbers]
+        if self.description.dtype != IMAGE:
+            return chosen
+        images = np.empty(len(chosen), object)
+        for number, path in enumerate(chosen.tolist()):
+            images[number], width, height = _png_size(Path(path))
+            if (height, width) != self.description.shape[:2]:
+                raise ConfigurationError(f"{path}: {width} x {height}: not as large as the first image")
+        return images
+
+
+def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
+    """(pixels, 3, 1, 1) of an image, 0 to 1; of large ones some pixels, evenly.
+
+    Raises:
+        ConfigurationError: it is damaged.
+        MissingExtra: pillow is not installed.
+    """
+    image_module = pillow()
+    try:
+        with image_module.open(BytesIO(png)) as image:
+            pixels = np.asarray(image)
+    except (OSError, SyntaxError) as error:
+        raise ConfigurationError(f"a PNG file is damaged: {error}") from None
+    step = _pixel_step(pixels.shape)
+    chosen: npt.NDArray[np.float32] = pixels[::step, ::step].reshape(-1, 3, 1, 1).astype(np.float32)
+    return chosen / np.float32(255)
+
+
+def pixel_count(shape: tuple[int, ...]) -> int:
+    """How many pixels that gives of an image with a shape."""
+    step = _pixel_step(shape)
+    return -(-shape[0] // step) * -(-shape[1] // step)
+
+
+def _pixel_step(shape: tuple[int, ...]) -> int:
+    return max(1, min(shape[:2]) // 150)
+
+
+def joined_rows(features: Sequence[JoinedFeature], rows: Mapping[str, npt.NDArray[np.int64]], part: slice) -> Batch:
+    """Some rows of all that was joined."""
+    return {feature.name: feature.rows(rows[feature.name][part]) for feature in features}
+
+
+def _png_size(path: Path) -> tuple[bytes, int, int]:
+    """A PNG file, its width and height."""
+    data = path.read_bytes()
+    if data[:8] != _PNG or data[12:16] != b"IHDR" or tuple(data[24:26]) != _RGB:
+        raise ConfigurationError(f"{path}: images are joined as PNG files with 8 bits of red, green and blue")
+    if data[-8:-4] != b"IEND":
+        raise ConfigurationError(f"{path}: cut off")
+    width, height = struct.unpack(">II", data[16:24])
+    return data, width, height

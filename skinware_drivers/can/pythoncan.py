@@ -154,6 +154,7 @@ class PythonCanBus(Bus):
             data=payload,
             is_fd=len(payload) > 8,
         )
+        sent_ns = now_ns()  # not later than an answer
         try:
             bus.send(message, timeout=0)
         except Exception as error:  # noqa: BLE001  (see the class)
@@ -161,7 +162,7 @@ class PythonCanBus(Bus):
             raise BusSendError(f"bus {self.channel}: frame {identifier_text(identifier)} not sent ({error})") from None
         self.counters.sent += 1
         if self.tap.is_open:
-            self.tap.keep_frame(now_ns(), identifier, payload, is_sent=True)
+            self.tap.keep_frame(sent_ns, identifier, payload, is_sent=True)
 
     def close(self) -> None:
         """Stop taking messages and shut the interface down. Idempotent.

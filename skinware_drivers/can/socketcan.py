@@ -267,6 +267,7 @@ class SocketCanBus(KernelBus):
         """Send one frame; see :class:`skinware_drivers.bus.Bus`."""
         sock = self.may_send_by(self._socket)
         frame = _classic_frame(identifier, payload) if len(payload) <= 8 else self._fd_frame(identifier, payload)
+        sent_ns = now_ns()  # not later than an answer
         try:
             sock.send(frame)
         except OSError as error:
@@ -276,7 +277,7 @@ class SocketCanBus(KernelBus):
         self.counters.sent += 1
         if self.tap.is_open:
             flags = frame[_FLAGS_AT] if len(payload) > 8 else 0
-            self.tap.keep_frame(now_ns(), identifier, payload, flags=flags, is_sent=True)
+            self.tap.keep_frame(sent_ns, identifier, payload, flags=flags, is_sent=True)
 
     def _fd_frame(self, identifier: int, payload: bytes) -> bytes:
         """``struct canfd_frame``, filled up with zeros to the next length that CAN FD has."""

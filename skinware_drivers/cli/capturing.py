@@ -48,7 +48,11 @@ class Capture:
             text=True,
             start_new_session=True,  # Ctrl-C ends the driver first, and what that says at last is in the file
         )
-        begun = self._next()
+        try:
+            begun = self._next()
+        except BaseException:  # somebody does not want to wait for it
+            self.end()
+            raise
         if not begun.get("ready"):
             self.end()
             raise ConfigurationError(f"{path}: {begun.get('problem', 'nothing can be recorded')}")

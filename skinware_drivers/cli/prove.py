@@ -11,12 +11,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
@@ -29,7 +30,7 @@ from skinware.cli._command import (
     seconds,
     version_option,
 )
-from skinware.errors import ConfigurationError, DriverError
+from skinware.errors import ConfigurationError, DriverError, SkinwareError
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -50,6 +51,8 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
         "skin-prove hand --only index --only palm      only these modules",
         "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
         "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
+        "skin-prove --captured hand.mcap               without the device: does the driver still show what it did?",
+        "skin-prove --captured hand.mcap -- --driver ./my.py",
     ),
 )
 @click.argument("name", required=False)
@@ -71,6 +74,15 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     type=click.Path(path_type=Path),
     help="Write STEM.md, STEM.json and STEM.mcap.  [default: prove-DRIVER-DATE-TIME]",
 )
+@click.option(
+    "--captured",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="No device: decode a capture (skin-driver --capture FILE) again, and compare with what was decoded then.",
+)
+@click.option(
+    "--save", is_flag=True, help="With --captured: from now on, what is decoded now is right; written beside FILE."
+)
 @namespace_option
 @json_option
 @version_option
@@ -85,6 +97,8 @@ def command(
     rest_s: float,
     with_tare: bool,
     stem: Path | None,
+    captured: Path | None,
+    save: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
@@ -94,7 +108,12 @@ def command(
     and losses, with driver NAME, or the only one that runs, or one that it starts. All of it is captured. Type
     "skip" and Enter to leave a module out. Nothing is sent to the device but by the driver itself.
 
-    Exit status: 0 proven, 1 something failed or nothing was pressed, 2 wrong usage.
+    With --captured it proves that the driver decodes a capture as it did when that was made, and tells the first
+    difference. The driver and its options are those of then, but for what is given behind the --.
+
+    Ctrl-C ends the walk: the report has what was seen until then.
+
+    Exit status: 0 proven, 1 something failed, differs, or nothing was pressed, 2 wrong usage.
     """
     from skinware.cli._driver_frames import reader_of
     from skinware.memory.namespace import Namespace
@@ -103,27 +122,51 @@ def command(
 
     if name is not None and name.startswith("-"):  # there was nothing before the --
         driver_arguments, name = (name, *driver_arguments), None
+    if captured is not None:
+        _refuse_others(
+            context, {"captured", "save", "driver_arguments", "as_json", *(["name"] if name is None else [])}
+        )
+        from skinware_drivers.cli.captured import compare_capture
+
+        if not compare_capture(captured, driver_arguments, save=save, as_json=as_json):
+            context.exit(EXIT_FAILED)
+        return
+    if save:
+        raise click.UsageError("--save is for --captured")
     place = Namespace(namespace)
     stem = stem or Path(time.strftime(f"prove-{name or 'driver'}-%Y%m%d-%H%M%S"))
     capture = stem.with_name(f"{stem.name}.mcap")
     person = _AtTerminal(as_json)
-    with contextlib.ExitStack() as beside:
-        if driver_arguments:
-            name = beside.enter_context(_started(driver_arguments, name, place, capture))
-        reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
-        if not driver_arguments:
-            from skinware_drivers.cli.capturing import captured
-
-            beside.enter_context(captured(capture, reader.name, place.name, lambda _done: None))
-        proof = Proof(reader.name, reader.driver_type, _facts(bool(driver_arguments), capture))
+    proof = Proof(name or "driver", "", _facts(bool(driver_arguments), capture))
+    with _interrupted_once() as undisturbed:
         try:
-            with contextlib.suppress(KeyboardInterrupt):
+            with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as beside:
+                if driver_arguments:
+                    name = beside.enter_context(_started(driver_arguments, name, place, capture))
+                reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
+                if not driver_arguments:
+                    from skinware_drivers.cli.capturing import captured as capturing
+
+                    beside.enter_context(capturing(capture, reader.name, place.name, lambda _done: None))
+                proof.driver, proof.driver_type = reader.name, reader.driver_type
                 walk(reader, person, Manner(type_name, only, patience_s, rest_s, with_tare), proof)
-        finally:
-            _write(proof, stem)
+                undisturbed()
+        except SkinwareError:
+            if proof.checks:
+                _write(proof, stem)
+            raise
+        _write(proof, stem)
     _tell(proof, stem, as_json)
     if not proof.is_proven:
         context.exit(EXIT_FAILED)
+
+
+def _refuse_others(context: click.Context, allowed: set[str]) -> None:
+    """What is about a device says nothing of a capture."""
+    for parameter in context.command.params:
+        is_given = parameter.name and context.get_parameter_source(parameter.name) is ParameterSource.COMMANDLINE
+        if is_given and parameter.name not in allowed and context.params[parameter.name]:
+            raise click.UsageError(f"--captured goes without {parameter.opts[0]}")
 
 
 def _facts(is_whole: bool, capture: Path) -> dict[str, str]:
@@ -135,6 +178,31 @@ def _facts(is_whole: bool, capture: Path) -> dict[str, str]:
         "verified against": "a device in the hands of its owner, as this table says",
         "capture": f"{capture.name}, {beginning}",
     }
+
+
+@contextlib.contextmanager
+def _interrupted_once() -> Iterator[Callable[[], None]]:
+    """Ctrl-C, or SIGTERM, ends what the block does, once: what comes after it is undisturbed.
+
+    Yields:
+        What to call where the block is to be undisturbed without having been interrupted.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def undisturbed() -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+
+    def interrupt(_number: int, _frame: object) -> None:
+        undisturbed()
+        raise KeyboardInterrupt
+
+    before = [signal.signal(number, interrupt) for number in numbers]
+    try:
+        yield undisturbed
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 @contextlib.contextmanager
@@ -165,8 +233,8 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, captu
         is_ready.set()
 
     thread = threading.Thread(target=listen, daemon=True)
-    thread.start()
     try:
+        thread.start()
         if not is_ready.wait(_STARTS_WITHIN_S) or not told:
             raise DriverError(f"skin-driver publishes nothing; {capture} has what went over its buses: attach it")
         yield str(told["name"])

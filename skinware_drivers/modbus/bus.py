@@ -346,11 +346,12 @@ class ModbusBus(KernelBus):
         said = talk.say(now_ns())
         if said or self._unsent:
             self._unsent += said
+            sent_ns = now_ns()  # not later than an answer
             try:
                 written = port.write(self._unsent)
             except OSError as error:
                 raise BusNotAvailable(f"{self.name}: {os.strerror(error.errno or 0)}") from None
-            self.tap.keep_bytes(now_ns(), self._unsent[:written], is_sent=True)
+            self.tap.keep_bytes(sent_ns, self._unsent[:written], is_sent=True)
             self._unsent = self._unsent[written:]
 
     def _wake(self) -> None:

@@ -303,11 +303,40 @@ class Master(Talk):
         return others and unit is not None and time_ns < unit.until_ns
 
 
+class Overheard:
+    """Joins what another master reads.
+
+    A master that asks what we would ask first begins its cycle there: what it has read before is then not joined with
+    what comes after.
+
+    Args:
+        wanted: what is looked for in the replies.
+    """
+
+    def __init__(self, wanted: Wanted) -> None:
+        self._image = Image(wanted)
+        reads = wanted.reads()
+        self._first = (reads[0].unit, reads[0].question) if reads else None
+        self._cycle_ns = 0
+
+    def take(self, asked: Message, registers: bytes, time_ns: int) -> list[Row]:
+        """The frames that are whole now.
+
+        Args:
+            asked: the question.
+            registers: bytes of what was replied.
+            time_ns: when.
+        """
+        if (asked.unit, asked.data) == self._first:
+            self._cycle_ns = time_ns
+        since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
+        return self._image.overhear(asked.unit, asked.data, registers, time_ns, since_ns)
+
+
 class Listener(Talk):
     """Pairs the questions of another master with their replies, on a line that it taps. It never says anything.
 
-    A reply does not tell which registers it holds, so one whose question was not heard is not used. A master that asks
-    what we would ask first begins its cycle there: what it has read before is then not joined with what comes after.
+    A reply does not tell which registers it holds, so one whose question was not heard is not used.
 
     Args:
         wanted: what is looked for in the replies.
@@ -317,12 +346,9 @@ class Listener(Talk):
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:
         super().__init__()
         self._counters = counters
-        self._image = Image(wanted)
+        self._overheard = Overheard(wanted)
         self._line = wire.RtuMessages(counters.framing)
         self._asked: Message | None = None
-        reads = wanted.reads()
-        self._first = Message(reads[0].unit, reads[0].question) if reads else None
-        self._cycle_ns = 0
 
     @property
     def due_ns(self) -> int | None:
@@ -350,10 +376,7 @@ class Listener(Talk):
             if wire.exception_of(message.data):
                 self._counters.errors += 1
             elif asked.data[0] in wire.READS:
-                if asked == self._first:
-                    self._cycle_ns = time_ns
-                since_ns = max(self._cycle_ns, time_ns - _OVERHEARD_NS)
-                self.rows += self._image.overhear(asked.unit, asked.data, message.data[2:], time_ns, since_ns)
+                self.rows += self._overheard.take(asked, message.data[2:], time_ns)
 
 
-__all__ = ["ANSWERS", "Listener", "Master", "Open", "Talk", "Timing"]
+__all__ = ["ANSWERS", "Listener", "Master", "Open", "Overheard", "Talk", "Timing"]

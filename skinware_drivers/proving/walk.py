@@ -178,7 +178,7 @@ class _Walk:
     def _look_at_rest(self) -> None:
         self._ask("rest", "", "leave the device alone")
         frames, stamps = [], []
-        for frame, values in self._frames(after(self._manner.rest_s)):
+        for frame, values in self._frames(after(self._manner.rest_s), may_skip=False):
             frames.append(values)
             stamps.append(frame.module_time_ns.copy())
         if len(frames) < 2:
@@ -317,10 +317,14 @@ class _Walk:
         yield from self._frames(after(self._manner.patience_s))
         raise _Missed(else_)
 
-    def _frames(self, is_over: Callable[[], bool]) -> Iterator[tuple[DriverFrame, Values]]:
-        """Frames with physical values of the type, (n,); of taxels without data, those at rest."""
+    def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverFrame, Values]]:
+        """Frames with physical values of the type, (n,); of taxels without data, those at rest.
+
+        Raises:
+            _Skipped: the person does not want it, and may say so: without the rest nothing can be judged.
+        """
         for frame in frames_until(self._reader, is_over):
-            if self._person.skips():
+            if self._person.skips() and may_skip:
                 raise _Skipped
             usable = (frame.status_of(self._type.name) & np.uint8(_UNUSABLE)) == 0
             values = frame.physical(self._type.name).astype(np.float64)

@@ -262,11 +262,12 @@ class SerialBus(KernelBus):
         port, epoll = self._port, self._epoll
         if port is None or epoll is None:
             return
+        sent_ns = now_ns()  # not later than an answer
         try:
             written = port.write(self._unsent)
         except OSError as error:
             raise BusNotAvailable(f"{self!r} went away, perhaps unplugged ({error.strerror or error})") from None
-        self.tap.keep_bytes(now_ns(), self._unsent[:written], is_sent=True)
+        self.tap.keep_bytes(sent_ns, self._unsent[:written], is_sent=True)
         self._unsent = self._unsent[written:]
         wanted = select.EPOLLIN | (select.EPOLLOUT if self._unsent else 0)
         with contextlib.suppress(OSError):

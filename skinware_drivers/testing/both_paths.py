@@ -31,8 +31,8 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NOBODY_WAITS, Publisher
-from skinware_drivers.testing.clock import HandClock, package_on
 from skinware_drivers.testing.defect import defect, require
+from skinware_drivers.virtual.hand_clock import HandClock, package_on
 from skinware_drivers.watch import Watch
 
 Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
@@ -298,7 +298,7 @@ class Pair:
     """Both paths, on the same clock. Every method does the same with both, and compares them.
 
     Args:
-        clock: what both take for the time; the package has to be on it (:func:`skinware_drivers.testing.clock.
+        clock: what both take for the time; the package has to be on it (:func:`skinware_drivers.virtual.hand_clock.
             package_on`).
         layouts: of each bus.
         tables: the skin.

@@ -1,8 +1,6 @@
-"""Time that passes only when nothing is left to be done: a driver of minutes runs in a moment, always the same way.
+"""A coroutine in a time of its own, watched: what blocks instead of waiting, or waits for ever, is found and named.
 
-:class:`HandClock` is the time. :func:`run_in_its_time` runs a coroutine in an event loop of that time: timers, sleeps
-and the time stamps of the whole package follow it. Whenever the loop would sleep, the clock jumps to the moment at
-which the next thing happens. What blocks instead of waiting, or waits for what can never come, is found and named.
+The time is that of :mod:`skinware_drivers.virtual.hand_clock`.
 """
 
 from __future__ import annotations
@@ -10,185 +8,28 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import selectors
 import sys
 import threading
-import time
 import traceback
-from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 import pytest
 
-import skinware.realtime
 from skinware_drivers.testing.defect import defect
+from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, NeverEnds, package_on
 
 T = TypeVar("T")
 
 _EXPAND_LOG = logging.getLogger("skinware.driver.expand")
 """Where exceptions are told that the package caught from a driver's code."""
-_BEGINNING_NS = 5_000_000_000_000
-_TURNS_AT_ONE_MOMENT = 20_000
-_NAPS_WITHOUT_TIMER = 40
-_NAP_S = 0.05
 _LOOKS_A_SECOND = 50
 _ASLEEP_LOOKS = 40
 """So often in a row the loop's thread must be found asleep in the same turn to be called blocked."""
 _LONGEST_TURN_S = 10.0
 """Of processor time."""
-
-
-class HandClock:
-    """CLOCK_MONOTONIC as a test has it, ns. Called, it tells the time.
-
-    Attributes:
-        now_ns: the time.
-        before_passing: called before every jump: everything of this moment has happened.
-        turns: of the event loop so far.
-    """
-
-    def __init__(self) -> None:
-        self.now_ns: int = _BEGINNING_NS
-        self.before_passing: list[Callable[[], object]] = []
-        self.turns = 0
-        self._timers: set[HandTimer] = set()
-
-    def __call__(self) -> int:
-        """The time."""
-        return self.now_ns
-
-    @property
-    def now_s(self) -> float:
-        """Seconds since the beginning."""
-        return (self.now_ns - _BEGINNING_NS) / 1e9
-
-    def timer(self) -> HandTimer:
-        """A descriptor that becomes readable at a moment of this clock."""
-        timer = HandTimer(self)
-        self._timers.add(timer)
-        return timer
-
-    def forget(self, timer: HandTimer) -> None:
-        """Called by a timer that is closed."""
-        self._timers.discard(timer)
-
-    def next_timer_ns(self) -> int | None:
-        """When the next of the timers will be due. Those that are due already are their readers' affair."""
-        due_ns = [timer.due_ns for timer in self._timers if timer.due_ns is not None and timer.due_ns > self.now_ns]
-        return min(due_ns, default=None)
-
-    def pass_to(self, time_ns: int) -> None:
-        """Let time pass."""
-        for action in self.before_passing:
-            action()
-        self.now_ns = max(self.now_ns, time_ns)
-        for timer in list(self._timers):
-            timer.look()
-
-
-class HandTimer:
-    """What :class:`skinware_drivers.virtual.timer.MonotonicTimer` is, for a :class:`HandClock`."""
-
-    def __init__(self, clock: HandClock) -> None:
-        self._clock = clock
-        self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._is_readable = False
-        self.due_ns: int | None = None
-
-    def fileno(self) -> int:
-        """The descriptor; -1 once closed."""
-        return self._fd
-
-    def wake_at(self, time_ns: int | None) -> None:
-        """Make the descriptor readable at ``time_ns``, and not before."""
-        self.due_ns = time_ns
-        self.look()
-
-    def look(self) -> None:
-        """Whether it is time."""
-        due = self.due_ns is not None and self.due_ns <= self._clock.now_ns
-        if due and not self._is_readable:
-            os.eventfd_write(self._fd, 1)
-        elif self._is_readable and not due:
-            os.eventfd_read(self._fd)
-        self._is_readable = due
-
-    def close(self) -> None:
-        """Give the descriptor back. Idempotent."""
-        if self._fd >= 0:
-            self._clock.forget(self)
-            os.close(self._fd)
-            self._fd = -1
-
-
-class _PassingTime(selectors.EpollSelector):
-    """Where the event loop would sleep, time passes instead."""
-
-    def __init__(self, clock: HandClock) -> None:
-        super().__init__()
-        self._clock = clock
-        self._turns_now = 0
-        self._naps = 0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """What is ready, after time has passed until something is."""
-        self._clock.turns += 1
-        self._turns_now += 1
-        if self._turns_now > _TURNS_AT_ONE_MOMENT:
-            defect("the driver loops without end and without a wait (await link.sleep)")
-        ready = super().select(0)
-        if ready or (timeout is not None and timeout <= 0):
-            return ready
-        moments = [] if timeout is None else [self._clock.now_ns + max(1, round(timeout * 1e9))]
-        timer_ns = self._clock.next_timer_ns()
-        if timer_ns is not None:
-            moments.append(timer_ns)
-        if not moments:  # only another thread can go on
-            self._naps += 1
-            if self._naps > _NAPS_WITHOUT_TIMER:
-                defect("the driver waits indefinitely: give the wait a timeout")
-            return super().select(_NAP_S)
-        self._turns_now = self._naps = 0
-        self._clock.pass_to(min(moments))
-        return super().select(0)
-
-
-class _Loop(asyncio.SelectorEventLoop):
-    def __init__(self, clock: HandClock) -> None:
-        self._hand_clock = clock
-        super().__init__(_PassingTime(clock))
-
-    def time(self) -> float:
-        """As the clock says, s."""
-        return self._hand_clock.now_ns / 1e9
-
-
-@contextmanager
-def package_on(clock: HandClock) -> Iterator[None]:
-    """Everything that asks ``skinware.realtime.now_ns`` gets the time of a clock; ``time.sleep`` is a defect."""
-    real_now_ns, real_sleep, thread = skinware.realtime.now_ns, time.sleep, threading.get_ident()
-    users = [module for module in sys.modules.values() if vars(module).get("now_ns") is real_now_ns]
-
-    def sleep(seconds: Any) -> None:
-        if threading.get_ident() != thread:
-            real_sleep(seconds)
-            return
-        where = traceback.extract_stack(limit=2)[0]
-        defect(
-            f"the driver blocks: {where.filename}:{where.lineno}, in {where.name}, calls time.sleep({seconds:g}):"
-            " nothing is read from any bus meanwhile; write `await link.sleep(...)`"
-        )
-
-    try:
-        for module in users:
-            vars(module)["now_ns"] = clock
-        time.sleep = sleep
-        yield
-    finally:
-        time.sleep = real_sleep
-        for module in users:
-            vars(module)["now_ns"] = real_now_ns
+_SAID = (pytest.fail.Exception, NeverEnds)
+"""What says by itself what is wrong."""
 
 
 def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]) -> T:
@@ -203,7 +44,7 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
 
     def note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
-        if isinstance(error, pytest.fail.Exception):
+        if isinstance(error, _SAID):
             failures.append(error)
         elif not failures:
             trace = _short_trace(error) if error is not None else str(context["message"])
@@ -221,7 +62,7 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
 
     def work() -> None:
         try:
-            with package_on(clock), asyncio.Runner(loop_factory=lambda: _Loop(clock)) as runner:
+            with package_on(clock), asyncio.Runner(loop_factory=lambda: HandLoop(clock)) as runner:
                 outcome.append(runner.run(scenario()))
         except BaseException as error:  # noqa: BLE001  (raised again in the test's own thread)
             failures.append(error)
@@ -239,7 +80,7 @@ def run_in_its_time(clock: HandClock, main: Callable[[], Coroutine[Any, Any, T]]
     if failures:
         # told anew: the trace of the first would keep everything alive that the test has to look after
         error = failures.pop()
-        what = str(error) if isinstance(error, pytest.fail.Exception) else f"it raised\n{_short_trace(error)}"
+        what = str(error) if isinstance(error, _SAID) else f"it raised\n{_short_trace(error)}"
         del error
         defect(what)
     return outcome[0]
@@ -293,4 +134,4 @@ def _short_trace(error: BaseException) -> str:
     return "".join(traceback.format_exception(error)[-5:])
 
 
-__all__ = ["HandClock", "HandTimer", "package_on", "run_in_its_time"]
+__all__ = ["run_in_its_time"]

@@ -6,12 +6,12 @@ from collections.abc import Collection
 
 import pytest
 
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.wire import Fault, foreign_identifiers
+from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24
 _DAMAGES = 8

@@ -13,11 +13,11 @@ from skinware.memory.namespace import Namespace
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.layout_check import check_layout
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.leaks import Belongings, files_left
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
 
 _ABSENT_S = 1.5

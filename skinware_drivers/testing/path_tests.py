@@ -8,12 +8,12 @@ import pytest
 
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock, why_python
 from skinware_drivers.testing.both_streams import both_streams
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.testing.suite import Suite
 from skinware_drivers.testing.torn_tests import Heard
+from skinware_drivers.virtual.hand_clock import HandClock
 
 Trouble = Literal["nothing", "lost", "truncated", "repeated", "garbage", "stumbling", "restart"]
 _PERIODS = 40

@@ -22,7 +22,7 @@ from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.running.unused_frames import why_unused
-from skinware_drivers.testing.clock import HandClock, run_in_its_time
+from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import (
     EmulatedBus,
@@ -32,6 +32,7 @@ from skinware_drivers.testing.wire import (
     Truth,
     make_bus,
 )
+from skinware_drivers.virtual.hand_clock import HandClock
 
 T = TypeVar("T")
 NAME = "driver_under_test"

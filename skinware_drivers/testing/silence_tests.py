@@ -6,11 +6,11 @@ import numpy as np
 
 from skinware.driver_service import DriverFrame
 from skinware.status import BusState, PatchState, Status
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24
 _SILENCE_S = 1.5

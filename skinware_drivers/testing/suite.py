@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.patterns import lively
 from skinware_drivers.testing.rig import Case, Handshakes, Running
+from skinware_drivers.virtual.hand_clock import HandClock
 
 
 class Suite:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from skinware.status import Status
-from skinware_drivers.testing.clock import HandClock
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.patterns import extreme
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24
 _SILENCE_S = 1.5

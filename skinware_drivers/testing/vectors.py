@@ -39,9 +39,10 @@ from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.both_paths import require_same
-from skinware_drivers.testing.clock import HandClock, run_in_its_time
+from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.defect import defect, require
 from skinware_drivers.testing.wire import make_bus
+from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 
 _MS = 1_000_000

@@ -20,10 +20,10 @@ from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.testing.clock import HandClock, HandTimer
 from skinware_drivers.testing.defect import defect
 from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.hand_clock import HandClock, HandTimer
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame, next_read
 
 Fault = Literal["lost", "repeated", "truncated", "garbage", "noise"]

@@ -166,10 +166,11 @@ class VirtualCanBus(Bus):
         except BusSendError:
             self.counters.send_failures += 1
             raise
-        self.hardware.receive(identifier, payload, self._clock())
+        sent_ns = self._clock()  # not later than an answer
+        self.hardware.receive(identifier, payload, sent_ns)
         self.counters.sent += 1
         if self.tap.is_open:
-            self.tap.keep_frame(self._clock(), identifier, payload, is_sent=True)
+            self.tap.keep_frame(sent_ns, identifier, payload, is_sent=True)
         self._wake_when_due()
 
     def close(self) -> None:

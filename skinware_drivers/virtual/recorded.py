@@ -23,7 +23,7 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.recorded_modbus import ReplayedModbusBus, was_over_tcp
-from skinware_drivers.virtual.recorded_wire import RecordedPort, RecordedWire
+from skinware_drivers.virtual.recorded_wire import Note, RecordedPort, RecordedWire
 from skinware_drivers.virtual.timer import MonotonicTimer, Timer
 
 if TYPE_CHECKING:
@@ -119,8 +119,17 @@ def replayed_bus(
     payload_size: int = 8,
     listen_only: bool = False,
     clock: Clock | None = None,
+    note: Note | None = None,
 ) -> Bus:
     """The bus ``replay``: what was recorded of one in the file ``channel``.
+
+    Args:
+        channel: the file.
+        options: see :class:`ReplayOptions`.
+        payload_size: longest payload that the layout knows.
+        listen_only: refuse to send, and wait for no question.
+        clock: in whose time; default: in real time.
+        note: is told of all that is given; see :class:`.recorded_wire.RecordedWire`.
 
     Raises:
         ConfigurationError: an option is unknown or has a bad value, or nothing, or more than one bus, is meant.
@@ -136,12 +145,13 @@ def replayed_bus(
     of_driver = [one for one in recording.wires if one.driver == wire.driver]
     first_ns = first_of(of_driver, wanted.start)
     more: dict[str, Any] = {"payload_size": payload_size, "listen_only": listen_only}
-    if _medium_of(recording, wire) == "modbus":
-        recorded = RecordedWire(items, first_ns, speed=wanted.speed, waits=False, with_sent=True, name=name)
+    play = partial(RecordedWire, items, first_ns, speed=wanted.speed, name=name, note=note)
+    if medium_of(recording, wire) == "modbus":
+        recorded = play(waits=False, with_sent=True)
         begin = partial(RecordedPort, recorded, clock.now_ns, clock.timer)
         return ReplayedModbusBus(begin, name, over_tcp=was_over_tcp(wire.items()), **more)
-    recorded = RecordedWire(items, first_ns, speed=wanted.speed, waits=not listen_only, name=name)
-    kind = ReplayedSerialBus if _medium_of(recording, wire) == "serial" else ReplayedCanBus
+    recorded = play(waits=not listen_only)
+    kind = ReplayedSerialBus if medium_of(recording, wire) == "serial" else ReplayedCanBus
     return kind(recorded, name, clock, **more)
 
 
@@ -172,8 +182,8 @@ def _open(path: str) -> Recording:
         raise BusNotAvailable(f"{path}: {error.strerror}") from None
 
 
-def _medium_of(recording: Recording, wire: WireTrack) -> str:
-    """As the driver said, or by what was recorded."""
+def medium_of(recording: Recording, wire: WireTrack) -> str:
+    """``can``, ``serial`` or ``modbus``: as the driver said, or by what was recorded."""
     known = recording.about(wire.driver).get("buses", {}).get(wire.bus, {}).get("medium")
     return str(known or ("serial" if wire.is_serial else "can"))
 
@@ -218,4 +228,4 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")
 
 
-__all__ = ["Clock", "Recorded", "ReplayOptions", "first_of", "recorded_driver", "replayed_bus", "wire_of"]
+__all__ = ["Clock", "Recorded", "ReplayOptions", "first_of", "medium_of", "recorded_driver", "replayed_bus", "wire_of"]

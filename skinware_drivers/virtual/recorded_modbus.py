@@ -7,21 +7,18 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from skinware.errors import BusNotAvailable
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.bus import ModbusBus
-from skinware_drivers.modbus.master import ANSWERS
-from skinware_drivers.modbus.registers import Image, Row, Wanted
+from skinware_drivers.modbus.master import ANSWERS, Overheard
+from skinware_drivers.modbus.registers import Row, Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.virtual.recorded_wire import SENT, RecordedPort
 
 if TYPE_CHECKING:
     from skinware.recording import WireItem
-
-_JOINED_NS = NS_PER_S
-"""Registers that were read longer ago are not joined with newer ones."""
 
 
 class Conversation:
@@ -39,7 +36,7 @@ class Conversation:
     def __init__(self, wanted: Wanted, counters: BusCounters, *, over_tcp: bool) -> None:
         self.rows: deque[Row] = deque()
         self._counters = counters
-        self._image = Image(wanted)
+        self._overheard = Overheard(wanted)
         self._line = None if over_tcp else wire.RtuMessages(counters.framing)
         self._asking, self._answering = wire.TcpMessages(counters.framing), wire.TcpMessages(counters.framing)
         self._asked: dict[int, Message] = {}
@@ -88,7 +85,7 @@ class Conversation:
         if wire.exception_of(reply.data):
             self._counters.errors += 1
         elif asked.data[0] in wire.READS and wire.is_reply(asked.data, reply.data):
-            self.rows += self._image.overhear(asked.unit, asked.data, reply.data[2:], time_ns, time_ns - _JOINED_NS)
+            self.rows += self._overheard.take(asked, reply.data[2:], time_ns)
 
 
 class ReplayedModbusBus(ModbusBus):

@@ -20,6 +20,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 SENT = 1
 """Identifier of what was sent, where that is given too."""
+Note = Callable[[int, int], None]
+"""Takes the time stamp of what is given, and the time that it had when it was recorded."""
 _PATIENCE_NS = 2_000_000_000
 """So long a question is waited for that was asked when it was recorded; the next one of its kind is not, after that."""
 _EARLIEST_NS = 250_000_000
@@ -36,6 +38,7 @@ class RecordedWire:
         waits: for the questions that were asked when it was recorded.
         with_sent: what was sent is given too, with the identifier :data:`SENT`.
         name: that the end is logged under; empty: it is not.
+        note: is told of all that is given.
     """
 
     def __init__(
@@ -47,8 +50,9 @@ class RecordedWire:
         waits: bool = True,
         with_sent: bool = False,
         name: str = "",
+        note: Note | None = None,
     ) -> None:
-        self._items, self._speed, self._waits, self._name = items, speed, waits, name
+        self._items, self._speed, self._waits, self._name, self._note = items, speed, waits, name, note
         self._with_sent = with_sent
         self._next: WireItem | None = None
         self._first_ns = first_ns
@@ -88,9 +92,9 @@ class RecordedWire:
                 if self._is_waited_for(item) and not self._is_asked(item, now_ns):
                     break
                 if self._with_sent:
-                    found.append(WireFrame(self._stamp_ns(item), SENT, item.data))
+                    found.append(self._given(item, SENT))
             elif item.identifier is None or not item.identifier & (ERROR_FLAG | REMOTE_FLAG):
-                found.append(WireFrame(self._stamp_ns(item), item.identifier or 0, item.data))
+                found.append(self._given(item, item.identifier or 0))
             self._take_next()
         self._counts["frames"] += len(found)
         return found
@@ -115,9 +119,11 @@ class RecordedWire:
     def _due_ns(self, item: WireItem) -> int:
         return self._begun_ns + round((item.time_ns - self._first_ns) / self._speed)
 
-    def _stamp_ns(self, item: WireItem) -> int:
+    def _given(self, item: WireItem, identifier: int) -> WireFrame:
         self._given_ns = max(self._given_ns, self._due_ns(item))
-        return self._given_ns
+        if self._note is not None:
+            self._note(self._given_ns, item.time_ns)
+        return WireFrame(self._given_ns, identifier, item.data)
 
     def _is_waited_for(self, item: WireItem) -> bool:
         return self._waits and item.is_sent and _kind(item) not in self._unasked
@@ -229,4 +235,4 @@ class RecordedPort(Port):
         self._timer.wake_at(0 if self._reads else self._wire.next_due_ns())
 
 
-__all__ = ["SENT", "RecordedPort", "RecordedWire"]
+__all__ = ["SENT", "Note", "RecordedPort", "RecordedWire"]

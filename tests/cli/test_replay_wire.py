@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import signal
 import time
@@ -18,7 +19,7 @@ from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.wire_tap import WireTap
 from tests.commands import run, running
 from tests.recording.test_wire_export import ON_VCAN1, Sent, keep, write_recording
-from tests.recording.test_wire_replay import equal_updates, record
+from tests.recording.test_wire_replay import record, updates_of
 
 MS = 1_000_000
 FRAMES = [
@@ -106,7 +107,9 @@ def test_bytes_of_a_line_come_out_of_a_pseudo_terminal(tmp_path: Path) -> None:
         after = record(again, adapter, make_bus(str(link), payload_size=adapter.payload_size), 15)
         replay.stop()
     assert after.structure.sensor_uid.tolist() == before.structure.sensor_uid.tolist()
-    assert equal_updates(before, after, with_times=False) > 10
+    for old, new in zip(updates_of(before), updates_of(after), strict=True):
+        matcher = difflib.SequenceMatcher(None, [one for _, one in old], [one for _, one in new], autojunk=False)
+        assert sum(block.size for block in matcher.get_matching_blocks()) >= 0.8 * min(len(old), len(new)) > 8
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from skinware_drivers.running.flow import Flow, flow_of
 from skinware_drivers.running.generation import Generation
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.ports import DescriptorPort, Port
-from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.virtual.hand_clock import HandClock
 from tests.serial.fuzzing import Script
 
 _OTHER_BUS = 2

@@ -16,41 +16,17 @@ from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
 from skinware import DriverReader
 from skinware.errors import BusNotAvailable, ConfigurationError
-from skinware_drivers import native
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import read_until
 from tests.modbus.hands import FINGER_AT
-from tests.modbus.peers import Action, device, rtu_server, tcp_server
-from tests.modbus.test_peers import N, counted, driven, until_right
+from tests.modbus.peers import Action, device, tcp_server
+from tests.modbus.rig import PYMODBUS, N, counted, driven, until_right, with_options
 from tests.streams.peers import LOCAL, free_port, server
 
 PLACE = FINGER_AT + N
 """Of registers that are the hand's, and not of its skin."""
 N_MORE = 8
-pytestmark = [
-    pytest.mark.usefixtures("namespace"),
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:pytest.PytestUnraisableExceptionWarning"),
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:RuntimeWarning"),
-]
-
-
-@pytest.fixture(params=["native", "python"])
-def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Who asks for the skin while nobody else does."""
-    if request.param == "python":
-        monkeypatch.setattr(native, "library", lambda: None)
-    elif native.library() is None:
-        pytest.skip(native.why_python())
-    return str(request.param)
-
-
-@pytest.fixture(params=["tcp", "rtu"])
-def over(request: pytest.FixtureRequest, way: str) -> Any:
-    return tcp_server if request.param == "tcp" else rtu_server
-
-
-def with_options(name: str, options: str) -> str:
-    return f"{name}{'&' if '?' in name else '?'}{options}"
+pytestmark = PYMODBUS
 
 
 @contextmanager
@@ -122,9 +98,10 @@ def test_a_gateway_that_only_reads(way: str) -> None:
 def test_exceptions_come_through_and_silence_is_one(way: str) -> None:
     async def act(function: int, start: int, address: int, count: int, registers: list[int], values: object) -> None:
         if address == PLACE + 1:
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(1.4 * timeout_s)
 
-    with shared(tcp_server, "&timeout_ms=200", act) as (port, _, reader), client(port) as program:
+    timeout_s = 2.0
+    with shared(tcp_server, f"&timeout_ms={1e3 * timeout_s}", act) as (port, _, reader), client(port) as program:
         assert program.read_holding_registers(7, count=1, device_id=1).exception_code == 2
         assert program.read_holding_registers(PLACE + 1, count=1, device_id=1).exception_code == 11
         until_newer(reader, 3)

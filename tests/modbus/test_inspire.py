@@ -19,19 +19,14 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.inspire import EmulatedInspire, EmulatedInspireOptions
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import device, rtu_server, tcp_server
+from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 
-pytestmark = [
-    pytest.mark.usefixtures("namespace"),
-    # pymodbus 3.16 leaves a question that came last unanswered, and its coroutine never awaited, when it is shut down
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:pytest.PytestUnraisableExceptionWarning"),
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:RuntimeWarning"),
-]
+pytestmark = PYMODBUS
 N = 1062
 DOUBT = int(Status.SUSPECT)
 AS_SENT = np.arange(100, 100 + N)
@@ -56,10 +51,8 @@ def right() -> np.ndarray[Any, np.dtype[np.int64]]:
 
 
 @contextmanager
-def driven(name: str, **options: Any) -> Iterator[DriverReader]:
-    driver = adapter(**options)
-    bus = make_bus(f"{name}{'&' if '?' in name else '?'}timeout_ms=5000", payload_size=driver.payload_size)
-    with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
+def reading(name: str, **options: Any) -> Iterator[DriverReader]:
+    with driven(with_options(name, PATIENTLY), adapter(**options)) as (_, reader):
         yield reader
 
 
@@ -199,7 +192,7 @@ async def count_bytes(
 
 @pytest.mark.parametrize("over", [tcp_server, rtu_server], ids=["tcp", "rtu"])
 def test_a_server_whose_addresses_count_bytes(over: Any) -> None:
-    with over(device(1, 3000, [0] * 3000, count_bytes)) as name, driven(name) as reader:
+    with over(device(1, 3000, [0] * 3000, count_bytes)) as name, reading(name) as reader:
         read_until(reader, lambda frame: not frame.status.any() and (frame.values == right()).all())
 
 
@@ -208,7 +201,7 @@ def test_matrix_by_matrix_it_does_not_matter_what_addresses_count() -> None:
     for block in adapter().registers:
         first = (block.address - 3000) // 2
         registers[block.address - 3000 :][: block.count] = AS_SENT[first : first + block.count]
-    with tcp_server(device(1, 3000, registers.tolist())) as name, driven(name, by_matrix=True) as reader:
+    with tcp_server(device(1, 3000, registers.tolist())) as name, reading(name, by_matrix=True) as reader:
         read_until(reader, lambda frame: not frame.status.any() and (frame.values == right()).all())
 
 
@@ -217,7 +210,7 @@ def test_matrix_by_matrix_it_does_not_matter_what_addresses_count() -> None:
 
 def test_values_that_no_taxel_has_are_doubted_and_the_end_of_the_range_is_told(caplog: Any) -> None:
     values = [4095, 4096, 4097, 65280, *[5] * (N - 4)]
-    with emulated_skin("inspire", feeling(values)) as skin:
+    with patient("inspire", feeling(values)) as skin:
         frame = read_until(skin.reader, is_current)
         beyond = int(Status.OUT_OF_RANGE)
         assert frame.status[:5].tolist() == [0, beyond, DOUBT, DOUBT, 0]
@@ -234,11 +227,11 @@ def test_bytes_in_the_other_order_are_told_and_put_right_by_an_option(caplog: An
         registers[address - start : address - start + len(told)] = told
 
     with tcp_server(device(1, 3000, [0] * 3000, swap)) as name:
-        with driven(name) as reader:
+        with reading(name) as reader:
             frame = read_until(reader, lambda frame: not (frame.status & Status.NEVER_SEEN).any())
             assert ((frame.status & DOUBT) != 0).sum() > N // 2
             wait_until(lambda: "add byte_order=little" in caplog.text)
-        with driven(f"{name}?byte_order=little") as reader:
+        with reading(f"{name}?byte_order=little") as reader:
             read_until(reader, lambda frame: not frame.status.any() and (frame.values == right()).all())
 
 
@@ -256,7 +249,7 @@ def test_a_dead_matrix_is_told_and_doubted_and_no_other(way: str, caplog: Any, m
         monkeypatch.setattr("skinware_drivers.native.library", lambda: None)
     monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
     caplog.set_level(logging.WARNING)
-    with emulated_skin("inspire", pattern="idle", zero=(13, 17)) as skin:
+    with patient("inspire", pattern="idle", zero=(13, 17)) as skin:
         dark = ["right hand, thumb tip", "right hand, palm"]
         read_until(skin.reader, lambda frame: doubted(frame) == dark)
         wait_until(lambda: "nothing but 0 comes from right hand, thumb tip; right hand, palm" in caplog.text)
@@ -265,7 +258,7 @@ def test_a_dead_matrix_is_told_and_doubted_and_no_other(way: str, caplog: Any, m
 def test_a_matrix_that_shows_something_at_last_is_believed_from_then_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
     felt = [0] * N
-    with emulated_skin("inspire", feeling(felt)) as skin:
+    with patient("inspire", feeling(felt)) as skin:
         read_until(skin.reader, lambda frame: bool(((frame.status & DOUBT) != 0).all()))
         felt[:9] = [0, 0, 1, *[0] * 6]
         frame = read_until(skin.reader, lambda frame: bool(frame.values[2] == 1) and is_current(frame))

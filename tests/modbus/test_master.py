@@ -13,6 +13,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.master import ANSWERS, Listener, Talk
 from skinware_drivers.modbus.registers import Registers, Row, Wanted
 from skinware_drivers.modbus.wire import Message
+from skinware_drivers.virtual.recorded_modbus import Conversation as RecordedConversation
 from tests.modbus.conversation import (
     MS,
     ONE,
@@ -387,3 +388,26 @@ def test_what_is_overheard_of_two_cycles_is_not_joined() -> None:
     assert row.time_ns == 1020 * MS
     assert said(listener, first, 1040 * MS) == []
     assert len(said(listener, second, 1041 * MS)) == 1
+
+
+@pytest.mark.parametrize("begins", [0, 1, 2])
+def test_a_recording_that_begins_in_the_middle_of_a_cycle_is_not_torn(begins: int, over_tcp: bool) -> None:
+    """Or that lost a reply: no frame has registers of two cycles."""
+    wanted = Wanted([Registers(0, 300)])
+    recorded = RecordedConversation(wanted, BusCounters(), over_tcp=over_tcp)
+    asked = [(read.address, read.count) for read in wanted.reads()]
+    everything = [(cycle, *one) for cycle in range(1, 12) for one in asked][begins:]
+    lost = {(4, 125), (8, 250)}
+    found = []
+    for number, (cycle, address, count) in enumerate(everything):
+        reply = reply_of([cycle] * count)
+        for is_sent, data in ((True, wire.question_to_read(3, address, count)), (False, reply)):
+            if not is_sent and (cycle, address) in lost:
+                continue
+            message = Message(1, data, number + 1)
+            frame = wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
+            recorded.heard(frame, (1000 + 20 * cycle + address // 125) * MS, is_sent=is_sent)
+        found += [np.frombuffer(row.payload, ">u2") for row in recorded.rows]
+        recorded.rows.clear()
+    assert all((row == row[0]).all() for row in found)
+    assert [int(row[0]) for row in found] == [cycle for cycle in range(1 + bool(begins), 12) if cycle not in (4, 8)]

@@ -19,17 +19,12 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.notice import Notice
 from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2, EmulatedRevo2Options
 from tests.modbus.peers import Action, device, rtu_server
+from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 
-pytestmark = [
-    pytest.mark.usefixtures("namespace"),
-    # pymodbus 3.16 leaves a question that came last unanswered, and its coroutine never awaited, when it is shut down
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:pytest.PytestUnraisableExceptionWarning"),
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:RuntimeWarning"),
-]
+pytestmark = PYMODBUS
 READ = "7E 04 10 68 00 1E FE D1"
 ENABLE = "7E 10 0F A0 00 05 0A 00 01 00 01 00 01 00 01 00 01 4E E4"
 CALIBRATE = "7E 10 0F AA 00 05 0A 00 01 00 01 00 01 00 01 00 01 44 EE"
@@ -53,10 +48,8 @@ def has_no_data(frame: DriverFrame) -> bool:
 
 
 @contextmanager
-def driven(name: str, **options: Any) -> Iterator[DriverReader]:
-    driver = adapter(**options)
-    bus = make_bus(f"{name}&timeout_ms=5000", payload_size=driver.payload_size)
-    with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
+def reading(name: str, **options: Any) -> Iterator[DriverReader]:
+    with driven(with_options(name, PATIENTLY), adapter(**options)) as (_, reader):
         yield reader
 
 
@@ -109,7 +102,7 @@ def test_a_finger_is_a_tip_with_three_axes_and_a_proximity() -> None:
 
 
 def test_a_server_with_a_hand() -> None:
-    with rtu_server(hand_of(WORDS), baudrate=460_800) as name, driven(name, side="left") as reader:
+    with rtu_server(hand_of(WORDS), baudrate=460_800) as name, reading(name, side="left") as reader:
         expected = np.array([*FORCES, *PROXIMITIES], np.float32)
         frame = read_until(reader, lambda frame: not frame.status.any())
         assert frame.values.tolist() == expected.tolist()
@@ -124,14 +117,14 @@ def test_a_server_with_a_hand_that_is_switched_on_and_calibrated_on_request() ->
 
     ones = [1] * 5
     with rtu_server(hand_of(WORDS, note), baudrate=460_800) as name:
-        with driven(name, side="left") as reader:
+        with reading(name, side="left") as reader:
             read_until(reader, lambda frame: not frame.status.any())
             assert writes == []
             reader.call("enable")
             reader.call("calibrate")
             assert writes == [(4000, ones), (4010, ones)]
         writes.clear()
-        with driven(name, side="left", enable=True) as reader:
+        with reading(name, side="left", enable=True) as reader:
             read_until(reader, lambda frame: not frame.status.any())
             assert writes == [(4000, ones)]
 
@@ -140,7 +133,7 @@ def test_a_server_with_a_hand_that_is_switched_on_and_calibrated_on_request() ->
 
 
 def test_a_hand_that_is_not_switched_on_shows_no_data_and_says_what_to_do(caplog: Any) -> None:
-    with emulated_skin("revo2", enabled=False) as skin:
+    with patient("revo2", enabled=False) as skin:
         read_until(skin.reader, has_no_data)
         wait_until(lambda: "touch is not switched on" in caplog.text)
         skin.reader.call("enable")
@@ -149,7 +142,7 @@ def test_a_hand_that_is_not_switched_on_shows_no_data_and_says_what_to_do(caplog
 
 def test_only_ffff_of_the_right_width_means_none() -> None:
     words = [*[0xFFFF] * 3, *FORCES[3:], 0xFFFF, 0, 0xFFFF, 0xFFFF, *[1, 0] * 3, *[0] * 5]
-    with rtu_server(hand_of(words), baudrate=460_800) as name, driven(name, side="left") as reader:
+    with rtu_server(hand_of(words), baudrate=460_800) as name, reading(name, side="left") as reader:
         frame = read_until(reader, lambda frame: not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any())
         assert frame.status.tolist() == [16, 16, 16, *[0] * 12, 0, 16, 0, 0, 0]
 

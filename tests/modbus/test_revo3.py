@@ -15,19 +15,13 @@ from skinware.status import Status
 from skinware_drivers.description import assemble
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
-from skinware_drivers.registry import make_bus
-from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
 from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import device, rtu_server
+from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 
-pytestmark = [
-    pytest.mark.usefixtures("namespace"),
-    # pymodbus 3.16 leaves a question that came last unanswered, and its coroutine never awaited, when it is shut down
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:pytest.PytestUnraisableExceptionWarning"),
-    pytest.mark.filterwarnings("ignore:.*ServerRequestHandler:RuntimeWarning"),
-]
+pytestmark = PYMODBUS
 AT = {"palm": 4200, "thumb tip": 4250, "thumb pad": 4290, "index tip": 4350, "index pad": 4400, "little pad": 4700}
 POINTS = [36, 31, 57, 21, 52, 21, 52, 21, 52, 21, 52]
 LONGER = (40, 31, 60, 21, 52, 21, 52, 21, 52, 21, 52)
@@ -39,10 +33,8 @@ def adapter(**options: Any) -> Revo3Driver:
 
 
 @contextmanager
-def driven(name: str, **options: Any) -> Iterator[DriverReader]:
-    driver = adapter(**options)
-    bus = make_bus(f"{name}&timeout_ms=5000", payload_size=driver.payload_size)
-    with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
+def reading(name: str, **options: Any) -> Iterator[DriverReader]:
+    with driven(with_options(name, PATIENTLY), adapter(**options)) as (_, reader):
         yield reader
 
 
@@ -129,7 +121,7 @@ def test_a_server_with_a_hand_to_which_nothing_is_written_unless_somebody_wants_
     switches, zero = (4000, 4011) if mapping == "pressure" else (5900, 5214)
     with (
         rtu_server(device(127, 4000, registers.tolist(), note), baudrate=460_800) as name,
-        driven(name, mapping=mapping, period_ms=20) as reader,
+        reading(name, mapping=mapping, period_ms=20) as reader,
     ):
         read_until(reader, lambda frame: not frame.status.any() and (frame.values == expected).all())
         assert writes == []
@@ -143,7 +135,7 @@ def test_a_server_with_a_hand_to_which_nothing_is_written_unless_somebody_wants_
 
 def test_pads_that_are_off_are_doubted_until_they_are_switched_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
-    with emulated_skin("revo3", enabled=False) as skin:
+    with patient("revo3", enabled=False) as skin:
         read_until(skin.reader, lambda frame: bool(((frame.status & Status.SUSPECT) != 0).all()))
         skin.reader.call("enable")
         read_until(skin.reader, lambda frame: not frame.status.any())

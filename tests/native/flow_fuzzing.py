@@ -40,7 +40,7 @@ from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNT
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import DescriptorPort, Port
-from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native.traffic import identifier_of
 from tests.sdk.cable import Cable
 from tests.serial.fuzzing import Script

@@ -38,7 +38,7 @@ from skinware_drivers.layout import (
 )
 from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.testing.both_paths import Pair, Publishing, Way
-from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import flow_fuzzing
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths
 from tests.native.traffic import identifier_of

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
 from skinware_drivers.testing.both_paths import Marking, MarkingAll, Pair, Publishing, hand_clock
-from skinware_drivers.testing.clock import HandClock
+from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import needs_native
 from tests.native.fuzzing import designs
 from tests.native.skins import BusDesign, SkinDesign, cycled_skins, plain_skins, skins, skins_of_frames

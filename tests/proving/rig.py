@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,6 +17,8 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
+from skinware_drivers.link import Link
+from skinware_drivers.operations import operation
 from skinware_drivers.options import NoOptions
 from skinware_drivers.proving.proof import Proof
 from skinware_drivers.proving.walk import Manner, Step, walk
@@ -54,10 +57,26 @@ class Hand(CanAdapter[NoOptions]):
     )
 
 
+class TaringHand(Hand):
+    """One that can be told to tare.
+
+    Attributes:
+        on_tare: does it.
+    """
+
+    on_tare: Callable[[], None]
+
+    @operation()
+    async def tare(self, link: Link, patches: object) -> None:
+        """Take what is felt now for nothing."""
+        self.on_tare()
+
+
 class EmulatedHand(Emulator[EmulatorOptions]):
     """It feels what ``touch`` says, through its wiring.
 
     Attributes:
+        offset: what it shows of nothing.
         touch: module and, of it, what its taxels feel in their own order; None: nothing.
         wiring: (2 * N,) the taxel that each place of the protocol shows.
         dead: places that always say 7.
@@ -72,13 +91,14 @@ class EmulatedHand(Emulator[EmulatorOptions]):
         self.period_s = 0.01
         self.wiring, self.dead = wiring, list(dead)
         self.person: PressingPerson | None = None
+        self.offset = 10
 
     def places(self) -> npt.NDArray[np.float64]:
         return on_a_grid(2 * N, COLUMNS)
 
     def feel(self, device: Device, time_s: float) -> Sequence[int]:
         noise = (np.arange(2 * N) * 7 + device.cycle) % 3
-        felt = 10 + noise + (0 if self.person is None else np.rint(self.person.touch()).astype(np.int64))
+        felt = self.offset + noise + (0 if self.person is None else np.rint(self.person.touch()).astype(np.int64))
         shown = felt[self.wiring]
         shown[self.dead] = 7
         return [int(value) for value in np.minimum(shown, 255)]
@@ -134,19 +154,33 @@ def straight() -> npt.NDArray[np.int64]:
 
 
 @contextmanager
-def hand(person: PressingPerson, wiring: npt.NDArray[np.int64], dead: Sequence[int] = ()) -> Iterator[DriverReader]:
-    """A reader of a driver on an emulated hand that a person has."""
+def hand(
+    person: PressingPerson,
+    wiring: npt.NDArray[np.int64],
+    dead: Sequence[int] = (),
+    on_tare: Callable[[EmulatedHand], None] | None = None,
+) -> Iterator[DriverReader]:
+    """A reader of a driver on an emulated hand that a person has, and that can be tared if it is said how."""
     devices = EmulatedHand(wiring, dead)
     devices.person = person
+    driver = Hand(NoOptions()) if on_tare is None else TaringHand(NoOptions())
+    if isinstance(driver, TaringHand) and on_tare is not None:
+        driver.on_tare = partial(on_tare, devices)
     bus = VirtualCanBus.with_hardware(devices, payload_size=64)
-    with driving_lines([(Hand(NoOptions()), bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
+    with driving_lines([(driver, bus)], "hand"), DriverReader("hand", timeout_s=30) as reader:
         yield reader
 
 
-def proven(person: PressingPerson, wiring: npt.NDArray[np.int64], dead: Sequence[int] = (), **manner: Any) -> Proof:
+def proven(
+    person: PressingPerson,
+    wiring: npt.NDArray[np.int64],
+    dead: Sequence[int] = (),
+    on_tare: Callable[[EmulatedHand], None] | None = None,
+    **manner: Any,
+) -> Proof:
     """What comes of a walk."""
     proof = Proof("hand", "hand", {})
-    with hand(person, wiring, dead) as reader:
+    with hand(person, wiring, dead, on_tare) as reader:
         walk(reader, person, Manner(**{"rest_s": 1.0, "patience_s": 20.0} | manner), proof)
     return proof
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
-from tests.proving.rig import COLUMNS, NAMES, ROWS, N, PressingPerson, failed, proven, straight
+from skinware.errors import BusError
+from skinware_drivers.proving.proof import Check, Verdict
+from tests.proving.rig import COLUMNS, NAMES, ROWS, EmulatedHand, N, PressingPerson, failed, proven, straight
 
 INDEX, MIDDLE = (f"hand, {name}" for name in NAMES)
 
@@ -55,3 +60,37 @@ def test_nobody_presses_anything() -> None:
     proof = proven(PressingPerson(ignored=["press"]), straight(), patience_s=0.3, only=["index"])
     assert failed(proof) == {("right module", INDEX): "nothing was felt within 0.3 s"}
     assert not proof.is_proven
+
+
+def tared(on_tare: Callable[[EmulatedHand], None], **more: Any) -> Check:
+    """What is said of taring, by a person who presses nothing."""
+    manner: dict[str, Any] = {"patience_s": 0.1, "only": ["index"], "with_tare": True} | more
+    skipped = manner.pop("skipped", [])
+    person = PressingPerson(ignored=["press"], skipped=skipped)
+    (check,) = (one for one in proven(person, straight(), (), on_tare, **manner).checks if one.what == "tare")
+    return check
+
+
+def test_taring_is_tried_if_it_is_wanted() -> None:
+    def tare(hand: EmulatedHand) -> None:
+        hand.offset = 0
+
+    def refuse(_hand: EmulatedHand) -> None:
+        raise BusError("it is not at rest")
+
+    done = tared(tare)
+    assert (done.verdict, done.seen) == (Verdict.PASSED, "at most 2 counts is left")
+    in_vain = tared(lambda _hand: None)
+    assert (in_vain.verdict, in_vain.seen) == (Verdict.FAILED, "at most 12 counts is left")
+    refused = tared(refuse)
+    assert refused.verdict is Verdict.FAILED
+    assert "it is not at rest" in refused.seen
+
+
+def test_taring_changes_a_device_so_nobody_has_to_want_it() -> None:
+    tares: list[EmulatedHand] = []
+    unasked = tared(tares.append, with_tare=False)
+    assert (unasked.verdict, unasked.seen) == (Verdict.UNKNOWN, "not wanted (--tare)")
+    assert tares == []
+    skipped = tared(tares.append, skipped=[""])  # the rest at the beginning cannot be skipped
+    assert skipped.verdict is Verdict.SKIPPED

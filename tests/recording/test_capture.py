@@ -17,7 +17,7 @@ from skinware import DriverReader, Namespace
 from skinware.recording import Recording, WireItem
 from skinware_drivers.doctor.scrubbing import Disguise, Secrets
 from skinware_drivers.testing.waiting import wait_until
-from tests.commands import run, running
+from tests.commands import refused, run, running
 
 ARRAY = str(Path(__file__).parents[1] / "modbus" / "array_file.py")
 LOCAL = "127.0.0.1"
@@ -68,6 +68,8 @@ def test_a_capture_is_whole_and_begins_with_the_first_question(tmp_path: Path, n
     assert about["buses"]["virtual"]["medium"] == "serial"
     assert about["buses"]["virtual"]["options"]["period_ms"] == 20
     assert about["versions"].keys() == {"skinware", "numpy", "python", "linux"}
+    again = refused("skin-prove", "--captured", str(path))
+    assert (again.returncode, again.stdout.splitlines()[-1]) == (0, "equal")
 
 
 def test_a_driver_that_is_killed_leaves_a_whole_capture(tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.samples import Samples
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.testing.clock import HandClock, run_in_its_time
+from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.wire import EmulatedSerialBus
+from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
 from tests.sdk.driving import TroubledBus, driving_lines, read_until
 

@@ -172,7 +172,7 @@ def test_two_buses_cannot_have_one_port() -> None:
 
 
 class Numbered(SerialAdapter[NoOptions]):
-    """A number, 4 taxels; a datagram each."""
+    """A number, 4 taxels; a datagram each. It takes no patch for silent that a busy machine holds up."""
 
     framing = Unframed(64)
     types = (PRESSURE.measured(unit="counts"),)
@@ -180,7 +180,7 @@ class Numbered(SerialAdapter[NoOptions]):
         [Frame("taxels", [Byte(0, 0xA5)], [6], Values(2, "u1", 4), sequence=SequenceNumber(1, "u1"))],
     )
     patches = (Patch("finger", [Module(taxels(4))]),)
-    period_s = 0.01
+    period_s = 1.0
 
 
 def test_a_driver_counts_datagrams_that_were_lost_or_overtook_each_other(namespace: object) -> None:
@@ -192,17 +192,16 @@ def test_a_driver_counts_datagrams_that_were_lost_or_overtook_each_other(namespa
     bus = make_bus(f"udp://:{port}", payload_size=64)
     with sender() as device, contextlib.ExitStack() as stack:
         running = stack.enter_context(driving_lines([(Numbered(NoOptions()), bus)], "finger", wait=False))
-        wait_until(lambda: running.runner is not None and bus.fileno() >= 0)
-        say(1)
+        wait_until(lambda: running.runner is not None and running.runner.generation is not None)
+        say(1)  # what came before that belongs to nobody
         running.wait()
         for number in (2, 3, 5, 4, 6, 9, 10, 11):
             say(number)
 
-        def patch() -> dict[str, int]:
-            [one] = running.status()["patches"]
-            return dict(one)
+        expected = {"updates": 9, "sequence_lost": 4, "sequence_back": 1}
 
-        wait_until(lambda: patch()["updates"] == 9)
-        counted = patch()
-        assert counted["sequence_lost"] >= 2
-        assert counted["sequence_back"] == 1
+        def counted() -> dict[str, int]:
+            [patch] = running.status()["patches"]
+            return {name: patch[name] for name in expected}
+
+        wait_until(lambda: counted() == expected)  # each is counted by itself, in another thread

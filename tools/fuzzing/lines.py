@@ -30,9 +30,9 @@ from skinware_drivers.registry import load_driver  # noqa: E402
 from skinware_drivers.serial.adapter import SerialAdapter  # noqa: E402
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock, why_python  # noqa: E402
 from skinware_drivers.testing.both_streams import made  # noqa: E402
-from skinware_drivers.testing.clock import HandClock  # noqa: E402
 from skinware_drivers.testing.patterns import lively  # noqa: E402
 from skinware_drivers.testing.rig import Case, Running, play  # noqa: E402
+from skinware_drivers.virtual.hand_clock import HandClock  # noqa: E402
 from skinware_drivers.virtual.hardware import load_emulator  # noqa: E402
 
 _HEARD_S = 2.0

@@ -1,0 +1,108 @@
+"""``skin-prove --captured``: a capture, decoded again and compared with what was decoded then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.core import ParameterSource
+
+from skinware.cli._command import print_json
+from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware_drivers.cli.hardware_options import value_of
+
+if TYPE_CHECKING:
+    from skinware_drivers.adapter import AnyAdapter
+    from skinware_drivers.proving.updates import Comparison
+
+
+def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_json: bool) -> bool:
+    """Compare, print what comes of it, and tell whether all is equal.
+
+    Args:
+        capture: the file.
+        arguments: of skin-driver: which driver, with which options of its own.
+        save: write what is decoded now beside the file, as what is right.
+        as_json: print JSON.
+
+    Raises:
+        BadRecording: it is no recording.
+        ConfigurationError: it has no wire, or those of several drivers; or the arguments are wrong.
+        BusNotAvailable: it cannot be read.
+        DriverError: the driver failed.
+    """
+    from skinware_drivers.proving import updates
+    from skinware_drivers.proving.captures import check_capture, decoded_now, expected_of
+
+    driver, options = _chosen(capture, arguments)
+    try:
+        if save:
+            now = decoded_now(capture, driver, options)
+            if not now:
+                raise ConfigurationError(f"{capture}: nothing of it is decoded: nothing to save")
+            updates.save(now, expected_of(capture))
+        compared, now = check_capture(capture, driver, options)
+    except OSError as error:
+        raise BusNotAvailable(f"{error.filename or capture}: {error.strerror}") from None
+    if not compared.then:
+        raise ConfigurationError(
+            f"{capture}: nothing was decoded then, {compared.now} updates are now; if they are right: --save"
+        )
+    _tell(capture, compared, as_json)
+    return compared.difference is None
+
+
+def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] | None, Mapping[str, Any]]:
+    """The driver, and the options that were given to it; None: that of then.
+
+    Raises:
+        ConfigurationError: no such driver, or an option that it does not have.
+        UsageError: one that is not about decoding.
+    """
+    from skinware_drivers.cli.driver import command as driver_command
+    from skinware_drivers.options import options_from_strings
+    from skinware_drivers.proving.captures import driver_type_of
+    from skinware_drivers.registry import load_driver
+
+    if not arguments:
+        return None, {}
+    name = value_of("--driver", list(arguments)) or driver_type_of(capture)
+    context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
+    driver, given = load_driver(name), dict[str, str]()
+    for key, text in context.params.items():
+        if context.get_parameter_source(key) is not ParameterSource.COMMANDLINE or key == "driver_name":
+            continue
+        if key not in driver.Options.__struct_fields__:
+            raise click.UsageError(f"--captured: --{key.replace('_', '-')} is not about decoding")
+        given[key] = text
+    options = options_from_strings(driver.Options, given) if given else None
+    return driver, {key: getattr(options, key) for key in given}
+
+
+def _tell(capture: Path, compared: Comparison, as_json: bool) -> None:
+    difference = compared.difference
+    if as_json:
+        print_json(
+            {
+                "event": "compared",
+                "file": str(capture),
+                "equal": difference is None,
+                "compared": compared.compared,
+                "then": compared.then,
+                "now": compared.now,
+                "difference": None if difference is None else asdict(difference),
+            }
+        )
+        return
+    counts = f"{compared.then} updates of modules then, {compared.now} now, {compared.compared} compared"
+    click.echo(f"{capture}: {counts}")
+    if difference is None:
+        click.echo(click.style("equal", fg="green"))
+    else:
+        click.echo(f"{click.style('different', fg='red')} {difference}")
+
+
+__all__ = ["compare_capture"]

@@ -1,0 +1,281 @@
+"""A capture, decoded again: by the driver of now, in a time of its own, and by that of then, as it was recorded.
+
+Nothing waits for a clock: minutes of a capture take seconds, and a busy machine makes no difference.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import shutil
+from array import array
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+import skinware.recording
+from skinware.driver_service import DriverFrame, DriverReader
+from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S
+from skinware.recording import Recording, WireItem, WireTrack
+from skinware.structure import Structure
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus
+from skinware_drivers.proving.updates import Collected, Comparison, Decoding, compare, load
+from skinware_drivers.registry import load_driver
+from skinware_drivers.running.runner import Runner
+from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
+from skinware_drivers.virtual.recorded import Clock, medium_of, replayed_bus, wire_of
+
+_NAME = "captured"
+_SLOTS = 64
+_LOOK_S = 0.1
+_SETTLED_NS = NS_PER_S
+"""So long after the end, all of it was published."""
+_LATEST_NS = 60 * NS_PER_S
+"""A driver that asks for other things than then has lost so much time at most, beside twice that of the recording."""
+
+
+def expected_of(capture: Path) -> Path:
+    """The file beside a capture with the values that are expected of it, where they are not those of then."""
+    return capture.with_suffix(".npz")
+
+
+def check_capture(
+    capture: Path, driver: type[AnyAdapter] | None = None, options: Mapping[str, Any] | None = None
+) -> tuple[Comparison, Decoding]:
+    """Compare what a driver makes of a capture now with what is expected.
+
+    Expected are the values in the file beside it (:func:`expected_of`), or else those that were decoded and recorded
+    then.
+
+    Args:
+        capture: a recording of one driver, with its wires.
+        driver: default: the one of then.
+        options: of the driver, beside those that it had then.
+
+    Returns:
+        The comparison, and what is made of it now.
+
+    Raises:
+        BadRecording: it is no recording.
+        ConfigurationError: it has no wire, or those of several drivers; or the options are wrong.
+        DriverError: the driver failed.
+        OSError: a file cannot be read.
+    """
+    now = decoded_now(capture, driver, options)
+    beside = expected_of(capture)
+    return compare(load(beside) if beside.exists() else decoded_then(capture), now), now
+
+
+def decoded_then(capture: Path) -> Decoding:
+    """What the driver published while it was captured.
+
+    Raises:
+        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`.
+    """
+    with skinware.recording.open(capture) as recording:
+        wires = _wires(recording)
+        found = Collected(_began_ns(recording, wires))
+        if wires[0].driver in recording.drivers:
+            for part in recording[wires[0].driver].parts:
+                series = part.read(["values", "module_time_ns"])
+                found.add(series.structure, series.column("values"), series.column("module_time_ns"))
+        return found.decoding()
+
+
+def decoded_now(
+    capture: Path, driver: type[AnyAdapter] | None = None, options: Mapping[str, Any] | None = None
+) -> Decoding:
+    """What a driver makes of a capture now; see :func:`check_capture`."""
+    with skinware.recording.open(capture) as recording:
+        wires = _wires(recording)
+        about = recording.about(wires[0].driver)
+        began_ns, listens = _began_ns(recording, wires), bool(about.get("listen_only"))
+        clock = HandClock()
+        replays = [_Replay(recording, wire, listens, clock) for wire in wires]
+        driver = driver or load_driver(_driver_type(recording, about))
+        of_buses = about.get("buses", {})
+        for replay in replays:
+            usual = of_buses.get(replay.wire.bus, {}).get("options", {})
+            replay.prepare(driver, {**usual, **(options or {})})
+    found, namespace = _Published(), Namespace(f"captured-{os.getpid()}-{secrets.token_hex(4)}")
+    try:
+        with package_on(clock), asyncio.Runner(loop_factory=lambda: HandLoop(clock)) as loop:
+            loop.run(_run(clock, replays, found, namespace, listens))
+    finally:
+        found.close()
+        shutil.rmtree(namespace.path, ignore_errors=True)
+    return found.decoding(replays, began_ns)
+
+
+def driver_type_of(capture: Path) -> str:
+    """The driver of then, as ``--driver`` takes it.
+
+    Raises:
+        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`; or the file does not tell it.
+    """
+    with skinware.recording.open(capture) as recording:
+        return _driver_type(recording, recording.about(_wires(recording)[0].driver))
+
+
+def _driver_type(recording: Recording, about: Mapping[str, Any]) -> str:
+    if "driver_type" not in about:
+        raise ConfigurationError(f"{recording.path}: an earlier version has recorded it: name its driver")
+    return str(about["driver_type"])
+
+
+def _wires(recording: Recording) -> Sequence[WireTrack]:
+    """Those of the only driver."""
+    if len({wire.driver for wire in recording.wires}) > 1:
+        names = ", ".join(sorted({wire.driver for wire in recording.wires}))
+        raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}): a capture has those of one")
+    return recording.wires or [wire_of(recording)]  # which says that there is none
+
+
+def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
+    """When the recording began, CLOCK_MONOTONIC of then."""
+    first = next((item for wire in wires for item in wire.items()), None)
+    return 0 if first is None else first.time_ns - (first.epoch_ns - recording.start_ns)
+
+
+class _Replay:
+    """One wire, and the adapter of the driver that is on it now.
+
+    Args:
+        recording: in which it is.
+        wire: it.
+        listens: the driver is to send nothing.
+        clock: in whose time.
+    """
+
+    def __init__(self, recording: Recording, wire: WireTrack, listens: bool, clock: HandClock) -> None:
+        self.wire = wire
+        self._path, self._listens, self._clock = recording.path, listens, clock
+        self._medium = medium_of(recording, wire)
+        self._times = [item.time_ns for item in wire.items() if self._is_given(item)]
+        self._stamps_ns, self._then_ns = array("q"), array("q")
+        self.line: tuple[str, AnyAdapter, Bus] | None = None
+
+    def prepare(self, driver: type[AnyAdapter], options: Mapping[str, Any]) -> None:
+        """Make the adapter, and its bus.
+
+        Raises:
+            ConfigurationError: the driver has no such options, or is for another kind of bus.
+        """
+        kind = next((one for one in (driver, *driver.elsewhere) if one.medium == self._medium), driver)
+        try:
+            adapter = kind(msgspec.convert(dict(options), kind.Options, strict=False))
+        except msgspec.ValidationError as error:
+            raise ConfigurationError(f"options of {kind.__name__}: {error}") from None
+        adapter.check()
+        bus = replayed_bus(
+            str(self._path),
+            {"bus": self.wire.bus, "driver": self.wire.driver},
+            payload_size=adapter.payload_size,
+            listen_only=self._listens,
+            clock=Clock(self._clock, self._clock.timer),
+            note=self._note,
+        )
+        self.line = self.wire.bus, adapter, bus
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all of it was given."""
+        return not self._times or (len(self._then_ns) > 0 and self._then_ns[-1] >= self._times[-1])
+
+    @property
+    def duration_ns(self) -> int:
+        """From the first to the last."""
+        return self._times[-1] - self._times[0] if self._times else 0
+
+    def _is_given(self, item: WireItem) -> bool:
+        """Whether the replayed bus gives it to the driver."""
+        if item.is_sent:
+            return self._medium == "modbus"
+        return not (item.identifier or 0) & (ERROR_FLAG | REMOTE_FLAG)
+
+    def _note(self, stamp_ns: int, then_ns: int) -> None:
+        self._stamps_ns.append(stamp_ns)
+        self._then_ns.append(then_ns)
+
+    def then_ns(self, time_ns: np.ndarray[Any, np.dtype[np.int64]]) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """When it was then what has these times now; 0 stays 0."""
+        stamps_ns = np.frombuffer(self._stamps_ns, np.int64)
+        if not len(stamps_ns):
+            return time_ns
+        at = np.maximum(np.searchsorted(stamps_ns, time_ns, side="right") - 1, 0)
+        later_ns = stamps_ns[at] - np.frombuffer(self._then_ns, np.int64)[at]
+        return np.where(time_ns == 0, 0, time_ns - later_ns)
+
+
+class _Published:
+    """Every frame that a driver publishes."""
+
+    def __init__(self) -> None:
+        self._reader: DriverReader | None = None
+        self._frames: list[tuple[Structure, list[DriverFrame]]] = []
+        self._last: tuple[int, int] | None = None
+
+    def look(self, runner: Runner, namespace: Namespace) -> None:
+        """Take what has been published."""
+        if self._reader is None:
+            if runner.writer is None or runner.writer.closed:
+                return
+            self._reader = DriverReader(runner.name, namespace=namespace, announce=False)
+        while self._reader.refresh() not in (None, self._last):
+            try:
+                frame = next(self._reader.in_order(timeout_s=0))
+            except ServiceTimeout:
+                return
+            except StructureChanged:
+                self._reader.reattach()
+                continue
+            self._last = frame.position
+            if not self._frames or self._frames[-1][0] is not frame.structure:
+                self._frames.append((frame.structure, []))
+            self._frames[-1][1].append(frame)
+
+    def decoding(self, replays: Sequence[_Replay], began_ns: int) -> Decoding:
+        """What was new in them, with the times of then."""
+        found = Collected(began_ns)
+        for structure, frames in self._frames:
+            times = np.array([frame.module_time_ns for frame in frames])
+            bus = np.asarray(structure.patch_bus)[np.asarray(structure.module_patch)]
+            for number, replay in enumerate(replays):
+                times[:, bus == number] = replay.then_ns(times[:, bus == number])
+            found.add(structure, np.array([frame.values for frame in frames]), times)
+        return found.decoding()
+
+    def close(self) -> None:
+        """Let go of the reader."""
+        if self._reader is not None:
+            self._reader.close()
+
+
+async def _run(
+    clock: HandClock, replays: Sequence[_Replay], found: _Published, namespace: Namespace, listens: bool
+) -> None:
+    """Run the driver until all was given, and published."""
+    lines = [replay.line for replay in replays if replay.line is not None]
+    runner = Runner(_NAME, lines, name=_NAME, listen_only=listens, namespace=namespace, slots=_SLOTS, publish="cycle")
+    running = asyncio.create_task(runner.run())
+    latest_ns = clock.now_ns + _LATEST_NS + 2 * max(replay.duration_ns for replay in replays)
+    clock.before_passing.append(lambda: found.look(runner, namespace))
+    over_ns = latest_ns
+    while clock.now_ns < over_ns and not running.done():
+        await asyncio.sleep(_LOOK_S)
+        if over_ns == latest_ns and all(replay.is_over for replay in replays):
+            over_ns = clock.now_ns + _SETTLED_NS
+    clock.before_passing.clear()
+    found.look(runner, namespace)
+    runner.stop()
+    await running
+
+
+__all__ = ["check_capture", "decoded_now", "decoded_then", "driver_type_of", "expected_of"]

@@ -1,0 +1,233 @@
+"""What a driver made of a wire, update by update, and the first in which it makes something else of it now.
+
+An update is what a module showed at one time. Two decoders are compared by the updates that have the same time; a
+little apart is allowed, since the clocks of devices are only estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import BadRecording
+from skinware.realtime import NS_PER_S
+from skinware.structure import Structure
+
+Times = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Updates:
+    """Of one module, in order.
+
+    Attributes:
+        sensors: (n,) names.
+        time_ns: (k,) int64, when, since the recording began.
+        values: (k, n) raw.
+    """
+
+    sensors: tuple[str, ...]
+    time_ns: Times
+    values: npt.NDArray[Any]
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+
+Decoding = Mapping[tuple[int, ...], Updates]
+"""All modules of which something came, by the uids of their sensors."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Something that one decoder makes of a wire and the other does not.
+
+    Attributes:
+        time_s: since the recording began.
+        sensor: name of the first that differs.
+        then, now: its raw value; None: there is no such update.
+    """
+
+    time_s: float
+    sensor: str
+    then: float | None
+    now: float | None
+
+    def __str__(self) -> str:
+        then, now = ("no update" if value is None else f"{value:g}" for value in (self.then, self.now))
+        return f"at {self.time_s:.4f} s, {self.sensor}: {then} then, {now} now"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two decodings of one wire.
+
+    Attributes:
+        compared: updates that both have, and that were compared.
+        then, now: updates that each has.
+        difference: the first by time; None: they are equal.
+    """
+
+    compared: int
+    then: int
+    now: int
+    difference: Difference | None
+
+
+class Collected:
+    """Puts updates together from frames, as they are published.
+
+    Args:
+        began_ns: when the recording began, in the time of the frames.
+    """
+
+    def __init__(self, began_ns: int = 0) -> None:
+        self._began_ns = began_ns
+        self._parts: dict[tuple[int, ...], list[Updates]] = {}
+
+    def add(self, structure: Structure, values: npt.NDArray[Any], module_time_ns: Times) -> None:
+        """Frames of one structure, in order.
+
+        Args:
+            structure: of the driver.
+            values: (frames, sensors) raw.
+            module_time_ns: (frames, modules) int64; 0: never seen.
+        """
+        for module in range(structure.n_modules):
+            mine = np.flatnonzero(structure.sensor_module == module)
+            time_ns = module_time_ns[:, module]
+            rows = np.flatnonzero((time_ns != 0) & np.r_[True, np.diff(time_ns) != 0])
+            if len(mine) and len(rows):
+                names = tuple(structure.sensor_name(int(position)) for position in mine)
+                found = Updates(names, time_ns[rows] - self._began_ns, values[np.ix_(rows, mine)])
+                self._parts.setdefault(tuple(structure.sensor_uid[mine].tolist()), []).append(found)
+
+    def decoding(self) -> Decoding:
+        """All of them, by time, each once."""
+        return {uids: _joined(parts) for uids, parts in self._parts.items()}
+
+
+def _joined(parts: list[Updates]) -> Updates:
+    time_ns, values = np.concatenate([part.time_ns for part in parts]), np.concatenate([part.values for part in parts])
+    time_ns, first = np.unique(time_ns, return_index=True)
+    return Updates(parts[-1].sensors, time_ns, values[first])
+
+
+def compare(then: Decoding, now: Decoding) -> Comparison:
+    """Hold two decodings of one wire against each other.
+
+    What is made of the beginning may differ: until a driver knows its devices, it shows nothing. So each module is
+    compared from its first common update to its last. In between, each update of then has to be there now, with the
+    same values. More of them now is no difference: a machine may have been too busy then to show all.
+    """
+    pairs = list(_in_pairs(then, now))
+    differences = sorted((found for _, found in pairs if found is not None), key=lambda one: one.time_s)
+    return Comparison(
+        sum(compared for compared, _ in pairs),
+        sum(map(len, then.values())),
+        sum(map(len, now.values())),
+        differences[0] if differences else None,
+    )
+
+
+def _in_pairs(then: Decoding, now: Decoding) -> Iterator[tuple[int, Difference | None]]:
+    """How many updates of each module were compared, and the first that differs."""
+    for uids, old in then.items():
+        new = now.get(uids)
+        yield (0, _without_partner(old, 0, is_then=True)) if new is None else _of_module(old, new)
+    for uids, new in now.items():
+        if uids not in then:
+            yield 0, _without_partner(new, 0, is_then=False)
+
+
+def _of_module(old: Updates, new: Updates) -> tuple[int, Difference | None]:
+    if old.values.shape[1:] != new.values.shape[1:]:
+        return 0, _without_partner(old, 0, is_then=True)
+    nearest, is_paired = _partners(old.time_ns, new.time_ns)
+    rows = np.flatnonzero(is_paired)
+    if not len(rows):
+        return 0, _without_partner(old, 0, is_then=True)
+    within = np.arange(rows[0], rows[-1] + 1)
+    one, other = old.values[within], new.values[nearest[within]]
+    differs = (one != other) & ~((one != one) & (other != other))
+    wrong = np.flatnonzero(~is_paired[within] | differs.any(axis=1))
+    if not len(wrong):
+        return len(rows), None
+    first = int(wrong[0])
+    if not is_paired[within[first]]:
+        return len(rows), _without_partner(old, int(within[first]), is_then=True)
+    sensor = int(np.flatnonzero(differs[first])[0])
+    time_s = float(old.time_ns[within[first]]) / NS_PER_S
+    found = Difference(time_s, old.sensors[sensor], float(one[first, sensor]), float(other[first, sensor]))
+    return len(rows), found
+
+
+def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:
+    """(k,) which update now is nearest to each of then; and whether it is the same one: nearest to each other."""
+    nearest, back = _nearest(old_ns, new_ns), _nearest(new_ns, old_ns)
+    apart_ns = np.abs(new_ns[nearest] - old_ns)
+    usual_ns = float(np.median(np.diff(old_ns))) if len(old_ns) > 1 else np.inf
+    return nearest, (back[nearest] == np.arange(len(old_ns))) & (apart_ns < usual_ns / 2)
+
+
+def _nearest(of_ns: Times, in_ns: Times) -> Times:
+    """(len(of_ns),) the place of the nearest in a rising order."""
+    after = np.clip(np.searchsorted(in_ns, of_ns), 1, max(1, len(in_ns) - 1))
+    if len(in_ns) == 1:
+        return np.zeros(len(of_ns), np.int64)
+    is_before = of_ns - in_ns[after - 1] <= in_ns[after] - of_ns
+    found: Times = after - is_before
+    return found
+
+
+def _without_partner(of: Updates, row: int, *, is_then: bool) -> Difference:
+    value = float(of.values[row, 0])
+    then, now = (value, None) if is_then else (None, value)
+    return Difference(float(of.time_ns[row]) / NS_PER_S, of.sensors[0], then, now)
+
+
+def save(decoding: Decoding, path: Path) -> None:
+    """Write a decoding into a file that others are held against.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    arrays: dict[str, Any] = {}
+    for number, (uids, of) in enumerate(decoding.items()):
+        arrays |= {
+            f"{number}.uids": np.array(uids, np.uint64),
+            f"{number}.sensors": np.array(of.sensors),
+            f"{number}.time_ns": of.time_ns,
+            f"{number}.values": of.values,
+        }
+    np.savez_compressed(path, **arrays)
+
+
+def load(path: Path) -> Decoding:
+    """Read what :func:`save` has written.
+
+    Raises:
+        BadRecording: it is no such file.
+        OSError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            return dict(_modules_in(file, file.files))
+    except (ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise BadRecording(f"{path}: no values that skin-prove has saved ({error})") from None
+
+
+def _modules_in(file: Mapping[str, Any], names: Iterable[str]) -> Iterator[tuple[tuple[int, ...], Updates]]:
+    for number in sorted({int(name.partition(".")[0]) for name in names}):
+        uids, sensors, time_ns, values = (file[f"{number}.{what}"] for what in ("uids", "sensors", "time_ns", "values"))
+        yield tuple(uids.tolist()), Updates(tuple(sensors.tolist()), time_ns, values)
+
+
+__all__ = ["Collected", "Comparison", "Decoding", "Difference", "Updates", "compare", "load", "save"]

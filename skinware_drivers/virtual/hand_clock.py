@@ -1,0 +1,194 @@
+"""Time that passes only when nothing is left to be done: a driver of minutes runs in a moment, always the same way.
+
+:class:`HandClock` is the time, :class:`HandLoop` an event loop in it: timers and sleeps follow it, and inside of
+:func:`package_on` the time stamps of the whole package. Whenever the loop would sleep, the clock jumps to the moment at
+which the next thing happens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import selectors
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import skinware.realtime
+
+_BEGINNING_NS = 5_000_000_000_000
+_TURNS_AT_ONE_MOMENT = 20_000
+_NAPS_WITHOUT_TIMER = 40
+_NAP_S = 0.05
+
+
+class NeverEnds(BaseException):
+    """Something blocks, loops without end, or waits for what can never come: in such a time, that is for ever.
+
+    The message says what, and what to do. It is no :class:`Exception`: nothing of a driver catches it.
+    """
+
+
+class HandClock:
+    """CLOCK_MONOTONIC as a test has it, ns. Called, it tells the time.
+
+    Attributes:
+        now_ns: the time.
+        before_passing: called before every jump: everything of this moment has happened.
+        turns: of the event loop so far.
+    """
+
+    def __init__(self) -> None:
+        self.now_ns: int = _BEGINNING_NS
+        self.before_passing: list[Callable[[], object]] = []
+        self.turns = 0
+        self._timers: set[HandTimer] = set()
+
+    def __call__(self) -> int:
+        """The time."""
+        return self.now_ns
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since the beginning."""
+        return (self.now_ns - _BEGINNING_NS) / 1e9
+
+    def timer(self) -> HandTimer:
+        """A descriptor that becomes readable at a moment of this clock."""
+        timer = HandTimer(self)
+        self._timers.add(timer)
+        return timer
+
+    def forget(self, timer: HandTimer) -> None:
+        """Called by a timer that is closed."""
+        self._timers.discard(timer)
+
+    def next_timer_ns(self) -> int | None:
+        """When the next of the timers will be due. Those that are due already are their readers' affair."""
+        due_ns = [timer.due_ns for timer in self._timers if timer.due_ns is not None and timer.due_ns > self.now_ns]
+        return min(due_ns, default=None)
+
+    def pass_to(self, time_ns: int) -> None:
+        """Let time pass."""
+        for action in self.before_passing:
+            action()
+        self.now_ns = max(self.now_ns, time_ns)
+        for timer in list(self._timers):
+            timer.look()
+
+
+class HandTimer:
+    """What :class:`skinware_drivers.virtual.timer.MonotonicTimer` is, for a :class:`HandClock`."""
+
+    def __init__(self, clock: HandClock) -> None:
+        self._clock = clock
+        self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._is_readable = False
+        self.due_ns: int | None = None
+
+    def fileno(self) -> int:
+        """The descriptor; -1 once closed."""
+        return self._fd
+
+    def wake_at(self, time_ns: int | None) -> None:
+        """Make the descriptor readable at ``time_ns``, and not before."""
+        self.due_ns = time_ns
+        self.look()
+
+    def look(self) -> None:
+        """Whether it is time."""
+        due = self.due_ns is not None and self.due_ns <= self._clock.now_ns
+        if due and not self._is_readable:
+            os.eventfd_write(self._fd, 1)
+        elif self._is_readable and not due:
+            os.eventfd_read(self._fd)
+        self._is_readable = due
+
+    def close(self) -> None:
+        """Give the descriptor back. Idempotent."""
+        if self._fd >= 0:
+            self._clock.forget(self)
+            os.close(self._fd)
+            self._fd = -1
+
+
+class _PassingTime(selectors.EpollSelector):
+    """Where the event loop would sleep, time passes instead."""
+
+    def __init__(self, clock: HandClock) -> None:
+        super().__init__()
+        self._clock = clock
+        self._turns_now = 0
+        self._naps = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """What is ready, after time has passed until something is."""
+        self._clock.turns += 1
+        self._turns_now += 1
+        if self._turns_now > _TURNS_AT_ONE_MOMENT:
+            raise NeverEnds("the driver loops without end and without a wait (await link.sleep)")
+        ready = super().select(0)
+        if ready or (timeout is not None and timeout <= 0):
+            return ready
+        moments = [] if timeout is None else [self._clock.now_ns + max(1, round(timeout * 1e9))]
+        timer_ns = self._clock.next_timer_ns()
+        if timer_ns is not None:
+            moments.append(timer_ns)
+        if not moments:  # only another thread can go on
+            self._naps += 1
+            if self._naps > _NAPS_WITHOUT_TIMER:
+                raise NeverEnds("the driver waits indefinitely: give the wait a timeout")
+            return super().select(_NAP_S)
+        self._turns_now = self._naps = 0
+        self._clock.pass_to(min(moments))
+        return super().select(0)
+
+
+class HandLoop(asyncio.SelectorEventLoop):
+    """An event loop in a clock's time.
+
+    Args:
+        clock: the time.
+    """
+
+    def __init__(self, clock: HandClock) -> None:
+        self._hand_clock = clock
+        super().__init__(_PassingTime(clock))
+
+    def time(self) -> float:
+        """As the clock says, s."""
+        return self._hand_clock.now_ns / 1e9
+
+
+@contextmanager
+def package_on(clock: HandClock) -> Iterator[None]:
+    """Everything that asks ``skinware.realtime.now_ns`` gets the time of a clock; ``time.sleep`` raises."""
+    real_now_ns, real_sleep, thread = skinware.realtime.now_ns, time.sleep, threading.get_ident()
+    users = [module for module in sys.modules.values() if vars(module).get("now_ns") is real_now_ns]
+
+    def sleep(seconds: Any) -> None:
+        if threading.get_ident() != thread:
+            real_sleep(seconds)
+            return
+        where = traceback.extract_stack(limit=2)[0]
+        raise NeverEnds(
+            f"the driver blocks: {where.filename}:{where.lineno}, in {where.name}, calls time.sleep({seconds:g}):"
+            " nothing is read from any bus meanwhile; write `await link.sleep(...)`"
+        )
+
+    try:
+        for module in users:
+            vars(module)["now_ns"] = clock
+        time.sleep = sleep
+        yield
+    finally:
+        time.sleep = real_sleep
+        for module in users:
+            vars(module)["now_ns"] = real_now_ns
+
+
+__all__ = ["HandClock", "HandLoop", "HandTimer", "NeverEnds", "package_on"]

@@ -151,6 +151,8 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
     with contextlib.closing(Link(places)) as link:
         watcher = Watcher(link)
         listed = _Listed(watcher, places.connect, tls, as_json=as_json, watch=watch)
+        if watch and as_json:
+            print_json({"event": "ready", "connect": list(places.connect)})
         with signals_end(watcher.stop):
             watcher.run(listed.tell)
     if listed.why:

@@ -9,10 +9,23 @@ from skinware.errors import MissingExtra
 if find_spec("zenoh") is None:
     raise MissingExtra("bridges need packages that are not installed: pip install 'skinware[zenoh]'")
 
-from skinware.bridge.endpoints import DEFAULT_LISTEN, Endpoints, endpoints
+from skinware.bridge.access import Rules
+from skinware.bridge.endpoints import DEFAULT_LISTEN, DEFAULT_ROUTER, Endpoints, endpoints
 from skinware.bridge.joining import Joiner
 from skinware.bridge.link import Link
 from skinware.bridge.messages import Wish
 from skinware.bridge.serving import Server
+from skinware.bridge.watching import Watcher
 
-__all__ = ["DEFAULT_LISTEN", "Endpoints", "Joiner", "Link", "Server", "Wish", "endpoints"]
+__all__ = [
+    "DEFAULT_LISTEN",
+    "DEFAULT_ROUTER",
+    "Endpoints",
+    "Joiner",
+    "Link",
+    "Rules",
+    "Server",
+    "Watcher",
+    "Wish",
+    "endpoints",
+]

@@ -1,4 +1,4 @@
-"""Where a bridge listens and connects, and who may do what there."""
+"""Where a bridge listens and connects."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from skinware.bridge.access import Rules
 from skinware.errors import ConfigurationError
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.%\w]+\]|[^\s/:\[\]]+):(\d{1,5})")
-DEFAULT_LISTEN = "tcp/127.0.0.1:7448"
+DEFAULT_LISTEN, DEFAULT_ROUTER = "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7447"
 _ALL = "skinware/**"
-_OF_A_ROBOT = "skinware/*/*/*"
-_CALLS = f"{_OF_A_ROBOT}/*/call/**"
-_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("clock", "services", "*/generation", "*/newest")]
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,7 @@ class Endpoints:
     Attributes:
         listen: its endpoints there, ``tcp/HOST:PORT`` or ``tls/HOST:PORT``.
         connect: those of others.
-        mode: ``peer``, or ``router`` that passes on what peers say.
+        mode: ``peer``, which speaks with those that it is connected to; ``router``, which speaks through others, too.
         patience_us: how long a frame may wait for a receiver that is too slow before it is left out for that one.
         security: settings of zenoh.
     """
@@ -50,10 +48,8 @@ def endpoints(
     listen: Sequence[str] = (),
     connect: Sequence[str] = (),
     tls: Path | None = None,
-    serves: bool = False,
-    callers: Sequence[str] = (),
+    rules: Rules | None = None,
     insecure: bool = False,
-    mode: str = "peer",
     patience_us: float = 1000.0,
 ) -> Endpoints:
     """Endpoints from what a person wrote.
@@ -62,10 +58,8 @@ def endpoints(
         listen: where to listen.
         connect: where to connect.
         tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``; both ends show a certificate of that authority.
-        serves: it speaks for a robot, and others only listen, ask and call.
-        callers: names in the certificates of those who may call operations, with ``tls``; none: all may.
+        rules: what others may do; None: it only joins.
         insecure: listen beyond this machine without TLS.
-        mode: of the session.
         patience_us: likewise.
 
     Raises:
@@ -74,16 +68,18 @@ def endpoints(
     security = {} if tls is None else _tls(tls)
     protocol = None if tls is None else "tls"
     places = [_endpoint(text, protocol) for text in listen]
-    if callers and tls is None:
-        raise ConfigurationError("who may call is told by the names in certificates: give --tls, too")
-    if serves:
-        security["access_control"] = _rules(callers)
+    if rules is not None:
+        if rules.names_people and tls is None:
+            raise ConfigurationError("who may do what is told by the names in certificates: give --tls, too")
+        security["access_control"] = rules.text()
     for place in places:
         if place.startswith("tcp/") and not insecure and not _is_of_this_machine(place):
             raise ConfigurationError(
                 f"{place} is beyond this machine, and everybody there could read the skin and call its operations:"
                 " give --tls DIR, or --insecure where the network itself is trusted"
             )
+    passes_on = rules is not None and (rules.routes or bool(connect))  # routers leave out peers of each other
+    mode = "router" if passes_on else "peer"
     return Endpoints(places, [_endpoint(text, protocol) for text in connect], mode, patience_us, security)
 
 
@@ -132,31 +128,4 @@ def _tls(folder: Path) -> dict[str, str]:
     return {**told, "transport/link/tls/enable_mtls": "true"}
 
 
-def _rules(callers: Sequence[str]) -> str:
-    """What zenoh lets others do: see and ask; call only who may; and nobody else speaks for the robot."""
-    listening = ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
-    speaking = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
-    rule = {"permission": "allow", "flows": ["ingress"], "messages": ["query"]}
-    subject: dict[str, object] = {"id": "callers"}
-    if callers:
-        subject["cert_common_names"] = list(callers)
-    return json.dumps(
-        {
-            "enabled": True,
-            "default_permission": "deny",
-            "rules": [
-                {**rule, "id": "see", "messages": listening, "key_exprs": [_ALL]},
-                {**rule, "id": "ask", "key_exprs": _QUESTIONS},
-                {**rule, "id": "call", "key_exprs": [_CALLS]},
-                {**rule, "id": "tell", "messages": speaking, "flows": ["egress"], "key_exprs": [_ALL]},
-            ],
-            "subjects": [{"id": "all"}, subject],
-            "policies": [
-                {"rules": ["see", "ask", "tell"], "subjects": ["all"]},
-                {"rules": ["call"], "subjects": ["callers"]},
-            ],
-        }
-    )
-
-
-__all__ = ["DEFAULT_LISTEN", "Endpoints", "endpoints", "tls_files"]
+__all__ = ["DEFAULT_LISTEN", "DEFAULT_ROUTER", "Endpoints", "endpoints", "tls_files"]

@@ -112,6 +112,49 @@ class Wish(msgspec.Struct, frozen=True):
         return SensorChoice((), self.patches, Regions(self.regions), self.in_regions)
 
 
+class DriverSummary(msgspec.Struct, frozen=True):
+    """How a driver is.
+
+    Attributes:
+        state: ``live``, ``paused``, ``closed`` or ``dead``.
+        rate_hz: frames in the last second.
+        age_ms: of the newest data in its newest frame, on the robot; None before the first.
+        lost: frames lost on its buses since it started.
+        sensors, fresh: how many it has, and of how many the value is good and new.
+        patches: how many it has.
+        silent: names of patches that do not send, the first of them.
+        n_silent: how many those are.
+        problems: what is not in order: the driver, or each of its buses and patches.
+    """
+
+    state: str
+    rate_hz: float
+    age_ms: float | None
+    lost: int
+    sensors: int
+    fresh: int
+    patches: int
+    silent: tuple[str, ...]
+    n_silent: int
+    problems: int
+
+
+class Summary(msgspec.Struct, frozen=True):
+    """How a robot is.
+
+    Attributes:
+        namespace: that is served.
+        drivers: by name.
+        services: how many others there are.
+        lost: frames that the bridge could not take from their rings.
+    """
+
+    namespace: str
+    drivers: dict[str, DriverSummary] = {}
+    services: int = 0
+    lost: int = 0
+
+
 class About(msgspec.Struct, frozen=True):
     """What a generation's file does not tell.
 
@@ -140,6 +183,7 @@ class Answered(msgspec.Struct, frozen=True):
 
 
 ALL_TOKENS = "skinware/live/*/*/*"
+ALL_SUMMARIES = f"skinware/{VERSION}/*/*/summary"
 
 
 class Keys:
@@ -185,6 +229,12 @@ def parts_of(key: str) -> tuple[str, str]:
     """(service, operation or what else) of a key of a service."""
     parts = key.split("/")
     return parts[4], parts[-1]
+
+
+def bridge_of(key: str) -> tuple[str, str]:
+    """(robot, instance) of a key of a robot."""
+    robot, instance = key.split("/")[2:4]
+    return robot, instance
 
 
 def token_parts(key: str) -> tuple[str, int, str]:

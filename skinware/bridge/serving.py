@@ -18,6 +18,7 @@ from skinware.bridge.giving import Stream
 from skinware.bridge.link import Link, Question
 from skinware.bridge.messages import CLOCK, About, Keys, Service, Services, Wish, generation_message, parts_of
 from skinware.bridge.parts import Parts
+from skinware.bridge.summaries import Summaries, Summarised
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
@@ -97,6 +98,7 @@ class Server:
         self._calls = Calls(namespace)
         self._coding = ThreadPoolExecutor(1, "skinware bridge coding")
         self._parts = Parts(self._stream)
+        self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
         self._stopping = False
         self._collector = Collector(namespace, names, self)
         self._answering = [
@@ -122,6 +124,7 @@ class Server:
                 if now_ns() >= tell_ns:
                     tell_ns = max(tell_ns + NS_PER_S, now_ns())
                     self._let_go()
+                    self._soon(self._summarise)
                     tell()
                 self._collector.wait(WAIT_SLICE_NS)
 
@@ -185,6 +188,24 @@ class Server:
     def _stream(self, service: str, part: str = "") -> Stream:
         return Stream(self._link.sender(self._keys.frame(service, part)), self._soon)
 
+    def _summarise(self) -> None:
+        there = self._there()
+        self._summaries.count({whole.name: stream.frames for whole, _, stream in there})
+        if not self._summaries.is_wanted:
+            return
+        drivers = [
+            Summarised(whole.name, told.state, generation, stream)
+            for whole, told, stream in there
+            if (generation := whole.of_driver) is not None
+        ]
+        self._summaries.send(drivers, len(there) - len(drivers), self.lost)
+
+    def _there(self) -> list[tuple[_Whole, Service, Stream]]:
+        """The services that are there now."""
+        with self._lock:
+            services = [(served.whole, served.told, served.stream) for served in self._services.values()]
+        return [service for service in services if service[1].state != "closed"]
+
     def _soon(self, work: Callable[..., None], *arguments: object) -> None:
         """Have frames coded, or cut, after what waits for that already."""
         with contextlib.suppress(RuntimeError):  # it is closed
@@ -226,10 +247,8 @@ class Server:
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:
         """Cut a part out of all drivers, and note those that have any of it; what is not there, a line for people."""
         part, structures = self._parts.wanted(wish), []
-        with self._lock:
-            there = [(served.whole, served.told, served.stream) for served in self._services.values()]
-        for whole, told, stream in there:
-            driver = whole.of_driver if told.state != "closed" else None
+        for whole, told, stream in self._there():
+            driver = whole.of_driver
             if driver is None or not isinstance(driver.context, Structure):
                 continue
             structures.append(driver.context)

@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import click
@@ -61,6 +62,16 @@ def namespace_option(command: _Decorated) -> _Decorated:
 def json_option(command: _Decorated) -> _Decorated:
     """``--json``."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
+
+
+def tls_option(command: _Decorated) -> _Decorated:
+    """``--tls DIR``."""
+    return click.option(
+        "--tls",
+        metavar="DIR",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
+    )(command)
 
 
 def version_option(command: _Decorated) -> _Decorated:

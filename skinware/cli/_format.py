@@ -102,3 +102,13 @@ def wrapped(line: str, width: int | None) -> list[str]:
         elif word:
             lines.append(f"{indent}    {word}")
     return lines
+
+
+def redraw(lines: list[str]) -> None:
+    """Put lines in the place of what is on the terminal, without flicker; what does not fit is cut."""
+    height = shutil.get_terminal_size().lines - 1
+    if len(lines) > height:
+        lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
+    if click.get_current_context().color is False:
+        lines = [click.unstyle(line) for line in lines]
+    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False, color=True)

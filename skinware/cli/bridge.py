@@ -18,9 +18,11 @@ from skinware.cli._command import (
     print_json,
     run,
     signals_end,
+    tls_option,
     version_option,
     warn,
 )
+from skinware.cli._robots import list_robots, route
 from skinware.errors import ConfigurationError
 from skinware.realtime import now_ns
 
@@ -28,12 +30,6 @@ if TYPE_CHECKING:
     from skinware.bridge import Joiner, Server, Wish
 
 _PORT = 7448
-_tls_option = click.option(
-    "--tls",
-    metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
-)
 
 
 @click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
@@ -41,11 +37,13 @@ _tls_option = click.option(
 def command() -> None:
     """Have the drivers and services of one machine on another, as if they ran there; or in a ROS 2 graph.
 
-    On the robot: skin-bridge serve. Elsewhere: skin-bridge join. For ROS 2: skin-bridge ros2.
+    On the robot: skin-bridge serve. Elsewhere: skin-bridge join. For many robots: skin-bridge list, skin-bridge route.
+    For ROS 2: skin-bridge ros2.
     """
 
 
-command.add_command(bridge_ros2.command)
+for _each in (route, list_robots, bridge_ros2.command):
+    command.add_command(_each)
 
 
 @command.command(
@@ -66,7 +64,7 @@ command.add_command(bridge_ros2.command)
     help=f"Where others connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router to connect to, instead of being called.")
-@_tls_option
+@tls_option
 @click.option(
     "--caller",
     "callers",
@@ -94,7 +92,7 @@ def serve(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.bridge import DEFAULT_LISTEN, Link, Server, endpoints
+    from skinware.bridge import DEFAULT_LISTEN, Link, Rules, Server, endpoints
     from skinware.memory.namespace import Namespace, check_name
 
     for name in names:
@@ -104,8 +102,7 @@ def serve(
         listen=listen or (() if connect else (DEFAULT_LISTEN,)),
         connect=connect,
         tls=tls,
-        serves=True,
-        callers=callers,
+        rules=Rules(callers),
         insecure=insecure,
     )
     with contextlib.closing(Link(places)) as link:
@@ -154,7 +151,7 @@ class _Serving:
 @click.argument("robot", metavar="R")
 @click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Where it is: tcp/HOST:PORT.")
 @click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
-@_tls_option
+@tls_option
 @click.option(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),

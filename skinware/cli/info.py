@@ -26,6 +26,7 @@ from skinware.cli._format import (
     count_text,
     plural,
     rate_text,
+    redraw,
     state_shown,
     table,
     terminal_width,
@@ -390,20 +391,10 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         elif sys.stdout.isatty():
             lines = as_text(found)
             fits = len(lines) < shutil.get_terminal_size().lines
-            _redraw(lines if fits else as_text(found, brief=True))
+            redraw(lines if fits else as_text(found, brief=True))
         else:
             click.echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
         time.sleep(_WATCH_PERIOD_S)
-
-
-def _redraw(lines: list[str]) -> None:
-    """Put lines in the place of what is on the terminal, without flicker; what does not fit is cut."""
-    height = shutil.get_terminal_size().lines - 1
-    if len(lines) > height:
-        lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
-    if click.get_current_context().color is False:
-        lines = [click.unstyle(line) for line in lines]
-    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False, color=True)
 
 
 def main() -> None:

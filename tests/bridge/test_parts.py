@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skinware import DriverReader, DriverWriter, Frame
+from skinware.bridge.access import Rules
 from skinware.bridge.clock import PeerClock, Sample
 from skinware.bridge.diagnosis import why_unreachable
 from skinware.bridge.endpoints import endpoints
@@ -227,7 +228,7 @@ def test_certificates_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="give --tls"):
         endpoints(listen=["tls/0.0.0.0:7448"])
     with pytest.raises(ConfigurationError, match="give --tls, too"):
-        endpoints(listen=["tcp/127.0.0.1:7448"], callers=["operator"])
+        endpoints(listen=["tcp/127.0.0.1:7448"], rules=Rules(callers=["operator"]))
 
 
 def test_why_nobody_is_reached() -> None:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import ExitStack
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
 from skinware import DriverReader, DriverWriter
+from skinware.bridge.messages import Keys, Summary
+from skinware.bridge.watching import Watcher
 from skinware.memory.namespace import Namespace
 from skinware_drivers.testing.waiting import wait_until
+from tests.bridge.net import Net, NetLink
 from tests.bridge.rig import joining, network, publish, serving, structure
 
 
@@ -48,3 +53,105 @@ def test_two_robots_of_one_name_are_told_and_never_mixed(namespace: Namespace, m
         wait_until(lambda: sees(2))
         values = [value for value in seen if value]
         assert values == sorted(values), "the first came back after the other"
+
+
+@contextmanager
+def watching(net: Net) -> Iterator[Watcher]:
+    link = NetLink(net)
+    watcher = Watcher(link)
+    thread = threading.Thread(target=watcher.run, name="watch")
+    thread.start()
+    try:
+        yield watcher
+    finally:
+        watcher.stop()
+        thread.join()
+        link.close()
+
+
+def told(watcher: Watcher, robot: str) -> Summary | None:
+    return next((seen.summary for seen in watcher.robots() if seen.robot == robot), None)
+
+
+def state(watcher: Watcher) -> str:
+    """Of the left robot's arm."""
+    summary = told(watcher, "left")
+    return "" if summary is None else summary.drivers["arm"].state
+
+
+def test_each_robot_tells_how_it_is(namespace: Namespace) -> None:
+    with ExitStack() as stack:
+        net = stack.enter_context(network())
+        watcher = stack.enter_context(watching(net))
+        other = Namespace(f"{namespace.name}-other")
+        stack.callback(shutil.rmtree, other.path, ignore_errors=True)
+        writers = [stack.enter_context(driver(place)) for place in (namespace, other)]
+        stack.enter_context(serving(net, namespace, "left"))
+        with serving(net, other, "right"):
+            summaries: dict[str, Summary] = {}
+
+            def all_told() -> bool:
+                for writer in writers:
+                    publish(writer)
+                summaries.update((name, summary) for name in ("left", "right") if (summary := told(watcher, name)))
+                return len(summaries) == 2 and all(
+                    summary.drivers and summary.drivers["arm"].rate_hz > 0 for summary in summaries.values()
+                )
+
+            wait_until(all_told)
+            arm = summaries["left"].drivers["arm"]
+            assert (arm.state, arm.sensors, arm.fresh, arm.patches) == ("live", 64, 64, 1)
+            assert (arm.silent, arm.n_silent) == (("palm",), 1)
+            assert arm.problems == 2, "patch and bus have said nothing of their state"
+            assert arm.age_ms is not None
+            assert arm.age_ms >= 0
+            assert summaries["right"].namespace == other.name
+            wait_until(lambda: all(seen.clock.is_known for seen in watcher.robots()))
+            writers[0]._service.desert()
+            wait_until(lambda: state(watcher) == "dead")
+            summary = told(watcher, "left")
+            assert summary is not None
+            assert (summary.drivers["arm"].fresh, summary.drivers["arm"].problems) == (0, 1)
+            again = stack.enter_context(driver(namespace))
+
+            def is_back() -> bool:
+                publish(again)
+                return state(watcher) == "live"
+
+            wait_until(is_back)
+        wait_until(lambda: [seen.robot for seen in watcher.robots()] == ["left"])
+        with serving(net, other, "left"):
+            wait_until(lambda: [seen.robot for seen in watcher.robots()] == ["left", "left"])
+            wait_until(lambda: {seen.summary and seen.summary.namespace for seen in watcher.robots()} >= {other.name})
+        assert all(seen.bytes < 10_000 for seen in watcher.robots())
+
+
+def test_nothing_is_told_where_nobody_listens_and_nonsense_is_left_out(namespace: Namespace) -> None:
+    with network() as net, serving(net, namespace) as server, driver(namespace) as writer:
+        publish(writer)
+        kinds: list[str] = []
+
+        def loses(kind: str, _key: str) -> bool:
+            kinds.append(kind)
+            return False
+
+        net.loses = loses
+        wait_until(lambda: server.frames().get("arm", ("", 0, 0))[1] > 0)
+        assert not kinds
+        with watching(net) as watcher:
+            wait_until(lambda: told(watcher, "walle") is not None)
+            nonsense = NetLink(net)
+            for payload in (b"", b"\xff\xfe", b"[]", b'{"drivers": 5}'):
+                nonsense.tell(Keys("walle", watcher.robots()[0].instance).summary, payload)
+                nonsense.tell(Keys("eve", "0").summary, payload)
+            net.idle()
+            assert [seen.robot for seen in watcher.robots()] == ["walle"]
+
+
+def test_a_robot_of_another_version_is_there_and_tells_nothing() -> None:
+    with network() as net, watching(net) as watcher:
+        other = NetLink(net)
+        other.be_there("skinware/live/eve/9/abcd")
+        wait_until(lambda: [(seen.robot, seen.version) for seen in watcher.robots()] == [("eve", 9)])
+        other.close()
+        wait_until(lambda: not watcher.robots())

@@ -1,0 +1,131 @@
+"""All robots that are reached, by the small message that each sends once a second."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.link import Link, Priority, Reply
+from skinware.bridge.messages import (
+    ALL_SUMMARIES,
+    ALL_TOKENS,
+    CLOCK,
+    VERSION,
+    Keys,
+    Summary,
+    bridge_of,
+    token_parts,
+)
+from skinware.realtime import NS_PER_S, now_ns
+
+_TICK_S = 0.05
+_ANSWER_S = 1.0
+
+Bridge = tuple[str, str]
+"""(robot, number of the bridge that serves it)."""
+
+
+@dataclass
+class Seen:
+    """A robot that is reached.
+
+    Attributes:
+        robot: its name.
+        instance: number of the bridge that serves it.
+        version: of that bridge.
+        clock: of the robot.
+        summary: what it told last; None: nothing yet.
+        told_ns: when that was, 0 if it was never.
+        bytes: of all that it told so far.
+        next_clock_ns: when its clock is to be asked next.
+    """
+
+    robot: str
+    instance: str
+    version: int = VERSION
+    clock: PeerClock = field(default_factory=PeerClock)
+    summary: Summary | None = None
+    told_ns: int = 0
+    bytes: int = 0
+    next_clock_ns: int = 0
+
+
+class Watcher:
+    """Knows how all robots are that a link leads to; reads none of their frames.
+
+    Args:
+        link: to them.
+        asks: have them tell how they are; otherwise only who is there.
+    """
+
+    def __init__(self, link: Link, *, asks: bool = True) -> None:
+        self._link, self._asks = link, asks
+        self._lock = threading.Lock()
+        self._seen: dict[Bridge, Seen] = {}
+        self._stopping = False
+        link.watch(ALL_TOKENS, self._token)
+        if asks:
+            link.listen(ALL_SUMMARIES, self._told)
+
+    def robots(self) -> list[Seen]:
+        """All that are reached now, by name; two of one name are two."""
+        with self._lock:
+            return sorted(self._seen.values(), key=lambda seen: (seen.robot, seen.instance))
+
+    def run(self, tell: Callable[[], object] = lambda: None) -> None:
+        """Until ``stop``; ``tell`` is called once a second."""
+        tell_ns = now_ns() + NS_PER_S
+        while not self._stopping:
+            time.sleep(_TICK_S)
+            time_ns = now_ns()
+            for seen in self.robots():
+                if self._asks and seen.version == VERSION and time_ns >= seen.next_clock_ns:
+                    self._ask_clock(seen)
+            if time_ns >= tell_ns:
+                tell_ns = max(tell_ns + NS_PER_S, time_ns)
+                tell()
+
+    def stop(self) -> None:
+        """End it; from any thread, and from a signal handler."""
+        self._stopping = True
+
+    def _token(self, key: str, there: bool) -> None:
+        robot, version, instance = token_parts(key)
+        with self._lock:
+            if there:
+                self._seen.setdefault((robot, instance), Seen(robot, instance)).version = version
+            else:
+                self._seen.pop((robot, instance), None)
+
+    def _told(self, key: str, payload: bytes) -> None:
+        try:
+            summary = msgspec.json.decode(payload, type=Summary)
+        except msgspec.MsgspecError:
+            return  # it is not new any more, and shown as such
+        with self._lock:
+            seen = self._seen.get(bridge_of(key))
+            if seen is not None:
+                seen.summary, seen.told_ns = summary, now_ns()
+                seen.bytes += len(payload)
+
+    def _ask_clock(self, seen: Seen) -> None:
+        asked_ns = now_ns()
+        seen.next_clock_ns = asked_ns + seen.clock.pause_ns()
+
+        def returned(reply: Reply) -> None:
+            returned_ns = now_ns()
+            if reply.payload is not None and len(reply.payload) == CLOCK.size:
+                heard_ns, answered_ns = CLOCK.unpack(reply.payload)
+                with self._lock:
+                    seen.clock.add(Sample.of(asked_ns, heard_ns, answered_ns, returned_ns))
+
+        keys = Keys(seen.robot, seen.instance)
+        self._link.ask(keys.clock, returned, timeout_s=_ANSWER_S, priority=Priority.CLOCK)
+
+
+__all__ = ["Seen", "Watcher"]

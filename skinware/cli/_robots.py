@@ -1,0 +1,267 @@
+"""Many robots: where they meet, and how all of them are."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import msgspec
+
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, signals_end, tls_option
+from skinware.cli._format import (
+    NO_VALUE,
+    age_text,
+    count_text,
+    plural,
+    rate_text,
+    redraw,
+    state_shown,
+    table,
+    terminal_width,
+)
+from skinware.errors import BridgeError
+from skinware.realtime import NS_PER_S, now_ns
+
+if TYPE_CHECKING:
+    from skinware.bridge import Watcher
+    from skinware.bridge.watching import Seen
+
+_PORT = 7447
+_PRESENCE = {0: "gone", 1: "there"}
+_PATIENCE_S = 3
+"""Until robots that are there have told how they are; one that has told nothing for so long is silent."""
+_TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "silent patches", "problems", "clock")
+
+
+@click.command(
+    "route",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-bridge route --listen tls/0.0.0.0:7447 --tls certs            where robots and their users meet",
+        "skin-bridge serve --robot icub --connect tls/router.lab:7447 --tls certs   a robot that goes there",
+        "skin-bridge join icub --connect tls/router.lab:7447 --tls certs            one who uses it",
+    ),
+)
+@click.option(
+    "--listen",
+    multiple=True,
+    metavar="ENDPOINT",
+    help=f"Where others connect.  [default: tcp/127.0.0.1:{_PORT}]",
+)
+@click.option(
+    "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are to be reached here."
+)
+@tls_option
+@click.option(
+    "--caller",
+    "callers",
+    multiple=True,
+    metavar="NAME",
+    help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
+)
+@click.option(
+    "--robot",
+    "robots",
+    multiple=True,
+    metavar="R",
+    help="Only who has a certificate of this name may serve, and only robot R; may be repeated.",
+)
+@click.option(
+    "--router", "routers", multiple=True, metavar="NAME", help="The certificate of another router; may be repeated."
+)
+@click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+@json_option
+def route(
+    listen: tuple[str, ...],
+    connect: tuple[str, ...],
+    tls: Path | None,
+    callers: tuple[str, ...],
+    robots: tuple[str, ...],
+    routers: tuple[str, ...],
+    insecure: bool,
+    as_json: bool,
+) -> None:
+    """Be where robots and those who use them meet: one address for all of them. Reads nothing by itself.
+
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage.
+    """
+    from skinware.bridge import DEFAULT_ROUTER, Link, Rules, Watcher, endpoints
+
+    places = endpoints(
+        listen=listen or (DEFAULT_ROUTER,),
+        connect=connect,
+        tls=tls,
+        rules=Rules(callers, True, robots, routers),
+        insecure=insecure,
+    )
+    with contextlib.closing(Link(places)) as link:
+        watcher = Watcher(link, asks=False)
+        with signals_end(watcher.stop):
+            if as_json:
+                print_json({"event": "ready", "listen": list(places.listen), "connect": list(places.connect)})
+            else:
+                click.echo(f"router: {places} (Ctrl-C ends)")
+            watcher.run(_Routed(watcher, as_json).tell)
+
+
+class _Routed:
+    """Tells which robots come and go."""
+
+    def __init__(self, watcher: Watcher, as_json: bool) -> None:
+        self._watcher, self._as_json = watcher, as_json
+        self._known: dict[str, int] = {}
+
+    def tell(self) -> None:
+        count = Counter(seen.robot for seen in self._watcher.robots())
+        if self._as_json:
+            print_json({"event": "status", "robots": dict(count)})
+        for robot in sorted({*count, *self._known} if not self._as_json else ()):
+            if count[robot] != self._known.get(robot, 0):
+                click.echo(f"robot {robot}: {_PRESENCE.get(count[robot]) or f'{count[robot]} robots have this name'}")
+        self._known = dict(count)
+
+
+@click.command(
+    "list",
+    context_settings=CONTEXT_SETTINGS,
+    epilog=examples(
+        "skin-bridge list --connect tcp/192.168.1.10:7448 --connect tcp/192.168.1.11:7448",
+        "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all that are there, every second",
+    ),
+)
+@click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT.")
+@tls_option
+@click.option("--watch", is_flag=True, help="Update every second.")
+@json_option
+def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
+    """Show all robots that are reached, with their drivers: rate, age, losses, silent patches, problems, clock error.
+
+    Each robot sends one small message a second for this; no frames are read.
+
+    Exit status: 0 done or interrupted, 1 none is reached, 2 wrong usage.
+    """
+    from skinware.bridge import Link, Watcher, endpoints
+
+    places = endpoints(connect=connect, tls=tls)
+    with contextlib.closing(Link(places)) as link:
+        watcher = Watcher(link)
+        listed = _Listed(watcher, places.connect, tls, as_json=as_json, watch=watch)
+        if watch and as_json:
+            print_json({"event": "ready", "connect": list(places.connect)})
+        with signals_end(watcher.stop):
+            watcher.run(listed.tell)
+    if listed.why:
+        raise BridgeError(listed.why)
+
+
+class _Listed:
+    """Tells each second how all robots are, or once."""
+
+    def __init__(
+        self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
+    ) -> None:
+        self._watcher, self._places, self._tls = watcher, places, tls
+        self._as_json, self._watch = as_json, watch
+        self._seconds = 0
+        self.why = ""
+
+    def tell(self) -> None:
+        from skinware.bridge.diagnosis import why_unreachable
+
+        self._seconds += 1
+        robots = self._watcher.robots()
+        is_late = self._seconds >= _PATIENCE_S
+        if not self._watch:
+            if not is_late and not (robots and all(seen.summary for seen in robots)):
+                return
+            self._watcher.stop()
+        found = _report(robots)
+        if not robots and is_late and self._seconds % _PATIENCE_S == 0:
+            why = " ".join(filter(None, (why_unreachable(at, self._tls) for at in self._places)))
+            found["problems"].append(why or "something listens there, but no robot answers; does it want --tls?")
+            if not self._watch:
+                self.why = found["problems"][-1]
+                return
+        if self._as_json:
+            print_json(found)
+        elif self._watch and sys.stdout.isatty():
+            redraw(_as_text(found))
+        else:
+            click.echo("\n".join(_as_text(found)))
+
+
+def _report(robots: Sequence[Seen]) -> dict[str, Any]:
+    """How robots are, as JSON has it."""
+    count = Counter(seen.robot for seen in robots)
+    text = "{} robots are called {}: give each a name of its own"
+    twice = [text.format(number, name) for name, number in count.items() if number > 1]
+    return {"event": "status", "robots": [_report_of(seen) for seen in robots], "problems": twice}
+
+
+def _as_text(found: dict[str, Any]) -> list[str]:
+    """The report for people, as lines."""
+    lines = [plural(len(found["robots"]), "robot")]
+    rows = [row for robot in found["robots"] for row in _rows_of(robot)]
+    if rows:
+        lines += table(_TITLES, rows, left=3, width=terminal_width())
+    return [*lines, *(click.style("problem: ", fg="red") + text for text in found["problems"])]
+
+
+def _report_of(seen: Seen) -> dict[str, Any]:
+    told_s = (now_ns() - seen.told_ns) / NS_PER_S if seen.told_ns else None
+    summary, clock = seen.summary, seen.clock
+    return {
+        "robot": seen.robot,
+        "instance": seen.instance,
+        "version": seen.version,
+        "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
+        "told_s": told_s,
+        "bytes": seen.bytes,
+        "clock": {
+            "offset_ms": clock.offset_ns(now_ns()) / 1e6,
+            "error_ms": clock.error_ns / 1e6,
+            "round_trip_ms": clock.round_trip_ns / 1e6,
+        }
+        if clock.is_known
+        else None,
+        **({} if summary is None else msgspec.to_builtins(summary)),
+    }
+
+
+def _rows_of(robot: dict[str, Any]) -> list[tuple[str, ...]]:
+    clock = robot["clock"]
+    error = NO_VALUE if clock is None else f"± {age_text(clock['error_ms'] * 1e6)}"
+    nothing = (NO_VALUE,) * 6
+    if not robot.get("drivers"):
+        return [(robot["robot"], NO_VALUE, robot["state"], *nothing, error)]
+    return [
+        (robot["robot"], name, _state_of(robot, driver), *_figures_of(driver), error)
+        for name, driver in robot["drivers"].items()
+    ]
+
+
+def _state_of(robot: dict[str, Any], driver: dict[str, Any]) -> str:
+    if robot["state"] != "live":
+        return f"was {driver['state']}"
+    return state_shown(driver["state"], driver["fresh"], driver["sensors"])
+
+
+def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
+    names = ", ".join(driver["silent"])
+    more = driver["n_silent"] - len(driver["silent"])
+    return (
+        rate_text(driver["rate_hz"]),
+        age_text(None if driver["age_ms"] is None else driver["age_ms"] * 1e6),
+        f"{count_text(driver['fresh'])} of {count_text(driver['sensors'])}",
+        count_text(driver["lost"]),
+        f"{names} and {more} more" if more else names or NO_VALUE,
+        count_text(driver["problems"]),
+    )
+
+
+__all__ = ["list_robots", "route"]

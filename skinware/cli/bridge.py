@@ -1,4 +1,4 @@
-"""``skin-bridge``: a namespace of one machine on another, and in a ROS 2 graph."""
+"""``skin-bridge``: a namespace of one machine on another, in a ROS 2 graph, and as ports of YARP."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli import bridge_ros2
+from skinware.cli import bridge_ros2, bridge_yarp
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     DEFAULT_REGIONS,
@@ -35,14 +35,14 @@ _PORT = 7448
 @click.group("skin-bridge", context_settings=CONTEXT_SETTINGS)
 @version_option
 def command() -> None:
-    """Have the drivers and services of one machine on another, as if they ran there; or in a ROS 2 graph.
+    """Have the drivers and services of one machine on another, as if they ran there; or in a ROS 2 graph, or in YARP.
 
     On the robot: skin-bridge serve. Elsewhere: skin-bridge join. For many robots: skin-bridge list, skin-bridge route.
-    For ROS 2: skin-bridge ros2.
+    For ROS 2: skin-bridge ros2. For YARP: skin-bridge yarp.
     """
 
 
-for _each in (route, list_robots, bridge_ros2.command):
+for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
     command.add_command(_each)
 
 

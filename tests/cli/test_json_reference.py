@@ -6,6 +6,7 @@ import io
 import json
 import re
 import shutil
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from skinware_drivers.finding import adapters, interfaces, ports
 from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
-from skinware_drivers.testing.waiting import read_until
+from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.roboskin.options import RoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.cli.fake_skin import FakeSkin, publishing
@@ -52,6 +53,7 @@ from tests.recording.test_wire_export import ON_VCAN1, keep, write_recording
 from tests.ros2.alone import own_domain
 from tests.streams.peers import free_port
 from tests.virtual.test_emulate import HostBus
+from tests.yarp.peers import LOCAL, robot, until_gone
 
 PAGE = Path(__file__).parents[2] / "docs/reference/json.md"
 VIRTUAL = "virtual?boards=7"
@@ -341,6 +343,19 @@ def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     with publishing(FakeSkin("torso")), running("skin-bridge", "ros2") as bridge:
         ready = bridge.wait_for("ready")
         check("`skin-bridge ros2`", ready, bridge.wait_for("status", lambda status: "torso" in status["drivers"]))
+
+
+def test_bridge_to_yarp() -> None:
+    with robot(until_gone) as yarp, publishing(FakeSkin("torso")):
+        with running("skin-bridge", "yarp", "--server", f"{LOCAL}:{yarp.server.port}", "--full-scale", "9") as bridge:
+            begun = [bridge.wait_for(event) for event in ("ready", "port")]
+            wait_until(lambda: "/skinware/torso" in yarp.ports)
+            host, number, _ = yarp.ports["/skinware/torso"]
+            with socket.create_connection((host, number), 30) as reader:
+                reader.sendall(b"CONNECT reader\nr\n")
+                read = bridge.wait_for("status", lambda event: bool(event["ports"]["/skinware/torso"]["readers"]))
+            yarp.ports["/skinware/torso"] = ("10.0.0.9", 1, "tcp")
+            check("`skin-bridge yarp`", *begun, read, bridge.wait_for("trouble"))
 
 
 def _has_ages(services: dict[str, Any]) -> bool:

@@ -108,16 +108,16 @@ class Robot:
                 assert begin.strip() == b"d"
                 command = next(lines).strip()
                 self.asked.append(command)
-                known = self.ports.get(command.split()[1].decode())
+                what, name, *more = command.decode().split()
+                if what == "register":
+                    carrier, host, number = more
+                    self.ports[name] = (LOCAL if host == "..." else host, int(number), carrier)
+                elif what == "unregister":
+                    self.ports.pop(name, None)
+                known = self.ports.get(name)
                 told = b""
                 if known is not None:
-                    name, (host, port, carrier) = command.split()[1], known
-                    told = b"registration name %s ip %s port %d type %s\r\n" % (
-                        name,
-                        host.encode(),
-                        port,
-                        carrier.encode(),
-                    )
+                    told = "registration name {} ip {} port {} type {}\r\n".format(name, *known).encode()
                 caller.sendall(told + END)
 
     def _speak(self, caller: socket.socket) -> None:

@@ -1,0 +1,231 @@
+"""A port that is read: what it says to YARP's tools, whom it calls, and that nobody can hold it up."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from skinware.yarp.carriers import Carrier, Message
+from skinware.yarp.names import NameServer
+from skinware.yarp.port import OutputPort
+from skinware_drivers.testing.waiting import wait_until
+from tests.yarp.peers import LOCAL, PATIENCE_S, Answering, Robot, robot, until_gone
+
+OURS = "/skinware/hand"
+
+
+class There:
+    """An output port in an event loop of its own."""
+
+    def __init__(self, names: NameServer) -> None:
+        self.loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self.loop.run_forever)
+        self._thread.start()
+        self.port = OutputPort(OURS, names)
+        self.number = asyncio.run_coroutine_threadsafe(self.port.open(LOCAL), self.loop).result(PATIENCE_S)
+        self.count = 0
+
+    def send(self, *values: float) -> None:
+        self.count += 1
+        message = Message(np.array(values), self.count, time.time())
+        done = threading.Event()
+        self.loop.call_soon_threadsafe(self.port.send, message)
+        self.loop.call_soon_threadsafe(done.set)
+        assert done.wait(PATIENCE_S)
+
+    def close(self) -> None:
+        asyncio.run_coroutine_threadsafe(self.port.close(), self.loop).result(PATIENCE_S)
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self._thread.join(PATIENCE_S)
+        self.loop.run_until_complete(self.loop.shutdown_default_executor())
+        self.loop.close()
+
+
+@pytest.fixture
+def yarp() -> Iterator[Robot]:
+    with robot(until_gone) as there:
+        yield there
+
+
+@pytest.fixture
+def there(yarp: Robot) -> Iterator[There]:
+    with contextlib.closing(There(NameServer(LOCAL, yarp.server.port))) as port:
+        yield port
+
+
+@contextmanager
+def called(there: There, text: bytes) -> Iterator[socket.socket]:
+    with socket.create_connection((LOCAL, there.number), PATIENCE_S) as connection:
+        connection.sendall(text)
+        yield connection
+
+
+def hear(connection: socket.socket, end: bytes) -> bytes:
+    data = b""
+    while not data.endswith(end):
+        more = connection.recv(1 << 16)
+        assert more, data
+        data += more
+    return data
+
+
+def test_a_reader_as_the_manual_has_it(there: There) -> None:
+    with called(there, b"CONNECT foo\n") as connection:
+        assert hear(connection, b"\r\n") == b"Welcome foo\r\n"
+        connection.sendall(b"*\n")
+        assert (
+            hear(connection, b"connections\r\n") == b"This is /skinware/hand\r\nThere are no outgoing connections\r\n"
+        )
+        connection.sendall(b"what\n")
+        assert b"not understood" in hear(connection, b"for help.\r\n")
+        connection.sendall(b"?\n")
+        assert b"Reverse connection type" in hear(connection, b"this help\r\n")
+        connection.sendall(b"d\nhello yarp\nr\n")
+        wait_until(lambda: len(there.port.receivers) == 1)
+        there.send(1.0, 2.5)
+        head, vector = hear(connection, b"2.5\r\n").splitlines()
+        assert head.startswith(b"do 1 1")
+        assert vector == b"1.0 2.5"
+    wait_until(lambda: not there.port.receivers)
+
+
+def test_it_quits_when_it_is_told(there: There) -> None:
+    with called(there, b"CONNECT foo\r\nq\r\n") as connection:
+        assert hear(connection, b"foo\r\n")
+        assert connection.recv(10) == b""
+
+
+class Input(Answering):
+    """An input port of a carrier; ``heard`` is everything, and each message is acknowledged once ``acks`` is set."""
+
+    def __init__(self, carrier: Carrier) -> None:
+        self.carrier = carrier
+        self.heard = b""
+        self.acks = threading.Event()
+        super().__init__(self._take)
+
+    def _take(self, caller: socket.socket) -> None:
+        greeting = len(self.carrier.greeting(OURS))
+        while len(self.heard) < greeting:
+            self.heard += caller.recv(greeting - len(self.heard))
+        if not self.carrier.is_text:
+            caller.sendall(b"YA\1\2\0\0RP")
+        while more := caller.recv(1 << 16):
+            self.heard += more
+            if self.carrier.acknowledges:
+                self.acks.wait(PATIENCE_S)
+                caller.sendall(b"YA\2\0\0\0RPxx")
+
+    @property
+    def messages(self) -> int:
+        return self.heard.count(b"do ")
+
+
+def connect(there: There, name: str) -> bytes:
+    """What ``yarp connect /skinware/hand NAME`` asks, as it asks it, and the last answer."""
+    told = b"a\r\n[list] [out] " + name.rpartition(":/")[2].encode() + b"\r\na\r\n[add] " + name.encode() + b"\r\n"
+    with called(there, b"CONNACK admin\r\n" + told) as connection:
+        data = b""
+        while data.count(b"<ACK>\r\n") < 2:
+            data += connection.recv(1 << 12)
+        return data.split(b"<ACK>\r\n")[1]
+
+
+@pytest.mark.parametrize("carrier", [Carrier.TCP, Carrier.FAST_TCP, Carrier.TEXT])
+def test_it_calls_a_port_that_it_is_told_to_call(yarp: Robot, there: There, carrier: Carrier) -> None:
+    with contextlib.closing(Input(carrier)) as gui:
+        gui.acks.set()
+        yarp.ports["/gui:i"] = (LOCAL, gui.port, "tcp")
+        assert connect(there, f"{carrier.title}://gui:i") == b'0 "Added connection from /skinware/hand to /gui:i"\r\n'
+        wait_until(lambda: len(there.port.receivers) == 1)
+        there.send(3.0)
+        wait_until(lambda: gui.messages == 1)
+        wait_until(lambda: not there.port.receivers[0].is_busy)
+        there.send(4.0)
+        wait_until(lambda: gui.messages == 2)
+        assert gui.heard.startswith(carrier.greeting(OURS))
+        if not carrier.is_text:
+            assert gui.heard.endswith(struct.pack("<iid", 266, 1, 4.0))
+        with called(there, b"CONNACK admin\r\na\r\n[list] [out] /gui:i\r\na\r\n[del] /gui:i\r\n") as connection:
+            told = hear(connection, b'/gui:i"\r\n<ACK>\r\n')
+            assert f"(carrier {carrier.title})".encode() in told
+            assert b'0 "Removed connection' in told
+        wait_until(lambda: not there.port.receivers)
+
+
+def test_a_port_that_is_called_again_is_not_called_twice(yarp: Robot, there: There) -> None:
+    with contextlib.closing(Input(Carrier.FAST_TCP)) as gui:
+        yarp.ports["/gui:i"] = (LOCAL, gui.port, "tcp")
+        for _ in range(3):
+            connect(there, "fast_tcp://gui:i")
+        wait_until(lambda: len(there.port.receivers) == 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        (b"/nobody", b"the name server does not know it"),
+        (b"/gone", b"refused"),
+        (b"udp://gui:i", b"only text, tcp and fast_tcp"),
+        (b"nonsense", b"no name of a port"),
+        (b'"/a b"', b"no name of a port"),
+    ],
+)
+def test_whom_it_cannot_call(yarp: Robot, there: There, name: bytes, why: bytes) -> None:
+    with socket.create_server((LOCAL, 0)) as probe:
+        yarp.ports["/gone"] = (LOCAL, probe.getsockname()[1], "tcp")
+    with called(there, b"CONNECT admin\r\na\r\n[add] " + name + b"\r\n") as connection:
+        said = hear(connection, b'"\r\n')
+        assert said.startswith(b"Welcome admin\r\n-1 ")
+        assert why in said.lower()
+
+
+def test_other_things_that_are_asked_for(there: There) -> None:
+    asked = b"a\r\n[ver]\r\na\r\n[list] [in]\r\na\r\n[prop] get x\r\n!/gui\r\n/nobody\r\n"
+    with called(there, b"CONNECT admin\r\n" + asked + b"q\r\n") as connection:
+        said = hear(connection, b"know it\r\n").splitlines()
+        assert said[1:4] == [b"ver 1 2 3", b"", b'[fail] "send [help] for list of valid commands"']
+
+
+def test_a_reader_that_does_not_read_misses_vectors_and_holds_nobody_up(yarp: Robot, there: There) -> None:
+    many = [0.125] * 3000
+    with contextlib.closing(Input(Carrier.TCP)) as busy, called(there, b"CONNECT slow\nr\n"):
+        yarp.ports["/busy"] = (LOCAL, busy.port, "tcp")
+        connect(there, "/busy")
+        with called(there, b"CONNECT quick\nr\n") as quick:
+            wait_until(lambda: len(there.port.receivers) == 3)
+            for number in range(300):
+                there.send(*many, float(number))
+                hear(quick, f" {number}.0\r\n".encode())
+            by_name = {receiver.name: receiver for receiver in there.port.receivers}
+            assert (by_name["quick"].sent, by_name["quick"].passed_over) == (300, 0)
+            assert (by_name["/busy"].sent, by_name["/busy"].passed_over) == (1, 299)
+            assert by_name["slow"].passed_over > 100
+            busy.acks.set()
+            wait_until(lambda: not by_name["/busy"].is_busy)
+            there.send(1.0)
+            wait_until(lambda: busy.messages == 2)
+
+
+@pytest.mark.parametrize("said", [b"YA\x64\x1e\0\0RP", b"GET / HTTP/1.1\r\n", b"\0" * 100, b"CONNECT " + b"x" * 10_000])
+def test_who_speaks_otherwise_is_hung_up_on(there: There, said: bytes) -> None:
+    with called(there, said) as connection, contextlib.suppress(ConnectionError):
+        assert connection.recv(100) == b""
+
+
+def test_a_crowd_is_not_served(there: There) -> None:
+    with contextlib.ExitStack() as crowd:
+        for number in range(80):
+            crowd.enter_context(called(there, b"CONNECT x%d\nr\n" % number))
+        wait_until(lambda: len(there.port.receivers) == 64)
+        there.send(1.0)
+    wait_until(lambda: not there.port.receivers)

@@ -20,7 +20,7 @@ from skinware.errors import BridgeError
 
 LEASE_MS = 2000
 """A peer that says nothing for so long is gone."""
-_RETRY_MS = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+_RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _FOREVER_MS = -1
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 

@@ -60,10 +60,12 @@ class Service(msgspec.Struct, frozen=True):
     Attributes:
         generation: its number; 0: not known yet.
         state: ``live``, ``paused``, ``closed`` or ``dead``.
+        sequence: of its newest frame when it became so: those up to it may be on their way still.
     """
 
     generation: int = 0
     state: str = "live"
+    sequence: int = 0
 
 
 class Services(msgspec.Struct, frozen=True):

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.clock import QUESTIONS, PeerClock, Sample
 from skinware.bridge.link import Link, Priority, Reply
 from skinware.bridge.messages import ALL_TOKENS, CLOCK, VERSION, Keys, token_parts
 from skinware.bridge.turns import Turns
@@ -55,6 +55,7 @@ class Peer:
         who: this end, in questions.
         clock: of the robot.
         is_connected: whether it is heard.
+        since_ns: since when that is so.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class Peer:
         self.clock = PeerClock()
         self._instance, self._start = "", ""
         self.is_connected = False
+        self.since_ns: int = now_ns()
         self.tell = tell
         self._link, self._turns, self._watcher = link, turns, watcher
         self._there: set[str] = set()  # bridges that serve the robot
@@ -140,7 +142,7 @@ class Peer:
         """Something came from it."""
         self._heard_ns = now_ns()
         if not self.is_connected:
-            self.is_connected = True
+            self.is_connected, self.since_ns = True, self._heard_ns
             self._told.clear()
             self.tell({"event": "connected", "robot": self.robot})
 
@@ -183,7 +185,7 @@ class Peer:
     def _lose(self, why: str) -> None:
         if not self.is_connected:
             return
-        self.is_connected = False
+        self.is_connected, self.since_ns = False, now_ns()
         self._watcher.lost()
         self.tell({"event": "disconnected", "robot": self.robot, "why": why})
 
@@ -201,11 +203,14 @@ class Peer:
         self._turns.soon(tell)
 
     def _ask_clock(self) -> None:
-        asked_ns = self._pinged_ns = now_ns()
-        self._next_clock_ns = asked_ns + self.clock.pause_ns()
-        instance = self._instance
-        if not instance:
-            return
+        self._pinged_ns = now_ns()
+        self._next_clock_ns = self._pinged_ns + self.clock.pause_ns()
+        if self._instance:
+            for _ in range(QUESTIONS):
+                self._ask_clock_once()
+
+    def _ask_clock_once(self) -> None:
+        asked_ns, instance = now_ns(), self._instance
 
         def returned(payload: bytes | None, returned_ns: int) -> None:
             if instance == self._instance:

@@ -99,6 +99,7 @@ class Server:
         self._parts = Parts(self._stream)
         self._stopping = False
         self._collector = Collector(namespace, names, self)
+        self._collector.take()  # who asks is told of all that there is
         self._answering = [
             link.answer(self._keys.clock, self._clock_asked),
             link.answer(self._keys.services, self._services_asked),
@@ -179,7 +180,9 @@ class Server:
         with self._lock:
             served = self._services.get(name)
             if served is not None:
-                served.told = Service(served.told.generation, state)
+                newest = served.stream.newest
+                sequence = newest.sequence if newest is not None else 0
+                served.told = Service(served.told.generation, state, sequence)
         self._link.tell(self._keys.services, self._told())
 
     def _stream(self, service: str, part: str = "") -> Stream:

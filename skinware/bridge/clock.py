@@ -16,9 +16,7 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
 
-QUESTIONS = 8
-"""At once."""
-_KEPT_NS = 20 * NS_PER_S
+_KEPT_NS = 30 * NS_PER_S
 _AT_ONCE_NS = 20_000_000
 _HORIZON_NS = 3 * NS_PER_S // 2
 """Until the next answers, what is told must hold."""
@@ -53,14 +51,12 @@ class Sample:
         return Sample((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
 
     def with_(self, other: Sample) -> Sample:
-        """What both told, at the moment of this one."""
+        """What both told, at the moment of this one; only the other where the clock jumped between them."""
         drift_ns = round(_MOST_DRIFT * abs(other.at_ns - self.at_ns))
-        return Sample(
-            self.at_ns,
-            max(self.low_ns, other.low_ns - drift_ns),
-            min(self.high_ns, other.high_ns + drift_ns),
-            min(self.round_trip_ns, other.round_trip_ns),
-        )
+        low_ns, high_ns = max(self.low_ns, other.low_ns - drift_ns), min(self.high_ns, other.high_ns + drift_ns)
+        if low_ns > high_ns:
+            return other
+        return Sample(self.at_ns, low_ns, high_ns, min(self.round_trip_ns, other.round_trip_ns))
 
 
 class PeerClock:
@@ -96,13 +92,10 @@ class PeerClock:
         return round(self._offset_ns + self._slope * (at_ns - self._at_ns))
 
     def add(self, sample: Sample) -> None:
-        """What a question told."""
+        """What questions told."""
         samples = self._samples
         if samples and abs(sample.at_ns - samples[-1].at_ns) < _AT_ONCE_NS:
-            joint = samples[-1].with_(sample)
-            if joint == samples[-1]:
-                return
-            samples[-1] = joint if joint.low_ns <= joint.high_ns else sample
+            samples[-1] = samples[-1].with_(sample)
         else:
             self._rounds += 1
             samples.append(sample)
@@ -145,4 +138,4 @@ def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
     return highest
 
 
-__all__ = ["QUESTIONS", "PeerClock", "Sample"]
+__all__ = ["PeerClock", "Sample"]

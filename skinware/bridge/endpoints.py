@@ -16,7 +16,7 @@ DEFAULT_LISTEN = "tcp/127.0.0.1:7448"
 _ALL = "skinware/**"
 _OF_A_ROBOT = "skinware/*/*/*"
 _CALLS = f"{_OF_A_ROBOT}/*/call/**"
-_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("clock", "services", "*/generation", "*/newest")]
+_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("services", "*/generation", "*/newest")]
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _tls(folder: Path) -> dict[str, str]:
 def _rules(callers: Sequence[str]) -> str:
     """What zenoh lets others do: see and ask; call only who may; and nobody else speaks for the robot."""
     listening = ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
-    speaking = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
+    speaking = ["put", "declare_subscriber", "delete", "reply", "declare_queryable", "liveliness_token"]
     rule = {"permission": "allow", "flows": ["ingress"], "messages": ["query"]}
     subject: dict[str, object] = {"id": "callers"}
     if callers:
@@ -147,12 +147,13 @@ def _rules(callers: Sequence[str]) -> str:
             "rules": [
                 {**rule, "id": "see", "messages": listening, "key_exprs": [_ALL]},
                 {**rule, "id": "ask", "key_exprs": _QUESTIONS},
+                {**rule, "id": "ping", "messages": ["put"], "key_exprs": [f"{_OF_A_ROBOT}/ping"]},
                 {**rule, "id": "call", "key_exprs": [_CALLS]},
                 {**rule, "id": "tell", "messages": speaking, "flows": ["egress"], "key_exprs": [_ALL]},
             ],
             "subjects": [{"id": "all"}, subject],
             "policies": [
-                {"rules": ["see", "ask", "tell"], "subjects": ["all"]},
+                {"rules": ["see", "ask", "ping", "tell"], "subjects": ["all"]},
                 {"rules": ["call"], "subjects": ["callers"]},
             ],
         }

@@ -7,9 +7,10 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from skinware.bridge.clock import QUESTIONS, PeerClock, Sample
-from skinware.bridge.link import Link, Priority, Reply
-from skinware.bridge.messages import ALL_TOKENS, CLOCK, VERSION, Keys, token_parts
+from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.link import Link, Reply
+from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, token_parts
+from skinware.bridge.pinging import Pinger
 from skinware.bridge.turns import Turns
 from skinware.realtime import NS_PER_S, now_ns
 
@@ -81,6 +82,7 @@ class Peer:
         self._why_not, self._next_why_ns, self._asking_why = why_not, now_ns() + _PATIENCE_NS, False
         self._heard_ns = self._pinged_ns = self._next_clock_ns = 0
         self._told: set[str] = set()
+        self._pinger = Pinger(link, self.who, lambda sample: turns.soon(lambda: self._take_clock(sample)))
         link.watch(ALL_TOKENS, lambda key, there: turns.soon(lambda: self._token(key, there)))
 
     @property
@@ -130,6 +132,7 @@ class Peer:
         self.heard()
         if instance != self._instance:
             self._instance, self.keys = instance, Keys(self.robot, instance)
+            self._pinger.follow(self.keys)
             self._watcher.moved()
         if start != self._start:
             self._start = start
@@ -205,25 +208,11 @@ class Peer:
     def _ask_clock(self) -> None:
         self._pinged_ns = now_ns()
         self._next_clock_ns = self._pinged_ns + self.clock.pause_ns()
-        if self._instance:
-            for _ in range(QUESTIONS):
-                self._ask_clock_once()
+        self._pinger.ask()
 
-    def _ask_clock_once(self) -> None:
-        asked_ns, instance = now_ns(), self._instance
-
-        def returned(payload: bytes | None, returned_ns: int) -> None:
-            if instance == self._instance:
-                self._take_clock(asked_ns, payload, returned_ns)
-
-        self.ask(self.keys.clock, returned, timeout_s=ANSWER_S, priority=Priority.CLOCK)
-
-    def _take_clock(self, asked_ns: int, payload: bytes | None, returned_ns: int) -> None:
-        if payload is None or len(payload) != CLOCK.size:
-            return
+    def _take_clock(self, sample: Sample) -> None:
         self.heard()
-        heard_ns, answered_ns = CLOCK.unpack(payload)
-        self.clock.add(Sample.of(asked_ns, heard_ns, answered_ns, returned_ns))
+        self.clock.add(sample)
         self._watcher.clock_told()
 
 

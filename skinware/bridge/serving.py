@@ -16,8 +16,9 @@ import msgspec
 from skinware.bridge.calling import Calls
 from skinware.bridge.giving import Stream
 from skinware.bridge.link import Link, Question
-from skinware.bridge.messages import CLOCK, About, Keys, Service, Services, Wish, generation_message, parts_of
+from skinware.bridge.messages import About, Keys, Service, Services, Wish, generation_message, parts_of
 from skinware.bridge.parts import Parts
+from skinware.bridge.pinging import answering
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
@@ -101,7 +102,7 @@ class Server:
         self._collector = Collector(namespace, names, self)
         self._collector.take()  # who asks is told of all that there is
         self._answering = [
-            link.answer(self._keys.clock, self._clock_asked),
+            answering(link, self._keys),
             link.answer(self._keys.services, self._services_asked),
             link.answer(self._keys.of("*", "generation"), self._generation_asked),
             link.answer(self._keys.of("*", "newest"), self._newest_asked),
@@ -200,10 +201,6 @@ class Server:
         self._parts.let_go()
 
     # -- questions, in zenoh's threads ----------------------------------------------------------------------------
-
-    def _clock_asked(self, question: Question) -> None:
-        heard_ns = now_ns()
-        question.reply(CLOCK.pack(heard_ns, now_ns()))
 
     def _services_asked(self, question: Question) -> None:
         if question.payload:

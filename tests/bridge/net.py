@@ -106,7 +106,7 @@ class NetLink(Link):
     def sender(self, key: str) -> Sender:
         return _Sender(self._net, key)
 
-    def tell(self, key: str, payload: Payload) -> None:
+    def tell(self, key: str, payload: Payload, priority: object = None) -> None:
         for pattern, heard in list(self._net.listeners):
             if fnmatch.fnmatchcase(key, pattern):
                 self._net.carry("told", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]

@@ -7,10 +7,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from skinware import DriverWriter, ServiceWriter
+from skinware.bridge.pinging import answering
 from skinware.bridge_state import MOST, BridgeReader, BridgeState, BridgeStateWriter, ServiceState, service_name
 from skinware.cli._report import report
 from skinware.cli.info import as_text
@@ -103,9 +105,11 @@ def test_the_true_error_of_the_clock_is_not_more_than_what_is_told(
 ) -> None:
     """The clock of the robot's bridge is 0.1 s away and drifts by 50 parts in a million."""
     begin_ns, away_ns = now_ns(), 100_000_000
-    monkeypatch.setattr(
-        "skinware.bridge.serving.now_ns", lambda: now_ns() + away_ns + round((now_ns() - begin_ns) * 50e-6)
-    )
+
+    def clock() -> int:
+        return now_ns() + away_ns + round((now_ns() - begin_ns) * 50e-6)
+
+    monkeypatch.setattr("skinware.bridge.serving.answering", partial(answering, clock=clock))
     ended = threading.Event()
     with joined(namespace, "push") as ends, serving(ends.net, ends.there):
         wait_until(lambda: ends.joiner.clock.is_known)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 _ALL = "skinware/**"
 _OF_A_ROBOT = "skinware/*/*/*"
-_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("clock", "services", "*/generation", "*/newest")]
+_QUESTIONS = [f"{_OF_A_ROBOT}/{what}" for what in ("services", "*/generation", "*/newest")]
+_PINGS = [f"{_OF_A_ROBOT}/ping"]
 _CALLS = [f"{_OF_A_ROBOT}/*/call/**"]
 
 _LISTENING = ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"]
-_SPEAKING = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
+_SPEAKING = ["put", "declare_subscriber", "delete", "reply", "declare_queryable", "liveliness_token"]
 _ASKING = ["query"]
 
 
@@ -42,6 +43,7 @@ class Rules:
         granted = [
             _Grant("see", _LISTENING, [_ALL]),
             _Grant("ask", _ASKING, _QUESTIONS),
+            _Grant("ping", ["put"], _PINGS),
             _Grant("call", _ASKING, _CALLS, self.callers),
             *(self._of_router() if self.routes else [_Grant("tell", _SPEAKING, [_ALL], flow="egress")]),
         ]

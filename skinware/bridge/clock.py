@@ -1,8 +1,9 @@
 """The other machine's clock, by questions to and fro: pure arithmetic.
 
-Each question tells an offset that is wrong by at most half of its round trip. The shortest round trips tell most.
-Clocks drift apart by some 10 parts in a million, so a line goes through the offsets of the shortest round trips of the
-last minute. What it may be wrong by is told with it.
+A question tells two bounds of the offset: it was heard after it was asked, and it returned after it was answered. The
+quickest way there and the quickest way back need not be those of one question, so several are asked at once. Clocks
+drift apart, steadily for a while: through the bounds of the last seconds go only so many lines, and what all of them
+have in common is what is known. Where none goes through, a clock jumped or drifts otherwise: the oldest are forgotten.
 """
 
 from __future__ import annotations
@@ -11,53 +12,65 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
 
-_KEPT_NS = 60 * NS_PER_S
-_SLOPE_FROM_NS = 5 * NS_PER_S
-"""A line through points that are nearer to each other tells nothing."""
-_SHARE = 0.1
-_FEWEST = 8
-_STEP_NS = 20_000_000
-"""Offsets that contradict what was known by more than their bounds and this: the clock jumped, as with a new start."""
-FAST_QUESTIONS, FAST_NS, SLOW_NS = 16, NS_PER_S // 8, NS_PER_S
+_KEPT_NS = 30 * NS_PER_S
+_AT_ONCE_NS = 20_000_000
+_HORIZON_NS = 3 * NS_PER_S // 2
+"""Until the next answers, what is told must hold."""
+_MOST_DRIFT = 500e-6
+"""Of two clocks, the worst that is corrected without a jump."""
+_WANDER = 0.2e-6
+"""By how much a drift may change within the time that is looked at."""
+_FAST_ROUNDS, _FAST_NS, _SLOW_NS = 16, NS_PER_S // 8, NS_PER_S // 2
+
+_Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What one question told.
+    """What questions told at one moment.
 
     Attributes:
-        at_ns: our time in the middle of it.
-        offset_ns: our clock minus the other.
+        at_ns: the moment, by our clock.
+        low_ns, high_ns: our clock minus the other is not less, and not more.
         round_trip_ns: without the time that the other end took.
     """
 
     at_ns: int
-    offset_ns: int
+    low_ns: int
+    high_ns: int
     round_trip_ns: int
 
     @staticmethod
     def of(asked_ns: int, heard_ns: int, answered_ns: int, returned_ns: int) -> Sample:
         """Of our times ``asked_ns`` and ``returned_ns`` and the other end's, ``heard_ns`` and ``answered_ns``."""
-        offset_ns = ((asked_ns - heard_ns) + (returned_ns - answered_ns)) // 2
-        round_trip_ns = max(0, (returned_ns - asked_ns) - (answered_ns - heard_ns))
-        return Sample((asked_ns + returned_ns) // 2, offset_ns, round_trip_ns)
+        low_ns, high_ns = asked_ns - heard_ns, returned_ns - answered_ns
+        return Sample((asked_ns + returned_ns) // 2, low_ns, high_ns, max(0, high_ns - low_ns))
+
+    def with_(self, other: Sample) -> Sample:
+        """What both told, at the moment of this one; only the other where the clock jumped between them."""
+        drift_ns = round(_MOST_DRIFT * abs(other.at_ns - self.at_ns))
+        low_ns, high_ns = max(self.low_ns, other.low_ns - drift_ns), min(self.high_ns, other.high_ns + drift_ns)
+        if low_ns > high_ns:
+            return other
+        return Sample(self.at_ns, low_ns, high_ns, min(self.round_trip_ns, other.round_trip_ns))
 
 
 class PeerClock:
     """Moves times of another machine to ours.
 
     Attributes:
-        error_ns: what ``here_ns`` may be wrong by.
+        error_ns: what ``offset_ns`` may be wrong by, until the next questions are answered.
     """
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque()
+        self._rounds = 0
         self._at_ns = 0
-        self._offset_ns = 0.0
-        self._slope = 0.0
+        self._offset_ns = self._slope = 0.0
         self.error_ns: int = 0
 
     @property
@@ -71,43 +84,58 @@ class PeerClock:
         return min((sample.round_trip_ns for sample in self._samples), default=0)
 
     def pause_ns(self) -> int:
-        """How long to wait before the next question."""
-        return FAST_NS if len(self._samples) < FAST_QUESTIONS else SLOW_NS
+        """How long to wait before the next questions."""
+        return _FAST_NS if self._rounds < _FAST_ROUNDS else _SLOW_NS
 
     def offset_ns(self, at_ns: int) -> int:
         """Our clock minus the other, at one of our moments."""
         return round(self._offset_ns + self._slope * (at_ns - self._at_ns))
 
     def add(self, sample: Sample) -> None:
-        """What a question told."""
-        if self.is_known:
-            away_ns = abs(sample.offset_ns - self.offset_ns(sample.at_ns))
-            if away_ns > self.error_ns + sample.round_trip_ns // 2 + _STEP_NS:
-                self._samples.clear()
-        self._samples.append(sample)
-        while sample.at_ns - self._samples[0].at_ns > _KEPT_NS:
-            self._samples.popleft()
-        self._fit(sample.at_ns)
-
-    def _fit(self, at_ns: int) -> None:
+        """What questions told."""
         samples = self._samples
-        count = max(_FEWEST, round(_SHARE * len(samples)))
-        best = sorted(samples, key=lambda sample: sample.round_trip_ns)[:count]
-        at = np.array([sample.at_ns - at_ns for sample in best], np.float64)
-        base_ns = best[0].offset_ns
-        offset = np.array([sample.offset_ns - base_ns for sample in best], np.float64)
-        bound = np.array([sample.round_trip_ns / 2 for sample in best], np.float64)
-        weight = 1 / np.maximum(bound, 1000.0) ** 2
-        middle = float(np.average(at, weights=weight))
-        self._slope = 0.0
-        if np.ptp(at) >= _SLOPE_FROM_NS:
-            spread = np.average((at - middle) ** 2, weights=weight)
-            self._slope = float(np.average((at - middle) * offset, weights=weight) / spread)
-        self._at_ns = at_ns
-        self._offset_ns = base_ns + float(np.average(offset, weights=weight)) - self._slope * middle
-        away = np.abs(offset + base_ns - (self._offset_ns + self._slope * at))
-        self.error_ns = round(float((bound + away).min() + abs(middle) * self._drift()))
+        if samples and abs(sample.at_ns - samples[-1].at_ns) < _AT_ONCE_NS:
+            samples[-1] = samples[-1].with_(sample)
+        else:
+            self._rounds += 1
+            samples.append(sample)
+            while sample.at_ns - samples[0].at_ns > _KEPT_NS:
+                samples.popleft()
+        while not self._fit():
+            samples.popleft()
 
-    def _drift(self) -> float:
-        """What the slope may be wrong by: nothing where there is a line, the worst of ordinary clocks where not."""
-        return 0.0 if self._slope else 100e-6
+    def _fit(self) -> bool:
+        """Find what all lines through the bounds have in common; False if there are none."""
+        newest = self._samples[-1]
+        at = np.array([sample.at_ns - newest.at_ns for sample in self._samples], np.float64)
+        slack = _WANDER * -at
+        low = np.array([sample.low_ns - newest.low_ns for sample in self._samples], np.float64) - slack
+        high = np.array([sample.high_ns - newest.low_ns for sample in self._samples], np.float64) + slack
+        most, least = _highest(at, low, high), -_highest(at, -high, -low)
+        if (most < least).any():
+            return False
+        now, then = (most + least) / 2
+        self._at_ns = newest.at_ns
+        self._offset_ns, self._slope = newest.low_ns + float(now), float(then - now) / _HORIZON_NS
+        self.error_ns = int(np.ceil((most - least).max() / 2)) + 1  # it is rounded, too
+        return True
+
+
+def _highest(at: _Floats, low: _Floats, high: _Floats) -> _Floats:
+    """(2,) where the highest line between bounds is at time 0, and at the horizon.
+
+    Args:
+        at: (n,) times, growing, none above 0.
+        low: (n,) bounds at these times.
+        high: likewise.
+    """
+    later = at[None, :] - at[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steep = np.where(later > 0, (high[None, :] - low[:, None]) / later, _MOST_DRIFT)
+    steepest = np.minimum(steep.min(axis=0), _MOST_DRIFT)
+    ends = np.array([0.0, _HORIZON_NS])
+    highest: _Floats = (high + steepest * (ends[:, None] - at)).min(axis=1)
+    return highest
+
+
+__all__ = ["PeerClock", "Sample"]

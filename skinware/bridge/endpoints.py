@@ -14,7 +14,6 @@ from skinware.errors import ConfigurationError
 
 _ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.%\w]+\]|[^\s/:\[\]]+):(\d{1,5})")
 DEFAULT_LISTEN, DEFAULT_ROUTER = "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7447"
-_ALL = "skinware/**"
 
 
 @dataclass(frozen=True)

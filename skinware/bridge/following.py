@@ -75,8 +75,11 @@ class Follower:
         self._patience_s = _FIRST_GENERATION_S
         self._count: int | None = None  # the robot's number of the frame published last, over generations
         self._newest = (0, 0)  # position of that frame
+        self._last_word = (0, 0)  # of the frame after which it became as it is there
+        self._is_gone = False  # from here, since the robot was not heard
         self._silence: Callable[[], None] | None = None  # ends the subscription to frames
-        self._pull_until_ns = 0  # until when an answer to the question for the newest frame may come, 0: none is open
+        self._pulls = 0  # how often the newest frame was asked for
+        self._pull_until_ns = 0  # until when an answer to the last such question may come, 0: none is open
         self._probe_until_ns = 0  # likewise, to one for a frame as it would be pushed
 
     @property
@@ -96,6 +99,7 @@ class Follower:
     def take(self, told: Service) -> None:
         """How it is there now."""
         before, self.state = self.state, told.state
+        self._last_word = told.generation, told.sequence
         if told.generation and (self._generation is None or self._generation.generation != told.generation):
             self._ask_generation(told.generation)
         if told.state != before or told.state in ("closed", "dead"):
@@ -108,7 +112,7 @@ class Follower:
         """What is to be done by the clock."""
         if not self._peer.is_connected or self._generation is None or not self._peer.clock.is_known:
             return
-        if self._pacing.pulls and time_ns > self._pull_until_ns:
+        if (self._pacing.pulls or self._is_gone) and time_ns > self._pull_until_ns:
             self._pull()
         if self._pacing.wants_probe(time_ns) and time_ns > self._probe_until_ns and self._count is not None:
             self._probe()
@@ -118,9 +122,11 @@ class Follower:
         self._generation, self._newest, self._count = None, (0, 0), None
 
     def lost(self) -> None:
-        """The robot is not heard any more."""
+        """The robot is not heard any more; whatever was asked is asked again when it is."""
         self._mirror.happened(self._name, DEAD)
-        self._pull_until_ns = 0
+        self._is_gone, self._newest = True, (0, 0)
+        self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
+        self._pull_until_ns = self._probe_until_ns = 0
 
     def clock_told(self) -> None:
         """The robot's clock is known."""
@@ -133,22 +139,23 @@ class Follower:
         time_ns = now_ns()
         if self._asked[0] == number and time_ns < self._asked[1]:
             return
-        self._asked = number, time_ns + round(self._patience_s * NS_PER_S)
+        self._asked = asked = number, time_ns + round(self._patience_s * NS_PER_S)
         self._peer.ask(
             self._peer.keys.of(self._name, "generation"),
-            lambda payload, _: self._take_generation(number, payload),
+            lambda payload, _: self._take_generation(asked, payload),
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
             parameters={"number": number} | self._of_part,
         )
 
-    def _take_generation(self, number: int, payload: bytes | None) -> None:
+    def _take_generation(self, asked: tuple[int, int], payload: bytes | None) -> None:
         if self.is_over:
             return
-        if self._asked[0] == number:
+        if self._asked == asked:
             self._asked = 0, 0
+            if payload is None:
+                self._patience_s = min(2 * self._patience_s, _LAST_GENERATION_S)
         if payload is None:
-            self._patience_s = min(2 * self._patience_s, _LAST_GENERATION_S)
             return
         self._peer.heard()
         try:
@@ -192,10 +199,11 @@ class Follower:
 
     def _pull(self) -> None:
         self._pull_until_ns = now_ns() + round(2 * ANSWER_S * NS_PER_S)
-        number, sequence = self._newest
+        self._pulls += 1
+        pull, (number, sequence) = self._pulls, self._newest
         self._peer.ask(
             self._peer.keys.of(self._name, "newest"),
-            lambda payload, _: self._take_pulled(payload),
+            lambda payload, _: self._take_pulled(pull, payload),
             timeout_s=2 * ANSWER_S,
             priority=Priority.PULLED,
             parameters={
@@ -207,12 +215,13 @@ class Follower:
             },
         )
 
-    def _take_pulled(self, message: bytes | None) -> None:
+    def _take_pulled(self, pull: int, message: bytes | None) -> None:
         if self.is_over:
             return
-        self._pull_until_ns = 0
-        if self._pacing.pulls and message is not None and self._peer.is_connected:
-            self._pull()  # the next one is on its way while this one is published
+        if pull == self._pulls:  # a late answer begins no second round
+            self._pull_until_ns = 0
+            if self._pacing.pulls and message is not None and self._peer.is_connected:
+                self._pull()  # the next one is on its way while this one is published
         if message:
             self._take_frame(message)
 
@@ -300,7 +309,9 @@ class Follower:
             return
         if self._count is not None:
             self.traffic.lost += max(0, count - self._count - 1)
-        self._count, self._newest = count, frame.position
+        self._count, self._newest, self._is_gone = count, frame.position, False
+        if self.state != "live" and frame.position <= self._last_word:  # it came late, and is of before
+            self._mirror.happened(self._name, _STATES[self.state])
         self.traffic.frames += 1
         self.traffic.ages_ns.append(age_ns)
         if self._pacing.saw(now_ns(), age_ns):

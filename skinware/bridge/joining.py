@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -14,6 +15,8 @@ from skinware.bridge.messages import Answered, Keys, Service, Services, Wish
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge.turns import Turns
+from skinware.bridge_state import BridgeState, BridgeStateWriter, ServiceState
+from skinware.errors import SkinwareError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns, short_turns
 from skinware.service import Request
@@ -48,7 +51,7 @@ class Joiner:
         why_not: Callable[[], str] = str,
         tell: Callable[[dict[str, Any]], None] = lambda _: None,
     ) -> None:
-        self._mode, self._wish = mode, wish
+        self._mode, self._wish, self._namespace = mode, wish, namespace
         self._missing = ""  # of the wish, when it was asked for last
         self._tell = tell
         self._turns = Turns()
@@ -57,11 +60,14 @@ class Joiner:
         self._followers: dict[str, Follower] = {}
         self._callers: tuple[str, ...] = ()
         self._stopping = False
-        self._next_services_ns = 0
+        self._next_services_ns = self._next_state_ns = 0
+        self._state_writer: BridgeStateWriter | None = None
         self._mirror.watch(self._turns.fd, self._turns.take)
         self._peer = Peer(robot, link, self._turns, self, why_not=why_not, tell=tell)
         self._of_any = Keys(robot)
         link.listen(self._of_any.services, lambda _, payload: self._turns.soon(lambda: self._services_changed(payload)))
+
+        self._state = BridgeState(robot, False, self._peer.since_ns, None, None, 0, {})
 
     @property
     def is_connected(self) -> bool:
@@ -73,19 +79,20 @@ class Joiner:
         """Of the robot."""
         return self._peer.clock
 
-    def run(self, tell: Callable[[], object] = lambda: None) -> None:
-        """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
+    def run(self, tell: Callable[[BridgeState], object] = lambda _: None) -> None:
+        """Until ``stop``; ``tell`` is told once a second how the bridge is."""
+        self._next_state_ns = now_ns() + NS_PER_S
         with short_turns():
             while not self._stopping:
                 self._mirror.answer(_TICK_S)
                 with self._lock:
                     self._look()
-                if now_ns() >= tell_ns:
-                    tell_ns = max(tell_ns + NS_PER_S, now_ns())
+                if now_ns() >= self._next_state_ns:
+                    self._next_state_ns = max(self._next_state_ns + NS_PER_S, now_ns())
                     with self._lock:
                         self._mirror.tidy()
-                    tell()
+                        self._publish_state(self._services_state())
+                    tell(self._state)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
@@ -98,17 +105,10 @@ class Joiner:
             for follower in self._followers.values():
                 follower.is_over = True
             self._mirror.close()
+            if self._state_writer is not None:
+                self._state_writer.close()
+                self._state_writer = None
         self._turns.close()
-
-    def traffic(self) -> Mapping[str, tuple[str, str, Traffic]]:
-        """(state, mode, what came since the last call) of every service."""
-        taken = {}
-        with self._lock:
-            for name, follower in self._followers.items():
-                state = follower.state if self.is_connected else "unheard"
-                taken[name] = (state, follower.mode, follower.traffic)
-                follower.traffic = Traffic(lost=follower.traffic.lost)
-        return taken
 
     def _look(self) -> None:
         """What is to be done by the clock."""
@@ -118,6 +118,45 @@ class Joiner:
         self._peer.look(time_ns)
         for follower in self._followers.values():
             follower.look(time_ns)
+        if self._peer.since_ns != self._state.since_ns:
+            state = "live" if self.is_connected else "unheard"
+            self._publish_state({name: replace(one, state=state) for name, one in self._state.services.items()})
+
+    # -- what is told of this bridge ------------------------------------------------------------------------------
+
+    def _services_state(self) -> dict[str, ServiceState]:
+        """How every service comes, since the last call."""
+        states = {}
+        for name, follower in self._followers.items():
+            traffic, follower.traffic = follower.traffic, Traffic(lost=follower.traffic.lost)
+            states[name] = ServiceState(
+                follower.state if self.is_connected else "unheard",
+                follower.mode,
+                traffic.frames,
+                traffic.lost,
+                traffic.bytes,
+                *(_quantile(traffic.ages_ns, share) for share in (0.5, 0.99)),
+            )
+        return states
+
+    def _publish_state(self, services: dict[str, ServiceState]) -> None:
+        clock = self.clock
+        self._state = BridgeState(
+            self._peer.robot,
+            self.is_connected,
+            self._peer.since_ns,
+            clock.offset_ns(now_ns()) if clock.is_known else None,
+            clock.error_ns if clock.is_known else None,
+            clock.round_trip_ns,
+            services,
+        )
+        try:
+            if self._state_writer is None:
+                self._state_writer = BridgeStateWriter(self._peer.robot, self._namespace)
+            self._state_writer.publish(self._state, now_ns())
+        except SkinwareError as error:
+            self._state_writer = None
+            self._peer.say_once("state", f"how this bridge is cannot be told: {error}")
 
     # -- what is told of the robot --------------------------------------------------------------------------------
 
@@ -221,6 +260,10 @@ class Joiner:
             return
         self._peer.heard()
         self._mirror.answered(name, request, answer, result)
+
+
+def _quantile(values: Sequence[int], share: float) -> float | None:
+    return sorted(values)[int(share * len(values))] if values else None
 
 
 __all__ = ["Joiner"]

@@ -20,7 +20,7 @@ from skinware.errors import BridgeError
 
 LEASE_MS = 2000
 """A peer that says nothing for so long is gone."""
-_RETRY_MS = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+_RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _FOREVER_MS = -1
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
@@ -147,10 +147,10 @@ class Link:
         )
         return Sender(publisher, self._undeclaring(publisher))
 
-    def tell(self, key: str, payload: Payload) -> None:
+    def tell(self, key: str, payload: Payload, priority: zenoh.Priority = Priority.CALLS) -> None:
         """Send something small, before any frames."""
         with contextlib.suppress(zenoh.ZError):
-            self._session.put(key, payload, priority=Priority.CALLS, express=True)
+            self._session.put(key, payload, priority=priority, express=True)
 
     def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
         """Have (key, bytes) of what is sent under keys, in the thread that receives; what ends it."""

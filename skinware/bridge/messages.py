@@ -4,7 +4,8 @@ Keys of robot R: ``skinware/1/R/INSTANCE/``..., INSTANCE being the number of the
 robots of one name are never taken for each other.
 
 ======================  ===============================================================================================
-``clock``               question; answer: two i64, CLOCK_MONOTONIC ns when it came and when it was answered
+``ping``                who asks (16 letters), i64 when, by his clock; answered with ``pong/WHO``: that time, and when
+                        it came and was answered, i64 CLOCK_MONOTONIC ns each
 ``services``            question; answer: :class:`Services` as JSON. Sent unasked whenever something of it changes.
                         Asked with :class:`Wish` as JSON: answered for those sensors, and asked again once a second
                         for as long as they are wanted
@@ -48,7 +49,6 @@ RAW, CODED = 0, 1
 
 _HEAD = struct.Struct("<B7xQ")
 _CODED_HEAD = struct.pack("<B7x", CODED)
-CLOCK = struct.Struct("<qq")
 _SIZE = struct.Struct("<I")
 _LONGEST_HEAD = 1 << 30
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
@@ -60,10 +60,12 @@ class Service(msgspec.Struct, frozen=True):
     Attributes:
         generation: its number; 0: not known yet.
         state: ``live``, ``paused``, ``closed`` or ``dead``.
+        sequence: of its newest frame when it became so: those up to it may be on their way still.
     """
 
     generation: int = 0
     state: str = "live"
+    sequence: int = 0
 
 
 class Services(msgspec.Struct, frozen=True):
@@ -204,8 +206,12 @@ class Keys:
             )
         self.robot, self._instance = robot, instance
         self._root = f"skinware/{VERSION}/{robot}/{instance}"
-        self.clock, self.services = f"{self._root}/clock", f"{self._root}/services"
+        self.ping, self.services = f"{self._root}/ping", f"{self._root}/services"
         self.summary = f"{self._root}/summary"
+
+    def pong(self, who: str) -> str:
+        """Of answers to somebody's pings."""
+        return f"{self._root}/pong/{who}"
 
     @property
     def token(self) -> str:

@@ -51,7 +51,7 @@ class Mirror(Republisher):
     """
 
     def __init__(self, namespace: Namespace, ask: Callable[[str, Request], None], offset_ns: Callable[[], int]) -> None:
-        super().__init__(namespace, {})
+        super().__init__(namespace, {}, keeps_counts=True)
         self.lock = threading.RLock()
         self._ask, self._offset_ns = ask, offset_ns
         self._answers: defaultdict[str, list[_Waiting]] = defaultdict(list)

@@ -8,8 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from skinware.bridge.clock import PeerClock, Sample
-from skinware.bridge.link import Link, Priority, Reply
-from skinware.bridge.messages import ALL_TOKENS, CLOCK, VERSION, Keys, token_parts
+from skinware.bridge.link import Link, Reply
+from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, token_parts
+from skinware.bridge.pinging import Pinger
 from skinware.bridge.turns import Turns
 from skinware.realtime import NS_PER_S, now_ns
 
@@ -55,6 +56,7 @@ class Peer:
         who: this end, in questions.
         clock: of the robot.
         is_connected: whether it is heard.
+        since_ns: since when that is so.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class Peer:
         self.clock = PeerClock()
         self._instance, self._start = "", ""
         self.is_connected = False
+        self.since_ns: int = now_ns()
         self.tell = tell
         self._link, self._turns, self._watcher = link, turns, watcher
         self._there: set[str] = set()  # bridges that serve the robot
@@ -79,6 +82,7 @@ class Peer:
         self._why_not, self._next_why_ns, self._asking_why = why_not, now_ns() + _PATIENCE_NS, False
         self._heard_ns = self._pinged_ns = self._next_clock_ns = 0
         self._told: set[str] = set()
+        self._pinger = Pinger(link, self.who, lambda sample: turns.soon(lambda: self._take_clock(sample)))
         link.watch(ALL_TOKENS, lambda key, there: turns.soon(lambda: self._token(key, there)))
 
     @property
@@ -128,6 +132,7 @@ class Peer:
         self.heard()
         if instance != self._instance:
             self._instance, self.keys = instance, Keys(self.robot, instance)
+            self._pinger.follow(self.keys)
             self._watcher.moved()
         if start != self._start:
             self._start = start
@@ -140,7 +145,7 @@ class Peer:
         """Something came from it."""
         self._heard_ns = now_ns()
         if not self.is_connected:
-            self.is_connected = True
+            self.is_connected, self.since_ns = True, self._heard_ns
             self._told.clear()
             self.tell({"event": "connected", "robot": self.robot})
 
@@ -183,7 +188,7 @@ class Peer:
     def _lose(self, why: str) -> None:
         if not self.is_connected:
             return
-        self.is_connected = False
+        self.is_connected, self.since_ns = False, now_ns()
         self._watcher.lost()
         self.tell({"event": "disconnected", "robot": self.robot, "why": why})
 
@@ -201,24 +206,13 @@ class Peer:
         self._turns.soon(tell)
 
     def _ask_clock(self) -> None:
-        asked_ns = self._pinged_ns = now_ns()
-        self._next_clock_ns = asked_ns + self.clock.pause_ns()
-        instance = self._instance
-        if not instance:
-            return
+        self._pinged_ns = now_ns()
+        self._next_clock_ns = self._pinged_ns + self.clock.pause_ns()
+        self._pinger.ask()
 
-        def returned(payload: bytes | None, returned_ns: int) -> None:
-            if instance == self._instance:
-                self._take_clock(asked_ns, payload, returned_ns)
-
-        self.ask(self.keys.clock, returned, timeout_s=ANSWER_S, priority=Priority.CLOCK)
-
-    def _take_clock(self, asked_ns: int, payload: bytes | None, returned_ns: int) -> None:
-        if payload is None or len(payload) != CLOCK.size:
-            return
+    def _take_clock(self, sample: Sample) -> None:
         self.heard()
-        heard_ns, answered_ns = CLOCK.unpack(payload)
-        self.clock.add(Sample.of(asked_ns, heard_ns, answered_ns, returned_ns))
+        self.clock.add(sample)
         self._watcher.clock_told()
 
 

@@ -16,8 +16,9 @@ import msgspec
 from skinware.bridge.calling import Calls
 from skinware.bridge.giving import Stream
 from skinware.bridge.link import Link, Question
-from skinware.bridge.messages import CLOCK, About, Keys, Service, Services, Wish, generation_message, parts_of
+from skinware.bridge.messages import About, Keys, Service, Services, Wish, generation_message, parts_of
 from skinware.bridge.parts import Parts
+from skinware.bridge.pinging import answering
 from skinware.bridge.summaries import Summaries, Summarised
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory import segments
@@ -101,8 +102,9 @@ class Server:
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
         self._stopping = False
         self._collector = Collector(namespace, names, self)
+        self._collector.take()  # who asks is told of all that there is
         self._answering = [
-            link.answer(self._keys.clock, self._clock_asked),
+            answering(link, self._keys),
             link.answer(self._keys.services, self._services_asked),
             link.answer(self._keys.of("*", "generation"), self._generation_asked),
             link.answer(self._keys.of("*", "newest"), self._newest_asked),
@@ -182,7 +184,9 @@ class Server:
         with self._lock:
             served = self._services.get(name)
             if served is not None:
-                served.told = Service(served.told.generation, state)
+                newest = served.stream.newest
+                sequence = newest.sequence if newest is not None else 0
+                served.told = Service(served.told.generation, state, sequence)
         self._link.tell(self._keys.services, self._told())
 
     def _stream(self, service: str, part: str = "") -> Stream:
@@ -218,10 +222,6 @@ class Server:
         self._parts.let_go()
 
     # -- questions, in zenoh's threads ----------------------------------------------------------------------------
-
-    def _clock_asked(self, question: Question) -> None:
-        heard_ns = now_ns()
-        question.reply(CLOCK.pack(heard_ns, now_ns()))
 
     def _services_asked(self, question: Question) -> None:
         if question.payload:

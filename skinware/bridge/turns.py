@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections import deque
 from collections.abc import Callable
 
@@ -17,6 +18,7 @@ class Turns:
 
     def __init__(self) -> None:
         self._jobs: deque[Callable[[], None]] = deque()
+        self._lock = threading.RLock()  # signal handlers come in between
         self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     def soon(self, job: Callable[[], None]) -> None:
@@ -26,8 +28,9 @@ class Turns:
 
     def ring(self) -> None:
         """Wake who waits; from any thread, and from a signal handler."""
-        with contextlib.suppress(OSError, ValueError):  # closed
-            os.eventfd_write(self.fd, 1)
+        with self._lock:
+            if self.fd >= 0:
+                os.eventfd_write(self.fd, 1)
 
     def take(self) -> None:
         """Do what waits."""
@@ -38,8 +41,9 @@ class Turns:
 
     def close(self) -> None:
         """End it."""
-        fd, self.fd = self.fd, -1
-        os.close(fd)
+        with self._lock:
+            fd, self.fd = self.fd, -1
+            os.close(fd)
 
 
 __all__ = ["Turns"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -10,21 +11,12 @@ from dataclasses import dataclass, field
 import msgspec
 
 from skinware.bridge.clock import PeerClock, Sample
-from skinware.bridge.link import Link, Priority, Reply
-from skinware.bridge.messages import (
-    ALL_SUMMARIES,
-    ALL_TOKENS,
-    CLOCK,
-    VERSION,
-    Keys,
-    Summary,
-    bridge_of,
-    token_parts,
-)
+from skinware.bridge.link import Link
+from skinware.bridge.messages import ALL_SUMMARIES, ALL_TOKENS, VERSION, Keys, Summary, bridge_of, token_parts
+from skinware.bridge.pinging import Pinger
 from skinware.realtime import NS_PER_S, now_ns
 
 _TICK_S = 0.05
-_ANSWER_S = 1.0
 
 Bridge = tuple[str, str]
 """(robot, number of the bridge that serves it)."""
@@ -43,6 +35,7 @@ class Seen:
         told_ns: when that was, 0 if it was never.
         bytes: of all that it told so far.
         next_clock_ns: when its clock is to be asked next.
+        pinger: asks for it; None: nobody wants to know.
     """
 
     robot: str
@@ -53,6 +46,7 @@ class Seen:
     told_ns: int = 0
     bytes: int = 0
     next_clock_ns: int = 0
+    pinger: Pinger | None = None
 
 
 class Watcher:
@@ -64,7 +58,7 @@ class Watcher:
     """
 
     def __init__(self, link: Link, *, asks: bool = True) -> None:
-        self._link, self._asks = link, asks
+        self._link, self._asks, self._who = link, asks, os.urandom(8).hex()
         self._lock = threading.Lock()
         self._seen: dict[Bridge, Seen] = {}
         self._stopping = False
@@ -96,11 +90,14 @@ class Watcher:
 
     def _token(self, key: str, there: bool) -> None:
         robot, version, instance = token_parts(key)
+        gone = None
         with self._lock:
             if there:
                 self._seen.setdefault((robot, instance), Seen(robot, instance)).version = version
             else:
-                self._seen.pop((robot, instance), None)
+                gone = self._seen.pop((robot, instance), None)
+        if gone is not None and gone.pinger is not None:
+            gone.pinger.close()
 
     def _told(self, key: str, payload: bytes) -> None:
         try:
@@ -114,18 +111,15 @@ class Watcher:
                 seen.bytes += len(payload)
 
     def _ask_clock(self, seen: Seen) -> None:
-        asked_ns = now_ns()
-        seen.next_clock_ns = asked_ns + seen.clock.pause_ns()
+        def told(sample: Sample) -> None:
+            with self._lock:
+                seen.clock.add(sample)
 
-        def returned(reply: Reply) -> None:
-            returned_ns = now_ns()
-            if reply.payload is not None and len(reply.payload) == CLOCK.size:
-                heard_ns, answered_ns = CLOCK.unpack(reply.payload)
-                with self._lock:
-                    seen.clock.add(Sample.of(asked_ns, heard_ns, answered_ns, returned_ns))
-
-        keys = Keys(seen.robot, seen.instance)
-        self._link.ask(keys.clock, returned, timeout_s=_ANSWER_S, priority=Priority.CLOCK)
+        seen.next_clock_ns = now_ns() + seen.clock.pause_ns()
+        if seen.pinger is None:
+            seen.pinger = Pinger(self._link, self._who, told)
+            seen.pinger.follow(Keys(seen.robot, seen.instance))
+        seen.pinger.ask()
 
 
 __all__ = ["Seen", "Watcher"]

@@ -7,7 +7,8 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from skinware import native
+from skinware import bridge_state, native
+from skinware.cli import _bridges
 from skinware.driver_service import KIND, DriverFrame, DriverReader
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS, ReaderRecord, living_readers
@@ -97,12 +98,20 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
 def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
     with ServiceReader[Frame](name, namespace=namespace, announce=False) as service:
         if service.kind != KIND:
-            told = {"description": service.schema.description, "columns": _columns(service)}
+            told: dict[str, Any] = {"description": service.schema.description, "columns": _columns(service)}
+            told |= {"bridge": _bridge(namespace, name)} if service.kind == bridge_state.KIND else {}
             return _common(service, _newest(service)) | told
     with DriverReader(name, namespace=namespace, announce=False) as driver:
         frame = _newest(driver)
         common = _common(driver, frame)
         return {**common, **_skin(driver, frame, common["state"])}
+
+
+def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
+    """What a bridge tells of itself; None before it has told anything."""
+    with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
+        frame = _newest(reader)
+        return None if frame is None else {"robot": frame.state.robot, **_bridges.as_data(frame.state)}
 
 
 def _newest(service: ServiceReader[FrameT]) -> FrameT | None:

@@ -15,6 +15,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
+from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._format import NOT_FRESH, plural
 from skinware.cli._heat_widget import HeatMap
@@ -25,6 +26,7 @@ from skinware.cli._top_rows import COLUMNS, Row, RowKey, counters_text, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.tactile.regions import Regions
+from skinware.views.bridges import LiveBridges
 from skinware.views.health import LIVE, life_of
 from skinware.views.live import LiveDrivers
 from skinware.views.touches import live_contacts, places_of
@@ -126,6 +128,7 @@ class SkinTop(App[None]):
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
         self._drivers = LiveDrivers(namespace)
         self._contacts = live_contacts(namespace)
+        self._bridges = LiveBridges(namespace)
         self._duration_s = duration_s
         self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
         self._has_regions = regions is not None
@@ -182,6 +185,7 @@ class SkinTop(App[None]):
         """Let go of the drivers."""
         for number in _ENDING_SIGNALS:
             asyncio.get_running_loop().remove_signal_handler(number)
+        self._bridges.close()
         self._contacts.close()
         self._drivers.close()
 
@@ -269,16 +273,19 @@ class SkinTop(App[None]):
             return  # the screen is being taken down
         rows: list[Row] = []
         why = _NOTHING.format(name=self._drivers.namespace.name)
-        count = 0
+        count, bridges = 0, []
         try:
             for driver in self._drivers.look():
                 self._drivers.poll(driver)
                 count += 1
                 rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
             self._contacts.look(self._drivers.others)
+            bridges = self._bridges.look(self._drivers.others)
         except NamespaceError as error:
             why = str(error)
-        self._heading = f"skin-top   namespace {self._drivers.namespace.name}   {plural(count, 'driver')}"
+        told = [_bridges.summary(bridge.robot, _bridges.as_data(bridge)) for bridge in bridges]
+        place = f"namespace {self._drivers.namespace.name}"
+        self._heading = "   ".join(["skin-top", place, plural(count, "driver"), *told])
         _say(self._why, why)
         self._nothing.display, self._all.display = not rows, bool(rows)
         self._fill(rows)

@@ -24,10 +24,10 @@ from skinware.cli._command import (
 )
 from skinware.cli._robots import list_robots, route
 from skinware.errors import ConfigurationError
-from skinware.realtime import now_ns
 
 if TYPE_CHECKING:
-    from skinware.bridge import Joiner, Server, Wish
+    from skinware.bridge import Server, Wish
+    from skinware.bridge_state import BridgeState
 
 _PORT = 7448
 
@@ -213,7 +213,7 @@ def join(
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
             else:
                 click.echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
-            joiner.run(lambda: status.tell(joiner))
+            joiner.run(status.tell)
 
 
 def _wish(patches: tuple[str, ...], in_regions: tuple[str, ...], region_files: tuple[Path, ...]) -> Wish | None:
@@ -247,39 +247,16 @@ class _Joined:
         else:
             click.echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
-    def tell(self, joiner: Joiner) -> None:
-        services = {}
-        for name, (state, mode, traffic) in joiner.traffic().items():
-            ages = sorted(traffic.ages_ns)
-            services[name] = {
-                "state": state,
-                "mode": mode,
-                "rate_hz": traffic.frames,
-                "lost": traffic.lost,
-                "bytes_per_s": traffic.bytes,
-                "age_ms": {
-                    "p50": ages[len(ages) // 2] / 1e6 if ages else None,
-                    "p99": ages[len(ages) * 99 // 100] / 1e6 if ages else None,
-                },
-            }
-            if not self._as_json and self._known.get(name) != (state, mode):
-                click.echo(f"{name}: {state}")
-            self._known[name] = state, mode
+    def tell(self, bridge: BridgeState) -> None:
+        from skinware.cli._bridges import as_data
+
+        for name, service in bridge.services.items():
+            shown = service.state, service.mode
+            if not self._as_json and self._known.get(name) != shown:
+                click.echo(f"{name}: {service.state}")
+            self._known[name] = shown
         if self._as_json:
-            clock = joiner.clock
-            told = {
-                "offset_ms": clock.offset_ns(now_ns()) / 1e6,
-                "error_ms": clock.error_ns / 1e6,
-                "round_trip_ms": clock.round_trip_ns / 1e6,
-            }
-            print_json(
-                {
-                    "event": "status",
-                    "connected": joiner.is_connected,
-                    "clock": told if clock.is_known else None,
-                    "services": services,
-                }
-            )
+            print_json({"event": "status"} | as_data(bridge))
 
 
 _MODES = {

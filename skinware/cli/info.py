@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from skinware.cli._bridges import as_lines
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
@@ -122,7 +123,7 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     for driver in drivers:
         lines += ["", *_driver_lines(driver | {"patch_list": _summed_up(driver)} if brief else driver)]
     for service in services:
-        own = [*_column_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
+        own = [*_content_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
         lines += ["", _life_line("service", service), *_indented(own)]
     if found["why_python"]:
         lines += ["", f"programs of this installation read without compiled code: {found['why_python']}"]
@@ -212,8 +213,10 @@ def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
     return entries
 
 
-def _column_lines(service: dict[str, Any]) -> list[str]:
-    """What the frames of a service that is no driver consist of."""
+def _content_lines(service: dict[str, Any]) -> list[str]:
+    """What a bridge tells; what the frames of another service that is no driver consist of."""
+    if service.get("bridge") is not None:
+        return [*as_lines(service["bridge"]["robot"], service["bridge"]), ""]
     rows = [
         [c["name"], _dtype_text(c["dtype"]), "x".join(map(str, c["shape"])) or "1", c["unit"], c["description"]]
         for c in service["columns"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
     from skinware.tactile.contacts_service import ContactsFrame
     from skinware.tactile.regions import Regions
+    from skinware.views.bridges import LiveBridges
     from skinware.views.live import LiveDrivers
     from skinware.views.touches import LiveSources
 
@@ -118,12 +120,13 @@ def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
     """Print a line per driver each second, until the time is over."""
+    from skinware.views.bridges import LiveBridges
     from skinware.views.live import LiveDrivers
     from skinware.views.touches import live_contacts
 
     start_s = time.monotonic()
     end_s = None if duration_s is None else start_s + duration_s
-    drivers, contacts = LiveDrivers(namespace), live_contacts(namespace)
+    drivers, contacts, bridges = LiveDrivers(namespace), live_contacts(namespace), LiveBridges(namespace)
     try:
         lines_at_s = start_s
         while end_s is None or time.monotonic() < end_s:
@@ -131,10 +134,13 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
                 drivers.poll(driver)
             if time.monotonic() >= lines_at_s:
                 _print_lines(drivers, contacts, as_json)
+                if not as_json:
+                    _print_bridges(bridges, drivers.others)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
             next_s = time.monotonic() + _TAKE_PERIOD_S
             time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
     finally:
+        bridges.close()
         contacts.close()
         drivers.close()
 
@@ -161,6 +167,13 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_
                 click.echo(line)
     if not found and not as_json:
         click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
+
+
+def _print_bridges(bridges: LiveBridges, names: Iterable[str]) -> None:
+    from skinware.cli._bridges import as_data, summary
+
+    for bridge in bridges.look(names):
+        click.echo(summary(bridge.robot, as_data(bridge)))
 
 
 def main() -> None:

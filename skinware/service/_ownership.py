@@ -38,6 +38,7 @@ class Ownership:
         schema, static, kind, slots, period_ns: of the first generation.
         group: who may read.
         operations: what programs may ask for.
+        published_before: frames that were published under the name before; None: as the files tell.
 
     Raises:
         NameInUse: a running writer has this name.
@@ -59,6 +60,7 @@ class Ownership:
         period_ns: int,
         group: str | None,
         operations: Mapping[str, Callable[..., object]],
+        published_before: int | None,
     ) -> None:
         self.name: str = check_name(name, "service")
         self.namespace: Namespace = Namespace.of(namespace)
@@ -74,8 +76,9 @@ class Ownership:
         try:
             sweep(self.namespace)
             previous = segments.previous(self.namespace, name)
-            published = segments.published_so_far(self._name_lock, previous)
-            self._begin_generation(schema, static, period_ns, previous, published)
+            if published_before is None:
+                published_before = segments.published_so_far(self._name_lock, previous)
+            self._begin_generation(schema, static, period_ns, previous, published_before)
         except BaseException:
             self._name_lock.close()
             raise
@@ -136,6 +139,7 @@ class Ownership:
         static: Mapping[str, npt.NDArray[Any]] | None = None,
         *,
         rate_hz: float | None = None,
+        skip: int = 0,
     ) -> None:
         """Go on under the same name with other columns, as a new generation; readers are told.
 
@@ -143,6 +147,7 @@ class Ownership:
             columns: as for a new writer.
             static: as for a new writer.
             rate_hz: the nominal rate from now on; None: as before.
+            skip: frames before its first one that are left out; readers count them as lost.
 
         Raises:
             ConfigurationError: columns that the format cannot hold; the old generation then goes on.
@@ -152,7 +157,7 @@ class Ownership:
         self._require_open()
         schema = Schema.of(columns, self._schema.description)
         period_ns = self._period_ns if rate_hz is None else round(NS_PER_S / rate_hz)
-        self._succeed(schema, static or {}, period_ns)
+        self._succeed(schema, static or {}, period_ns, skip)
 
     def request_server(self) -> RequestServer:
         """The socket that requests come by, for event loops: readable when ``requests`` has something to say.
@@ -254,10 +259,10 @@ class Ownership:
                 previous.mark(file_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
                 previous.descriptor.close()
 
-    def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int) -> None:
+    def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int, skip: int = 0) -> None:
         """A new generation in the place of our own."""
         own = self._ring.segment
-        self._begin_generation(schema, static, period_ns, own, own.published)
+        self._begin_generation(schema, static, period_ns, own, own.published + skip)
 
     def _set_paused(self, paused: bool) -> None:
         self._require_open()

@@ -36,6 +36,8 @@ class ServiceWriter(Ownership):
         description: of the service, for people.
         operations: what programs may ask for besides a frame: name to function, called in the writer's own loop
             (``periodic``, ``on_request``) with the request's arguments; its docstring's first line describes it.
+        published_before: frames that were published under this name before, for who passes frames on and counts as
+            their origin does; None: as the files of the name tell.
 
     Raises:
         NameInUse: a running writer has this name.
@@ -56,6 +58,7 @@ class ServiceWriter(Ownership):
         group: str | None = None,
         description: str = "",
         operations: Mapping[str, Callable[..., object]] | None = None,
+        published_before: int | None = None,
     ) -> None:
         super().__init__(
             name,
@@ -67,6 +70,7 @@ class ServiceWriter(Ownership):
             period_ns=round(NS_PER_S / rate_hz) if rate_hz else 0,
             group=group,
             operations=operations or {},
+            published_before=published_before,
         )
         self.missed_periods: int = 0
         self._stopping = False

@@ -56,6 +56,8 @@ class Republisher:
         namespace: where to publish.
         operations: that every service offers, also while it is paused.
         keeps_times: they stay as they were recorded.
+        keeps_counts: frames have the numbers that they have where they come from, so that readers know what they lost
+            even if another process published before; otherwise each new writer counts on from the last one.
 
     Attributes:
         frames: of each service that were published.
@@ -68,13 +70,14 @@ class Republisher:
         operations: Mapping[str, Callable[..., object]],
         *,
         keeps_times: bool = False,
+        keeps_counts: bool = False,
     ) -> None:
-        self._namespace, self._operations, self._keeps_times = namespace, operations, keeps_times
+        self._namespace, self._operations = namespace, operations
+        self._keeps_times, self._keeps_counts = keeps_times, keeps_counts
         self._services: dict[str, Published] = {}
         self._deserted: dict[str, Generation] = {}
         self._surplus: list[str] = []
-        self._counts: dict[str, int] = {}
-        self._ahead: Counter[str] = Counter()  # losses that a writer told more than there were, for want of a slot
+        self._counts: dict[str, int] = {}  # the origin's number of the frame that was published last
         self._paused = False
         self._epoll = select.epoll()
         self._calls: dict[int, Callable[[], object]] = {}
@@ -105,20 +108,24 @@ class Republisher:
         """
         if name in self._surplus:
             self._surplus.remove(name)
-        service = self._service(name, generation, follows)
+        count = generation.published_before + frame.sequence
+        service = self._service(name, generation, count, follows)
         writer = service.writer
         service.was_paused = False
         if writer.paused:
             writer.resume()
-        before, lost = writer.sequence, self._lost_before(name, frame, generation, follows)
-        columns = writer.begin(skip=max(0, lost - self._ahead[name]), contents=frame.slot)
+        lost = self._lost_before(name, count) if follows else 0
+        if lost and (lost + 1) % writer.slots == 0:  # it would take the slot of the newest frame, or leave out one more
+            self._restructure(service, skip=lost)
+            lost = 0
+        columns = writer.begin(skip=lost, contents=frame.slot)
         shift_ns = self.shift_ns(frame)  # last, so that filling the columns makes no frame older
         if generation.is_driver and not self._keeps_times:
             for into in (columns[column] for column in _TIMES_OF_DRIVERS if column in columns):
                 into[into != 0] += shift_ns
         acquired_ns = frame.acquired_ns + shift_ns if frame.acquired_ns else 0
-        sequence = writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
-        self._ahead[name] += sequence - before - 1 - lost
+        writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
+        self._counts[name] = count
         self.frames[name] += 1
         self._reply(service, acquired_ns)
         if self._paused:
@@ -186,8 +193,8 @@ class Republisher:
                 self._new_writer(name, generation).close()
         self._epoll.close()
 
-    def _service(self, name: str, generation: Generation, follows: bool) -> Published:
-        """The service, with the generation of a frame."""
+    def _service(self, name: str, generation: Generation, count: int, follows: bool) -> Published:
+        """The service, with the generation of the frame that has a number."""
         service = self._services.get(name)
         if service is not None and service.generation is generation and service.speed == self.speed:
             return service
@@ -195,17 +202,24 @@ class Republisher:
             self._remove(name)
             service = None
         if service is None:
-            return self._begin(name, generation)
+            return self._begin(name, generation, count)
         before, service.generation = service.generation, generation
         restarted = follows and before.generation != generation.generation
         if restarted or before.digest != generation.digest or service.speed != self.speed:
-            static = _tables(generation)
-            service.writer.restructure(generation.schema.columns, static, rate_hz=self._rate_hz(generation))
+            self._restructure(service)
             service.speed = self.speed
         return service
 
-    def _begin(self, name: str, generation: Generation) -> Published:
-        writer = self._new_writer(name, generation)
+    def _restructure(self, service: Published, skip: int = 0) -> None:
+        generation = service.generation
+        static, rate_hz = _tables(generation), self._rate_hz(generation)
+        service.writer.restructure(generation.schema.columns, static, rate_hz=rate_hz, skip=skip)
+
+    def _begin(self, name: str, generation: Generation, count: int) -> Published:
+        published_before = count - 1 if self._keeps_counts else None
+        writer = self._new_writer(name, generation, published_before)
+        if published_before is not None:
+            self._counts[name] = published_before
         self._deserted.pop(name, None)
         server = writer.request_server()
         server.while_paused, server.why_no_others = frozenset(self._operations), _OTHERS
@@ -213,7 +227,7 @@ class Republisher:
         self.watch(service.fd, lambda: self.take_requests(name, service))
         return service
 
-    def _new_writer(self, name: str, generation: Generation) -> ServiceWriter:
+    def _new_writer(self, name: str, generation: Generation, published_before: int | None = None) -> ServiceWriter:
         return ServiceWriter(
             name,
             generation.schema.columns,
@@ -224,6 +238,7 @@ class Republisher:
             rate_hz=self._rate_hz(generation),
             description=generation.schema.description,
             operations=self.operations_of(name),
+            published_before=published_before,
         )
 
     def _rate_hz(self, generation: Generation) -> float | None:
@@ -242,11 +257,9 @@ class Republisher:
         """Carry out what was asked of a service."""
         service.waiting += [(now_ns(), request) for request in service.writer.answer_requests()]
 
-    def _lost_before(self, name: str, frame: RecordedFrame, generation: Generation, follows: bool) -> int:
-        """How many frames are not in the recording between a frame and the one before."""
-        count = generation.published_before + frame.sequence
-        before, self._counts[name] = self._counts.get(name), count
-        return max(0, count - before - 1) if follows and before is not None else 0
+    def _lost_before(self, name: str, count: int) -> int:
+        """How many frames are missing between the one that has a number and the one that was published last."""
+        return max(0, count - self._counts.get(name, count) - 1)
 
     @staticmethod
     def _reply(service: Published, acquired_ns: int) -> None:

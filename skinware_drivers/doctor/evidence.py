@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from skinware.bridge_state import BridgeState
 from skinware.memory.statistics import Histogram
 from skinware.structure import Structure
 from skinware_drivers.finding.interfaces import CanInterface
@@ -358,6 +359,7 @@ class Evidence:
         running: living drivers in all namespaces that may be read; without those that publish another one's frames.
         waiting: processes of ``skin-driver`` that have published nothing so far.
         readers: programs that read the drivers frame by frame.
+        bridges: over which services come into the namespace, and that run.
     """
 
     seconds: float
@@ -372,6 +374,7 @@ class Evidence:
     running: tuple[RunningDriver, ...] = ()
     waiting: tuple[int, ...] = ()
     readers: tuple[ReaderSeen, ...] = ()
+    bridges: tuple[BridgeState, ...] = ()
 
     @property
     def is_live(self) -> bool:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from skinware_drivers.doctor import buses, files, interfaces, machine, patches, permissions, taxels, timing
+from skinware_drivers.doctor import bridges, buses, files, interfaces, machine, patches, permissions, taxels, timing
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, printable
 
 CHECKS: tuple[Callable[[Evidence], Iterator[Note]], ...] = (
     interfaces.check,
     permissions.check,
+    bridges.check,
     buses.check,
     patches.check,
     timing.check,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from skinware.bridge_state import BridgeState
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
+from skinware.views.bridges import LiveBridges
 from skinware_drivers.doctor import programs, surroundings
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.watching import watch
@@ -41,7 +43,18 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
         running=tuple(one for one in living if not programs.publishes_again(one.pid)),
         waiting=programs.waiting_drivers({one.pid for one in living}),
         readers=readers.seen(),
+        bridges=_bridges(namespace),
     )
+
+
+def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
+    live = LiveBridges(namespace)
+    try:
+        return tuple(live.look(namespace.services()))
+    except NamespaceError:
+        return ()
+    finally:
+        live.close()
 
 
 __all__ = ["look"]

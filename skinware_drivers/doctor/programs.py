@@ -10,7 +10,7 @@ from skinware_drivers.doctor.evidence import ReaderSeen
 
 _EVERY_FRAME = "in order"
 """How readers read that want every frame; others are meant to skip some."""
-_DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay")
+_DRIVER, _SECOND_HAND = "skin-driver", ("skin-calm", "skin-replay", "skin-bridge")
 _PROC = Path("/proc")
 
 

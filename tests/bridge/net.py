@@ -34,12 +34,15 @@ class Net:
     Attributes:
         loses: (kind, key) -> whether a message is lost; kinds: ``frame``, ``told``, ``question``, ``reply``.
         is_cut: nothing goes over it.
+        flows: where it is cleared, what goes over it waits, and arrives when it is set again.
         offered: frames that were sent, whether they got lost or not.
     """
 
     def __init__(self) -> None:
         self.loses: Callable[[str, str], bool] = lambda _kind, _key: False
         self.is_cut = False
+        self.flows = threading.Event()
+        self.flows.set()
         self.offered = 0
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self.listeners: list[tuple[str, Callable[[str, Payload], None]]] = []
@@ -63,11 +66,13 @@ class Net:
 
     def close(self) -> None:
         """End it."""
+        self.flows.set()
         self._jobs.put(None)
         self._thread.join()
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
+            self.flows.wait()
             job()
 
 
@@ -96,24 +101,21 @@ class NetLink(Link):
     def __init__(self, net: Net) -> None:
         self._net = net
         self._own: list[str] = []
+        self._ends: list[Callable[[], None]] = []
 
     def sender(self, key: str) -> Sender:
         return _Sender(self._net, key)
 
-    def tell(self, key: str, payload: Payload) -> None:
+    def tell(self, key: str, payload: Payload, priority: object = None) -> None:
         for pattern, heard in list(self._net.listeners):
             if fnmatch.fnmatchcase(key, pattern):
                 self._net.carry("told", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]
 
     def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
-        entry = (key, heard)
-        self._net.listeners.append(entry)
-        return lambda: self._net.listeners.remove(entry)
+        return self._entered(self._net.listeners, (key, heard))
 
     def answer(self, key: str, asked: Callable[[Any], None]) -> Callable[[], None]:
-        entry = (key, asked)
-        self._net.answerers.append(entry)
-        return lambda: self._net.answerers.remove(entry)
+        return self._entered(self._net.answerers, (key, asked))
 
     def ask(
         self,
@@ -137,8 +139,8 @@ class NetLink(Link):
         self._tell_watchers(key, True)
 
     def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
-        self._net.watchers.append((key, changed))
-        for token in self._net.tokens:
+        self._entered(self._net.watchers, (key, changed))
+        for token in list(self._net.tokens):
             if fnmatch.fnmatchcase(token, key):
                 self._net.carry("token", token, lambda token=token: changed(token, True))  # type: ignore[misc]
 
@@ -147,8 +149,20 @@ class NetLink(Link):
             self._net.tokens.discard(key)
             self._tell_watchers(key, False)
         self._own.clear()
+        for end in self._ends:
+            end()
+
+    def _entered(self, entries: list[Any], entry: tuple[str, Callable[..., None]]) -> Callable[[], None]:
+        entries.append(entry)
+
+        def leave() -> None:
+            if entry in entries:
+                entries.remove(entry)
+
+        self._ends.append(leave)
+        return leave
 
     def _tell_watchers(self, key: str, there: bool) -> None:
-        for pattern, changed in self._net.watchers:
+        for pattern, changed in list(self._net.watchers):
             if fnmatch.fnmatchcase(key, pattern):
                 self._net.carry("token", key, lambda changed=changed: changed(key, there))  # type: ignore[misc]

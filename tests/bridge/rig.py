@@ -112,8 +112,12 @@ def joining(
     *,
     wish: Wish | None = None,
     into: str = "here",
+    is_killed: bool = False,
 ) -> Iterator[Ends]:
-    """A joiner of what is served over a network, into a namespace of its own."""
+    """A joiner of what is served over a network, into a namespace of its own.
+
+    One that is killed in the end leaves there what it has published.
+    """
     here = Namespace(f"{namespace.name}-{into}")
     events: list[dict[str, Any]] = []
     link = NetLink(net)
@@ -127,7 +131,21 @@ def joining(
         thread.join()
         link.close()
         net.idle()
+        if is_killed:
+            _desert(joiner)
         joiner.close()
+    if not is_killed:
         left = files_left(here.path)
         shutil.rmtree(here.path, ignore_errors=True)
         assert not left
+
+
+def _desert(joiner: Joiner) -> None:
+    """Leave its files as the kernel does if its process is killed."""
+    mirror = joiner._mirror
+    for service in mirror._services.values():
+        service.writer.desert()
+    mirror._services.clear()
+    mirror._deserted.clear()
+    if joiner._state_writer is not None:
+        joiner._state_writer._service.desert()

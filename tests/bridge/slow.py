@@ -20,10 +20,13 @@ class SlowLink:
     Attributes:
         port: where to connect.
         bits_per_s: how much goes through.
+        flows: where it is cleared, nothing goes through, and all waits.
     """
 
     def __init__(self, to_port: int, bits_per_s: float) -> None:
         self.bits_per_s = bits_per_s
+        self.flows = threading.Event()
+        self.flows.set()
         self._to_port = to_port
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
@@ -41,6 +44,7 @@ class SlowLink:
     def close(self) -> None:
         """End all of it."""
         self._closed = True
+        self.flows.set()
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self.cut()
@@ -79,6 +83,7 @@ class SlowLink:
             while data := source.recv(_PIECE):
                 due_s = max(due_s, time.monotonic()) + 8 * len(data) / self.bits_per_s
                 time.sleep(max(0.0, due_s - time.monotonic()))
+                self.flows.wait()
                 target.sendall(data)
         for connection in (source, target):
             with contextlib.suppress(OSError):

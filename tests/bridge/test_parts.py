@@ -29,6 +29,7 @@ from skinware.bridge.messages import (
     split_generation,
 )
 from skinware.bridge.pacing import Pacing
+from skinware.bridge.pinging import QUESTIONS
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
@@ -43,41 +44,74 @@ MS = 1_000_000
 # -- clock --------------------------------------------------------------------------------------------------------
 
 
-def asked(clock: PeerClock, seconds: float, offset_ns: float, drift: float, seed: int = 1) -> None:
-    """Ask for so long as a joiner does; round trips of 0.3 ms and more, most of it on one way or the other."""
-    generator = np.random.default_rng(seed)
-    at_ns = 5 * NS_PER_S
-    end_ns = at_ns + seconds * NS_PER_S
+class Peers:
+    """Two clocks, and questions between them as a joiner asks them: ways of 0.15 ms and more, each of its own length.
 
-    def other(ns: float) -> int:
-        return round(ns - offset_ns - drift * (ns - 5 * NS_PER_S))
+    Args:
+        offset_ns, drift: of ours to the other, from the 5th second of ours on.
+    """
 
-    while at_ns < end_ns:
-        there_ns, back_ns = 150_000 + generator.exponential(200_000, 2)
-        heard, returned = at_ns + there_ns, at_ns + there_ns + 20_000 + back_ns
-        clock.add(Sample.of(at_ns, other(heard), other(heard + 20_000), round(returned)))
-        at_ns += clock.pause_ns()
+    def __init__(self, offset_ns: float, drift: float, seed: int = 1) -> None:
+        self.clock = PeerClock()
+        self.at_ns: float = 5 * NS_PER_S
+        self.offset_ns, self.drift = offset_ns, drift
+        self._generator = np.random.default_rng(seed)
+
+    def ask(self) -> None:
+        """Some questions at once; then it is the time of the next ones."""
+        for number in range(QUESTIONS):
+            asked_ns = self.at_ns + number * 30_000
+            there_ns, back_ns = 150_000 + self._generator.exponential(200_000, 2)
+            heard_ns, returned_ns = asked_ns + there_ns, asked_ns + there_ns + 20_000 + back_ns
+            there = (self._other(heard_ns), self._other(heard_ns + 20_000))
+            self.clock.add(Sample.of(round(asked_ns), *there, round(returned_ns)))
+        self._pass(self.clock.pause_ns())
+
+    def wrong_ns(self) -> float:
+        """What we believe to be known, but is not so."""
+        return abs(self.clock.offset_ns(round(self.at_ns)) - self.offset_ns)
+
+    def _pass(self, ns: float) -> None:
+        self.at_ns += ns
+        self.offset_ns += self.drift * ns
+
+    def _other(self, ns: float) -> int:
+        return round(ns - self.offset_ns - self.drift * (ns - self.at_ns))
 
 
 @pytest.mark.parametrize("offset_ns", [0, 100 * MS, -3 * 3600 * NS_PER_S])
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -50e-6])
-@pytest.mark.parametrize("seconds", [1, 4, 30, 300])
-def test_the_other_clock_is_found_and_its_error_told(offset_ns: float, drift: float, seconds: float) -> None:
-    clock = PeerClock()
-    asked(clock, seconds, offset_ns, drift)
-    now_ns = round((5 + seconds) * NS_PER_S)
-    wrong_ns = abs(clock.offset_ns(now_ns) - (offset_ns + drift * seconds * NS_PER_S))
-    assert wrong_ns <= clock.error_ns
-    if seconds >= 30:
-        assert wrong_ns < 100_000
+def test_the_other_clock_is_found_and_its_error_told_at_every_moment(offset_ns: float, drift: float) -> None:
+    peers = Peers(offset_ns, drift)
+    while peers.at_ns < 65 * NS_PER_S:
+        peers.ask()
+        assert peers.wrong_ns() <= peers.clock.error_ns
+        if peers.at_ns > 35 * NS_PER_S:
+            assert peers.wrong_ns() < 50_000
+            assert peers.clock.error_ns < 150_000 + 100_000  # what no clock can know, and some more
 
 
-def test_a_clock_that_jumps_is_found_again() -> None:
-    clock = PeerClock()
-    asked(clock, 30, 0, 0)
-    for at_s in range(40, 44):
-        clock.add(Sample(at_s * NS_PER_S, 7 * NS_PER_S, 300_000))
-    assert abs(clock.offset_ns(44 * NS_PER_S) - 7 * NS_PER_S) <= clock.error_ns < MS
+def test_the_error_stays_true_when_the_drift_changes() -> None:
+    peers = Peers(0, 5e-6)
+    for drift in (5e-6, 40e-6, -60e-6, 0):
+        peers.drift = drift
+        until_ns = peers.at_ns + 40 * NS_PER_S
+        changed_ns = peers.at_ns
+        while peers.at_ns < until_ns:
+            peers.ask()
+            if peers.at_ns - changed_ns > 31 * NS_PER_S:  # no moment before is looked at any more
+                assert peers.wrong_ns() <= peers.clock.error_ns < MS
+
+
+@pytest.mark.parametrize("by_ns", [7 * NS_PER_S, -300 * MS, 5 * MS])
+def test_a_clock_that_jumps_is_found_again(by_ns: int) -> None:
+    peers = Peers(0, 0)
+    while peers.at_ns < 30 * NS_PER_S:
+        peers.ask()
+    peers.offset_ns += by_ns
+    for _ in range(4):
+        peers.ask()
+    assert peers.wrong_ns() <= peers.clock.error_ns < MS
 
 
 # -- push or pull -------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
+from skinware.bridge_state import BridgeState, BridgeStateWriter
 from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command as calibrate
 from skinware.cli.convert import command as convert
@@ -176,7 +177,9 @@ def test_a_driver_and_those_that_look_at_it(
             read_until(reader, lambda frame: bool(frame.bus_samples["why"].any()))
             other.read()
             (namespace.path / "broken.ring").write_bytes(b"x")
-            (told,) = printing(info)
+            with BridgeStateWriter("icub", namespace) as bridge:
+                bridge.publish(BridgeState("icub", False, now_ns(), None, None, 0, {}), now_ns())
+                (told,) = printing(info)
             check("`skin-info`", told)
             (namespace.path / "broken.ring").unlink()
         (rows,) = printing(info, "roboskin", "--sensors")

@@ -171,7 +171,8 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
         more = ""
         if name != "serve":
             service = last["services"]["large"]
-            wrong = f"clock wrong by at most {last['clock']['error_ms']:.3f} ms"
+            clock = last["clock"]  # both ends have the same one
+            wrong = f"clock wrong by {abs(clock['offset_ms']):.3f} ms, told {clock['error_ms']:.3f}"
             more = f", {service['mode']}, {service['bytes_per_s'] / 1e6:.2f} MB/s, {wrong}"
         print(f"    {name:<6} {100 * share:5.1f} % of a core{more}")
 

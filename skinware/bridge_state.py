@@ -1,0 +1,230 @@
+"""How a bridge is: a service of the namespace in which a robot appears.
+
+Once a second, and whenever the link comes or goes::
+
+    with BridgeReader(service_name("icub"), namespace="icub") as bridge:
+        state = bridge.read().state
+        print(state.is_up, state.services["arm"].age_p99_ns)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware._columns import texts
+from skinware.errors import BadServiceFile
+from skinware.memory import segments
+from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
+from skinware.service import Column, ServiceReader, ServiceWriter
+
+KIND = "bridge"
+RATE_HZ = 1.0
+"""How often it is published at least."""
+MOST = 64
+"""Services that are told of."""
+STATES = ("unheard", "live", "paused", "closed", "dead")
+"""Of services: as on the robot, or not heard."""
+MODES = ("pull", "push")
+
+_ROW = np.dtype(
+    [
+        ("name", "S48"),
+        ("state", "u1"),
+        ("mode", "u1"),
+        ("reserved", "u1", (6,)),
+        ("lost", "<u8"),
+        ("rate_hz", "<f8"),
+        ("bytes_per_s", "<f8"),
+        ("age_p50_ns", "<f8"),
+        ("age_p99_ns", "<f8"),
+    ]
+)
+_COLUMNS = {
+    "is_up": Column(np.dtype("u1"), (), "", "the robot's bridge is heard"),
+    "since_ns": Column(np.dtype("<i8"), (), "ns", "since when, CLOCK_MONOTONIC"),
+    "clock_offset_ns": Column(np.dtype("<i8"), (), "ns", "our clock minus the robot's"),
+    "clock_error_ns": Column(np.dtype("<i8"), (), "ns", "what that may be wrong by; -1: nothing is known"),
+    "round_trip_ns": Column(np.dtype("<i8"), (), "ns", "the shortest lately"),
+    "count": Column(np.dtype("<u4"), (), "", "rows of services that are in use"),
+    "services": Column(_ROW, (MOST,), "", "each service: frames of the last second, ages from there to here"),
+}
+
+
+@dataclass(frozen=True)
+class ServiceState:
+    """How a service comes over a bridge.
+
+    Attributes:
+        state: one of ``STATES``.
+        mode: one of ``MODES``.
+        rate_hz: frames published here in the last second.
+        lost: frames that the robot published and that did not come, since the first one.
+        bytes_per_s: of messages, in the last second.
+        age_p50_ns, age_p99_ns: from the publication there to the one here, in the last second; None: there was none.
+    """
+
+    state: str
+    mode: str
+    rate_hz: float = 0.0
+    lost: int = 0
+    bytes_per_s: float = 0.0
+    age_p50_ns: float | None = None
+    age_p99_ns: float | None = None
+
+
+@dataclass(frozen=True)
+class BridgeState:
+    """How a bridge is.
+
+    Attributes:
+        robot: its name.
+        is_up: its bridge is heard.
+        since_ns: since when that is so, CLOCK_MONOTONIC.
+        clock_offset_ns: our clock minus the robot's; None: not known.
+        clock_error_ns: what that may be wrong by; likewise.
+        round_trip_ns: the shortest lately.
+        services: by name.
+    """
+
+    robot: str
+    is_up: bool
+    since_ns: int
+    clock_offset_ns: int | None
+    clock_error_ns: int | None
+    round_trip_ns: int
+    services: Mapping[str, ServiceState]
+
+
+def service_name(robot: str) -> str:
+    """Name of the service with the state of the bridge to a robot."""
+    return f"{robot[:40]}-bridge"
+
+
+class BridgeFrame(Frame):
+    """How a bridge was at one time."""
+
+    __slots__ = ()
+
+    @property
+    def state(self) -> BridgeState:
+        """All of it."""
+        error_ns = int(self.column("clock_error_ns"))
+        is_known = error_ns >= 0
+        rows = self.column("services")[: int(self.column("count"))]
+        return BridgeState(
+            str(self.context),
+            bool(self.column("is_up")),
+            int(self.column("since_ns")),
+            int(self.column("clock_offset_ns")) if is_known else None,
+            error_ns if is_known else None,
+            int(self.column("round_trip_ns")),
+            {row["name"].decode(errors="replace"): _state_of(row) for row in rows},
+        )
+
+
+class BridgeReader(ServiceReader[BridgeFrame]):
+    """Reads how a bridge is.
+
+    Args:
+        name: of the service (:func:`service_name`).
+        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
+
+    Raises:
+        BadServiceFile: the service is no state of a bridge.
+    """
+
+    frame_class = BridgeFrame
+
+    def _describe(self, attached: segments.Segment) -> str:
+        columns = attached.schema.columns
+        if bytes(attached.header["kind"]) != KIND.encode() or any(
+            name not in columns or (columns[name].dtype, columns[name].shape) != (column.dtype, column.shape)
+            for name, column in _COLUMNS.items()
+        ):
+            raise BadServiceFile(f"service {self.name!r} is no state of a bridge")
+        return (texts(attached.static_columns().get("robot", np.zeros(0, "S1"))) or [""])[0]
+
+
+class BridgeStateWriter:
+    """Publishes how a bridge is.
+
+    Args:
+        robot: its name.
+        namespace: as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+    """
+
+    def __init__(self, robot: str, namespace: Namespace) -> None:
+        self._service = ServiceWriter(
+            service_name(robot),
+            _COLUMNS,
+            {"robot": np.array([robot.encode()], "S48")},
+            namespace=namespace,
+            kind=KIND,
+            rate_hz=RATE_HZ,
+            description=f"the bridge to robot {robot}",
+        )
+
+    def publish(self, state: BridgeState, at_ns: int) -> None:
+        """Publish how it is at a time, CLOCK_MONOTONIC ns.
+
+        Raises:
+            Closed, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+        """
+        columns = self._service.begin()
+        columns["is_up"][...], columns["since_ns"][...] = state.is_up, state.since_ns
+        columns["clock_offset_ns"][...] = state.clock_offset_ns or 0
+        columns["clock_error_ns"][...] = -1 if state.clock_error_ns is None else state.clock_error_ns
+        columns["round_trip_ns"][...] = state.round_trip_ns
+        told = list(state.services.items())[:MOST]
+        columns["count"][...] = len(told)
+        columns["services"][:] = np.zeros(MOST, _ROW)
+        for row, (name, service) in enumerate(told):
+            columns["services"][row] = _row_of(name, service)
+        self._service.commit(at_ns)
+
+    def close(self) -> None:
+        """Withdraw the service. Idempotent."""
+        self._service.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _row_of(name: str, service: ServiceState) -> tuple[Any, ...]:
+    ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
+    state, mode = STATES.index(service.state), MODES.index(service.mode)
+    return name.encode(), state, mode, 0, service.lost, service.rate_hz, service.bytes_per_s, *ages
+
+
+def _state_of(row: npt.NDArray[Any]) -> ServiceState:
+    p50_ns, p99_ns = (None if np.isnan(row[name]) else float(row[name]) for name in ("age_p50_ns", "age_p99_ns"))
+    state, mode = int(row["state"]), int(row["mode"])
+    return ServiceState(
+        STATES[state] if state < len(STATES) else STATES[0],
+        MODES[mode] if mode < len(MODES) else MODES[0],
+        float(row["rate_hz"]),
+        int(row["lost"]),
+        float(row["bytes_per_s"]),
+        p50_ns,
+        p99_ns,
+    )
+
+
+__all__ = [
+    "KIND",
+    "BridgeFrame",
+    "BridgeReader",
+    "BridgeState",
+    "BridgeStateWriter",
+    "ServiceState",
+    "service_name",
+]

@@ -55,7 +55,7 @@ def test_the_papers_experiment_writes_one_row_per_trial(tmp_path: Path) -> None:
 
 def scale(*options: str, status: int = 0, path: str | None = None) -> tuple[list[dict[str, Any]], str]:
     """What the benchmark of large skins and fleets says with tiny numbers, and its messages; it leaves nothing."""
-    command = [sys.executable, BENCHMARKS / "scale.py", *options, "--seconds", "0.3", "--json"]
+    command = [sys.executable, str(BENCHMARKS / "scale.py"), *options, "--seconds", "0.3", "--json"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"] if path is None else path}
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -72,7 +72,6 @@ def test_a_large_skin_over_a_slow_link_is_one_row() -> None:
     assert (row["sensors"], row["robots"], row["mode"], row["link"]) == (64, 1, "pull", "proxy 16 Mbit/s")
     assert row["arrived_hz"] > 0
     assert 0 < row["age_p50_ms"] <= row["age_p99_ms"]
-    assert row["kb"] > 0
 
 
 def test_a_fleet_where_no_machines_can_be_made_is_on_the_loopback(tmp_path: Path) -> None:

@@ -75,9 +75,9 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
         serve = Command("serve", "--robot", "bench", "--namespace", namespace.name, "--insecure", *listen, place=robot)
         serving = stack.enter_context(serve)
         joins, places = {}, {}
-        for name, (there, host) in receivers.items():
+        for name, (place, host) in receivers.items():
             places[name] = stack.enter_context(own_namespace(name)).name
-            join = Command("join", "bench", "--connect", f"tcp/{host}:{PORT}", "--into", places[name], place=there)
+            join = Command("join", "bench", "--connect", f"tcp/{host}:{PORT}", "--into", places[name], place=place)
             joins[name] = stack.enter_context(join)
         processes = stack.enter_context(Processes())
         readers = {"beside the driver": processes.start(read_all, namespace.name)}

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from processes import RunFailed
+
 from tests.bridge.slow import slow_link
 
 BIN = Path(sys.executable).parent
@@ -139,6 +140,7 @@ class Command:
 
     def __init__(self, *arguments: str, place: str | None = None) -> None:
         inside = ["ip", "netns", "exec", place] if place else []
+        self._what = f"skin-bridge {' '.join(arguments)}"
         self._process = subprocess.Popen(
             [*inside, str(BIN / "skin-bridge"), *arguments, "--json"], stdout=subprocess.PIPE, text=True
         )
@@ -148,7 +150,7 @@ class Command:
         assert self._process.stdout is not None
         try:
             if not self._process.stdout.readline():
-                raise RunFailed(f"skin-bridge {self._process.args} ended at once")
+                raise RunFailed(f"{self._what} ended at once")
         except BaseException:
             self.__exit__()
             raise

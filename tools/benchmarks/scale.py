@@ -9,9 +9,9 @@ robots  many robots at one desk, over one link: ten of them to a process, and te
         robot's publication to the arrival at the desk, losses those of the joiners.
 chain   one large skin through all there is: structure, writer, readers, commands, bridge, recording.
 
-Robots are light: drivers that write frames made beforehand. Both ends are on machines of their own (network namespaces,
-veth, tbf), or, where these cannot be made, on the loopback, with a proxy as the slow link. With ``--json`` each row is a
-line. A row that does not work says why, and the next one begins; exit status 1 then.
+Robots are light: drivers that write frames made beforehand. Both ends are on machines of their own (network
+namespaces, veth, tbf), or, where these cannot be made, on the loopback, with a proxy as the slow link. With ``--json``
+each row is a line. A row that does not work says why, and the next one begins; exit status 1 then.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 import scale_chain
@@ -183,16 +182,10 @@ def one_bridge(setting: Setting) -> Row:
         taken, missed, _ = answer(beside, PATIENCE_S)
         statuses = [event for event in joining.end() if event["event"] == "status"]
         driver.send("enough")
-    told = [service for status in statuses for service in status["services"].values()]
-    came = Account(frames, lost, round(frames * _bytes_a_frame(told)), ages)
+    seconds = [service for status in statuses for service in status["services"].values()]
+    told = Account(sum(second["rate_hz"] for second in seconds), bytes=sum(second["bytes_per_s"] for second in seconds))
+    came = Account(frames, lost, round(frames * told.bytes / max(1, told.frames)), ages)
     return _row(setting, taken + missed, came, shares, weights, files, first_s, load, sent)
-
-
-def _bytes_a_frame(told: list[dict[str, Any]]) -> float:
-    """As the joiner says each second, without the first frames, which come with all that is told once."""
-    later = told[len(told) // 2 :]
-    frames = sum(service["rate_hz"] for service in later)
-    return sum(service["bytes_per_s"] for service in later) / frames if frames else float("nan")
 
 
 def many_robots(setting: Setting) -> Row:

@@ -25,6 +25,7 @@ class _Asked:
     def _answer(self, reply: Reply) -> None:
         assert not self._done
         self._done = True
+        self._net.answered.append((self.key, reply))
         self._net.carry("reply", self.key, lambda: self._to(reply))
 
 
@@ -35,12 +36,14 @@ class Net:
         loses: (kind, key) -> whether a message is lost; kinds: ``frame``, ``told``, ``question``, ``reply``.
         is_cut: nothing goes over it.
         offered: frames that were sent, whether they got lost or not.
+        answered: (key, answer) of questions, likewise.
     """
 
     def __init__(self) -> None:
         self.loses: Callable[[str, str], bool] = lambda _kind, _key: False
         self.is_cut = False
         self.offered = 0
+        self.answered: list[tuple[str, Reply]] = []
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self.listeners: list[tuple[str, Callable[[str, Payload], None]]] = []
         self.answerers: list[tuple[str, Callable[[Any], None]]] = []

@@ -140,6 +140,7 @@ class Follower:
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
             parameters={"number": number} | self._of_part,
+            is_large=True,
         )
 
     def _take_generation(self, number: int, payload: bytes | None) -> None:

@@ -95,6 +95,7 @@ class Peer:
         priority: Any,
         parameters: Mapping[str, object] | None = None,
         payload: bytes = b"",
+        is_large: bool = False,
     ) -> None:
         """See :meth:`skinware.bridge.link.Link.ask`; in a turn it is told the answer and when that came."""
 
@@ -109,6 +110,7 @@ class Peer:
             priority=priority,
             parameters=parameters,
             payload=payload,
+            is_large=is_large,
         )
 
     def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:

@@ -127,6 +127,7 @@ class NetLink(Link):
         priority: object,
         parameters: Mapping[str, object] | None = None,
         payload: Payload = b"",
+        is_large: bool = False,
     ) -> None:
         texts = {name: str(value) for name, value in (parameters or {}).items()}
         for pattern, asked in list(self._net.answerers):

@@ -17,7 +17,7 @@ from skinware.errors import BadRecording, BridgeError, NameInUse, SkinwareError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
-from skinware.transfer.frames import frame_of
+from skinware.transfer.frames import RecordedFrame, frame_of
 from skinware.transfer.generation import Generation
 
 Slot = npt.NDArray[np.uint8]
@@ -146,6 +146,7 @@ class Follower:
             timeout_s=self._patience_s,
             priority=Priority.CALLS,
             parameters={"number": number} | self._of_part,
+            is_large=True,
         )
 
     def _take_generation(self, asked: tuple[int, int], payload: bytes | None) -> None:
@@ -197,10 +198,12 @@ class Follower:
             if key == self._frame_key:  # and not of a bridge that is not followed any more
                 self._take_frame(message)
 
-    def _pull(self) -> None:
+    def _pull(self, here: RecordedFrame | None = None) -> None:
+        """Ask for a frame that is newer than all that are here; ``here`` is one that is not published yet."""
         self._pull_until_ns = now_ns() + round(2 * ANSWER_S * NS_PER_S)
         self._pulls += 1
-        pull, (number, sequence) = self._pulls, self._newest
+        pull = self._pulls
+        number, sequence = self._newest if here is None else max(self._newest, here.position)
         self._peer.ask(
             self._peer.keys.of(self._name, "newest"),
             lambda payload, _: self._take_pulled(pull, payload),
@@ -218,12 +221,13 @@ class Follower:
     def _take_pulled(self, pull: int, message: bytes | None) -> None:
         if self.is_over:
             return
+        frame = self._frame_of(message) if message else None
         if pull == self._pulls:  # a late answer begins no second round
             self._pull_until_ns = 0
             if self._pacing.pulls and message is not None and self._peer.is_connected:
-                self._pull()  # the next one is on its way while this one is published
-        if message:
-            self._take_frame(message)
+                self._pull(frame)  # the next one is on its way while this one is published
+        if frame is not None:
+            self._publish(frame)
 
     def _probe(self) -> None:
         """Ask for a frame as it would be pushed, and look how long it is on its way."""
@@ -257,31 +261,36 @@ class Follower:
         self._take_frame(held)
 
     def _take_frame(self, message: bytes) -> None:
+        frame = self._frame_of(message)
+        if frame is not None:
+            self._publish(frame)
+
+    def _frame_of(self, message: bytes) -> RecordedFrame | None:
+        """The frame of a message; None if it cannot be read, or not yet."""
         if self.is_over:
-            return
+            return None
         self._peer.heard()
         self.traffic.bytes += len(message)
         try:
             form, number = form_of(message), generation_of(message)
         except BridgeError as error:
             self._trouble(error)
-            return
+            return None
         generation = self._generation
         if generation is None or generation.generation != number:
             if generation is None or number > generation.generation:
                 self._held = message
                 self._ask_generation(number)
-            return
+            return None
         if not self._peer.clock.is_known:
             self._held = message
-            return
+            return None
         try:
-            slot = self._slot(form, message, generation)
+            return frame_of(generation, self._slot(form, message, generation))
         except BadRecording as error:
             self._decoder = None
             self._trouble(error)
-            return
-        self._publish(generation, slot)
+            return None
 
     def _slot(self, form: int, message: bytes, generation: Generation) -> Slot:
         if form == RAW:
@@ -293,11 +302,11 @@ class Follower:
             self._decoder = Decoder(generation.coded, generation.slot_stride)
         return self._decoder.decode(coded_part(message))
 
-    def _publish(self, generation: Generation, slot: Slot) -> None:
-        frame = frame_of(generation, slot)
-        count = generation.published_before + frame.sequence
-        if frame.position <= self._newest:
+    def _publish(self, frame: RecordedFrame) -> None:
+        generation = self._generation
+        if generation is None or frame.position <= self._newest:
             return
+        count = generation.published_before + frame.sequence
         age_ns = now_ns() - self._peer.clock.offset_ns(now_ns()) - frame.published_ns
         try:
             self._mirror.publish(self._name, frame, generation)

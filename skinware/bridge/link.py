@@ -173,8 +173,12 @@ class Link:
         priority: zenoh.Priority,
         parameters: Mapping[str, object] | None = None,
         payload: Payload = b"",
+        is_large: bool = False,
     ) -> None:
-        """Ask whoever answers under a key; ``answered`` is called for each answer, and once with none if none came."""
+        """Ask whoever answers under a key; ``answered`` is called for each answer, and once with none if none came.
+
+        What does not fit on a slow link soon is left out, unless the answer is known to be large.
+        """
         text = ";".join(f"{name}={value}" for name, value in (parameters or {}).items())
         got: list[bool] = []
 
@@ -195,7 +199,7 @@ class Link:
                 _directly(hear, over),
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.DROP,
+                congestion_control=zenoh.CongestionControl.BLOCK if is_large else zenoh.CongestionControl.DROP,
                 priority=priority,
                 express=True,
                 payload=payload or None,

@@ -99,6 +99,7 @@ class Peer:
         priority: Any,
         parameters: Mapping[str, object] | None = None,
         payload: bytes = b"",
+        is_large: bool = False,
     ) -> None:
         """See :meth:`skinware.bridge.link.Link.ask`; in a turn it is told the answer and when that came."""
 
@@ -113,6 +114,7 @@ class Peer:
             priority=priority,
             parameters=parameters,
             payload=payload,
+            is_large=is_large,
         )
 
     def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:

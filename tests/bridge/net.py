@@ -25,6 +25,7 @@ class _Asked:
     def _answer(self, reply: Reply) -> None:
         assert not self._done
         self._done = True
+        self._net.answered.append((self.key, reply))
         self._net.carry("reply", self.key, lambda: self._to(reply))
 
 
@@ -36,6 +37,7 @@ class Net:
         is_cut: nothing goes over it.
         flows: where it is cleared, what goes over it waits, and arrives when it is set again.
         offered: frames that were sent, whether they got lost or not.
+        answered: (key, answer) of questions, likewise.
     """
 
     def __init__(self) -> None:
@@ -44,6 +46,7 @@ class Net:
         self.flows = threading.Event()
         self.flows.set()
         self.offered = 0
+        self.answered: list[tuple[str, Reply]] = []
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self.listeners: list[tuple[str, Callable[[str, Payload], None]]] = []
         self.answerers: list[tuple[str, Callable[[Any], None]]] = []
@@ -126,6 +129,7 @@ class NetLink(Link):
         priority: object,
         parameters: Mapping[str, object] | None = None,
         payload: Payload = b"",
+        is_large: bool = False,
     ) -> None:
         texts = {name: str(value) for name, value in (parameters or {}).items()}
         for pattern, asked in list(self._net.answerers):

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, Skin
+from skinware.bridge.messages import coded_part, parts_of
 from skinware.errors import Paused, PeerGone, RequestError, RequestFailed, RequestRefused, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.service import ServiceReader, ServiceWriter
+from skinware.transfer.codec import HEADER
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.net import NetLink
 from tests.bridge.rig import ROBOT, Ends, joined, publish, serving, structure
@@ -94,6 +96,23 @@ def test_every_frame_comes_and_what_is_lost_is_counted_exactly(namespace: Namesp
             ends.net.loses = lambda _kind, _key: False
             until_read(there, publish(writer))
             assert there.lost + len(taken[there.name]) == writer.sequence - first + 1
+
+
+def test_a_pulled_frame_is_the_difference_to_the_one_before_and_comes_once(namespace: Namespace) -> None:
+    with joined(namespace, "pull") as ends, serving(ends.net, ends.there), driver(ends.there) as writer:
+        until_appeared(ends, writer, None)
+        with reader(ends) as there:
+            ends.net.answered.clear()
+            for _ in range(20):
+                until_read(there, publish(writer))
+        messages = [
+            reply.payload for key, reply in ends.net.answered if parts_of(key)[-1] == "newest" and reply.payload
+        ]
+        pulled = [np.frombuffer(coded_part(message), HEADER, 1)[0] for message in messages]
+    sequences = [int(header["sequence"]) for header in pulled]
+    follow = [int(header["after"]) == before for header, before in zip(pulled[1:], sequences, strict=False)]
+    assert sum(follow) > len(follow) / 2  # all, unless this machine stood still and something was asked for again
+    assert len(set(sequences)) > 0.75 * len(sequences)
 
 
 def until_read(there: DriverReader, value: int) -> None:

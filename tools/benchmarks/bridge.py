@@ -10,20 +10,13 @@ must not notice. Where network namespaces cannot be made (not root), ``--loopbac
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
 import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
-from pathlib import Path
-from typing import Any
 
 import numpy as np
+from links import LOOPBACK, PATIENCE_S, Command, connect, machine
 from processes import Processes, answer, own_namespace
 from record import LARGE, RATE_HZ, SMALL, driving
 
@@ -31,10 +24,7 @@ from skinware.errors import Overrun, ServiceTimeout, StructureChanged
 from skinware.realtime import now_ns
 from skinware.service import ServiceReader
 
-BIN = Path(sys.executable).parent
 PORT = 7461
-PATIENCE_S = 30.0
-TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 def read_all(pipe: Connection, namespace: str) -> None:
@@ -60,65 +50,6 @@ def read_all(pipe: Connection, namespace: str) -> None:
         pipe.send((len(ages), reader.lost - lost, ages))
 
 
-class Command:
-    """One of our commands, with what it says."""
-
-    def __init__(self, *arguments: str, where: str | None = None) -> None:
-        inside = ["ip", "netns", "exec", where] if where else []
-        self._process = subprocess.Popen(
-            [*inside, str(BIN / "skin-bridge"), *arguments, "--json"], stdout=subprocess.PIPE, text=True
-        )
-        assert self._process.stdout is not None
-        assert json.loads(self._process.stdout.readline())["event"] == "ready"
-        self._begin = self._cpu_s(), time.monotonic()
-
-    def begin(self) -> None:
-        """Count processor time from now on."""
-        self._begin = self._cpu_s(), time.monotonic()
-
-    def share(self) -> float:
-        """Of a core, since ``begin``."""
-        cpu_s, begin_s = self._begin
-        return (self._cpu_s() - cpu_s) / (time.monotonic() - begin_s)
-
-    def end(self) -> list[dict[str, Any]]:
-        """Its events."""
-        self._process.send_signal(signal.SIGINT)
-        out, _ = self._process.communicate(timeout=PATIENCE_S)
-        return [json.loads(line) for line in out.splitlines()]
-
-    def _cpu_s(self) -> float:
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
-
-
-def run(*command: str) -> None:
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-@contextmanager
-def side(name: str, number: int, mbit: float | None) -> Iterator[tuple[str, str]]:
-    """A network namespace behind a link of its own; (its name, address of this side)."""
-    here, there, net = f"skb{number}a", f"skb{number}b", f"10.77.{number}"
-    run("ip", "netns", "add", name)
-    try:
-        run("ip", "link", "add", here, "type", "veth", "peer", "name", there, "netns", name)
-        run("ip", "addr", "add", f"{net}.1/24", "dev", here)
-        run("ip", "link", "set", here, "up")
-        run("ip", "-n", name, "addr", "add", f"{net}.2/24", "dev", there)
-        run("ip", "-n", name, "link", "set", there, "up")
-        run("ip", "-n", name, "link", "set", "lo", "up")
-        if mbit is not None:
-            shape = ("tbf", "rate", f"{mbit:g}mbit", "burst", "32kb", "latency", "50ms")
-            run("tc", "qdisc", "add", "dev", here, "root", *shape)
-            run("ip", "netns", "exec", name, "tc", "qdisc", "add", "dev", there, "root", *shape)
-        yield name, f"{net}.1"
-    finally:
-        with contextlib.suppress(subprocess.CalledProcessError):
-            run("ip", "link", "del", here)
-        run("ip", "netns", "del", name)
-
-
 def told(what: str, result: tuple[int, int, list[int]], seconds: float, beside: float | None = None) -> None:
     frames, lost, ages = result
     p50, p99 = (float(np.percentile(ages, share)) / 1e6 for share in (50, 99)) if ages else (np.nan, np.nan)
@@ -134,19 +65,20 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
     with ExitStack() as stack:
         namespace = stack.enter_context(own_namespace())
         stack.enter_context(driving(namespace.name, sensors, "analogue"))
-        receivers: dict[str, tuple[str | None, str]] = {"fast": (None, "127.0.0.1")} if loopback else {}
-        if not loopback:
-            receivers["fast"] = stack.enter_context(side("skin-fast", 1, None))
-            if mbit is not None:
-                receivers["slow"] = stack.enter_context(side("skin-slow", 2, mbit))
+        receivers: dict[str, tuple[str | None, str]] = {"fast": (None, LOOPBACK)}
+        robot = None if loopback else stack.enter_context(machine("robot"))
+        if robot is not None:
+            for number, name in enumerate(("fast",) if mbit is None else ("fast", "slow"), 1):
+                there = stack.enter_context(machine(name))
+                receivers[name] = there, connect(robot, there, number, mbit if name == "slow" else None)
         listen = [part for _, host in receivers.values() for part in ("--listen", f"tcp/{host}:{PORT}")]
-        serving = Command("serve", "--robot", "bench", "--namespace", namespace.name, "--insecure", *listen)
+        serve = Command("serve", "--robot", "bench", "--namespace", namespace.name, "--insecure", *listen, place=robot)
+        serving = stack.enter_context(serve)
         joins, places = {}, {}
-        for name, (where, host) in receivers.items():
-            places[name] = f"{namespace.name}-{name}"
-            joins[name] = Command(
-                "join", "bench", "--connect", f"tcp/{host}:{PORT}", "--into", places[name], where=where
-            )
+        for name, (place, host) in receivers.items():
+            places[name] = stack.enter_context(own_namespace(name)).name
+            join = Command("join", "bench", "--connect", f"tcp/{host}:{PORT}", "--into", places[name], place=place)
+            joins[name] = stack.enter_context(join)
         processes = stack.enter_context(Processes())
         readers = {"beside the driver": processes.start(read_all, namespace.name)}
         readers |= {f"{name} link": processes.start(read_all, place) for name, place in places.items()}

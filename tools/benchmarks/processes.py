@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import resource
 import shutil
+import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -92,6 +93,26 @@ def answer(pipe: Connection, deadline_s: float) -> Any:
     return message
 
 
+@contextlib.contextmanager
+def within(limit_s: float) -> Iterator[None]:
+    """A block that does not take longer, wherever it waits; for the main thread.
+
+    Raises:
+        RunFailed: it would have.
+    """
+
+    def late(*_: object) -> None:
+        raise RunFailed(f"not done after {limit_s:g} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
 class CpuShare:
     """CPU seconds of this process per second, from when this object was made."""
 
@@ -126,9 +147,9 @@ def may_use_fifo() -> bool:
 
 
 @contextlib.contextmanager
-def own_namespace() -> Iterator[Namespace]:
-    """A namespace for this benchmark alone, removed afterwards."""
-    namespace = Namespace(f"bench-{os.getpid()}")
+def own_namespace(role: str = "") -> Iterator[Namespace]:
+    """A namespace for this benchmark alone, removed afterwards; ``role`` tells several apart."""
+    namespace = Namespace("-".join(filter(None, ("bench", str(os.getpid()), role))))
     try:
         yield namespace
     finally:

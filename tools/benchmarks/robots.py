@@ -14,7 +14,7 @@ import time
 from contextlib import ExitStack
 from statistics import mean
 
-from bridge import Command
+from links import Command
 from processes import own_namespace
 from record import LARGE, RATE_HZ, SMALL, driving
 

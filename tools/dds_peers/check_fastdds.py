@@ -64,7 +64,7 @@ class Peer:
 def structure(modules: int) -> Structure:
     """Modules of 12 taxels at places; one in four is a grid."""
     n = 12 * modules
-    geometry = Geometry.unknown(["pressure"] * n, np.arange(n))
+    geometry = Geometry.unknown(["pressure"] * n, np.arange(n, dtype=np.uint64))
     geometry.position_m[:] = np.random.default_rng(1).random((n, 3))
     geometry.frame[:] = "forearm"
     return Structure(

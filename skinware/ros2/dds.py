@@ -64,12 +64,6 @@ _PLAIN = {
     "uint64": idl.uint64,
 }
 
-_NO_LIMIT = (
-    "<CycloneDDS><Domain id='any'><Internal><Watermarks>"
-    "<WhcAdaptive>false</WhcAdaptive><WhcHigh>1 GB</WhcHigh>"
-    "</Watermarks></Internal></Domain></CycloneDDS>"
-)
-"""What one reader has not acknowledged keeps no other from the next message: the limit is the short history."""
 _THIS_MACHINE = (
     "<CycloneDDS><Domain id='any'><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
     "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
@@ -332,8 +326,7 @@ def _configuration() -> str:
     """For Cyclone DDS; later parts overrule."""
     of_range = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     is_local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or of_range == "LOCALHOST"
-    parts = [_NO_LIMIT, *([_THIS_MACHINE] if is_local else []), os.environ.get("CYCLONEDDS_URI", "")]
-    return ",".join(filter(None, parts))
+    return ",".join(filter(None, [_THIS_MACHINE if is_local else "", os.environ.get("CYCLONEDDS_URI", "")]))
 
 
 def _reason(error: DDSException) -> str:

@@ -28,6 +28,7 @@ from skinware.ros2.dds import _type
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _POLL_S = 0.005
+_HEAD = 64
 _TYPES = {
     each.name: each
     for each in (types.POINTS, types.IMAGE, types.SKIN_FRAME, types.SENSORS, types.DIAGNOSTICS, types.PARTICIPANT)
@@ -39,7 +40,7 @@ def say(what: str, **more: Any) -> None:
     print(json.dumps({"event": what, **more}), flush=True)
 
 
-def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: bool) -> None:
+def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: bool, only_heads: bool) -> None:
     """Say what comes under a topic."""
     message_type = _TYPES[type_name]
     durability = Policy.Durability.TransientLocal if late else Policy.Durability.Volatile
@@ -52,7 +53,8 @@ def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: 
         taken = ddspy_take(reader._ref, _ANY, 16)
         for data, info in taken if isinstance(taken, list) else []:
             if info.valid_data:
-                say("message", topic=topic, data=base64.b64encode(data).decode())
+                told = data[:_HEAD] if only_heads else data
+                say("message", topic=topic, size=len(data), data=base64.b64encode(told).decode())
         time.sleep(_POLL_S)
 
 
@@ -92,6 +94,7 @@ def main() -> None:
     parser.add_argument("domain", type=int)
     parser.add_argument("--listen", nargs=2, action="append", default=[], metavar=("TOPIC", "TYPE"))
     parser.add_argument("--listen-late", nargs=2, action="append", default=[], metavar=("TOPIC", "TYPE"))
+    parser.add_argument("--only-heads", action="store_true", help="say the beginnings of messages: short lines")
     parser.add_argument("--look", action="store_true")
     parser.add_argument("--call", action="append", default=[])
     parser.add_argument("--json", action="store_true", help="as our commands have it; it always does")
@@ -99,11 +102,15 @@ def main() -> None:
     participant = DomainParticipant(options.domain)
     threads = [
         *(
-            threading.Thread(target=listen, args=(participant, *each), kwargs={"late": False})
+            threading.Thread(
+                target=listen, args=(participant, *each), kwargs={"late": False, "only_heads": options.only_heads}
+            )
             for each in options.listen
         ),
         *(
-            threading.Thread(target=listen, args=(participant, *each), kwargs={"late": True})
+            threading.Thread(
+                target=listen, args=(participant, *each), kwargs={"late": True, "only_heads": options.only_heads}
+            )
             for each in options.listen_late
         ),
         *(threading.Thread(target=call, args=(participant, each)) for each in options.call),

@@ -40,9 +40,12 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+_write_bytes: Callable[[int, bytes], int] | None
 try:
-    from cyclonedds._clayer import ddspy_write as _write_bytes
-except ImportError:  # it is not public
+    from cyclonedds import _clayer
+
+    _write_bytes = _clayer.ddspy_write
+except (ImportError, AttributeError):  # it is not public
     _write_bytes = None
 
 _SERVICE_QOS = Qos(depth=10)
@@ -217,7 +220,7 @@ class _Writer:
         if writer is None:
             return False
         if _write_bytes is not None:
-            return bool(_write_bytes(self._ref, message + bytes(-len(message) % 4)) >= 0)
+            return _write_bytes(self._ref, message + bytes(-len(message) % 4)) >= 0
         try:
             writer.write(writer.data_type.deserialize(message))
         except DDSException:

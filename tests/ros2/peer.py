@@ -28,6 +28,7 @@ from skinware.ros2.dds import _type
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _POLL_S = 0.005
+_SAYING = threading.Lock()
 _HEAD = 64
 _TYPES = {
     each.name: each
@@ -37,7 +38,8 @@ _RELIABLE = Policy.Reliability.Reliable(max_blocking_time=10**9)
 
 
 def say(what: str, **more: Any) -> None:
-    print(json.dumps({"event": what, **more}), flush=True)
+    with _SAYING:  # lines of several threads
+        print(json.dumps({"event": what, **more}), flush=True)
 
 
 def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: bool, only_heads: bool) -> None:

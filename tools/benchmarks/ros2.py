@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import os
 import random
+import struct
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -44,7 +45,7 @@ def alone() -> int:
         "<MaxAutoParticipantIndex>8</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
         "</Domain></CycloneDDS>"
     )
-    domain = random.randint(1, 200)
+    domain = random.randint(1, 99)
     os.environ["ROS_DOMAIN_ID"] = str(domain)
     return domain
 
@@ -91,8 +92,8 @@ def subscribe(pipe: Connection, domain: int, topics: list[tuple[str, MessageType
 def _age_ns(topic: str, data: bytes) -> int:
     if topic == FRAME:
         return now_ns() - int.from_bytes(data[_PUBLISHED], "little")
-    seconds, rest_ns = np.frombuffer(data[_STAMP], "<u4").tolist()
-    return time.time_ns() - seconds * 10**9 - rest_ns
+    seconds, rest_ns = struct.unpack("<iI", data[_STAMP])
+    return time.time_ns() - int(seconds) * 10**9 - int(rest_ns)
 
 
 def measure(sensors: int, seconds: float) -> None:

@@ -64,7 +64,7 @@ class Peer:
 def structure(modules: int) -> Structure:
     """Modules of 12 taxels at places; one in four is a grid."""
     n = 12 * modules
-    geometry = Geometry.unknown(["pressure"] * n, np.arange(n))
+    geometry = Geometry.unknown(["pressure"] * n, np.arange(n, dtype=np.uint64))
     geometry.position_m[:] = np.random.default_rng(1).random((n, 3))
     geometry.frame[:] = "forearm"
     return Structure(
@@ -113,7 +113,7 @@ def main() -> int:
     parser.add_argument("program", type=Path)
     parser.add_argument("--messages", type=int, default=60)
     options = parser.parse_args()
-    domain = random.randint(100, 200)
+    domain = random.randint(1, 99)
     os.environ["CYCLONEDDS_URI"] = (
         "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
         "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"

@@ -40,9 +40,12 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+_write_bytes: Callable[[int, bytes], int] | None
 try:
-    from cyclonedds._clayer import ddspy_write as _write_bytes
-except ImportError:  # it is not public
+    from cyclonedds import _clayer
+
+    _write_bytes = _clayer.ddspy_write
+except (ImportError, AttributeError):  # it is not public
     _write_bytes = None
 
 _SERVICE_QOS = Qos(depth=10)
@@ -64,12 +67,6 @@ _PLAIN = {
     "uint64": idl.uint64,
 }
 
-_NO_LIMIT = (
-    "<CycloneDDS><Domain id='any'><Internal><Watermarks>"
-    "<WhcAdaptive>false</WhcAdaptive><WhcHigh>1 GB</WhcHigh>"
-    "</Watermarks></Internal></Domain></CycloneDDS>"
-)
-"""What one reader has not acknowledged keeps no other from the next message: the limit is the short history."""
 _THIS_MACHINE = (
     "<CycloneDDS><Domain id='any'><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
     "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
@@ -223,7 +220,7 @@ class _Writer:
         if writer is None:
             return False
         if _write_bytes is not None:
-            return bool(_write_bytes(self._ref, message + bytes(-len(message) % 4)) >= 0)
+            return _write_bytes(self._ref, message + bytes(-len(message) % 4)) >= 0
         try:
             writer.write(writer.data_type.deserialize(message))
         except DDSException:
@@ -332,8 +329,7 @@ def _configuration() -> str:
     """For Cyclone DDS; later parts overrule."""
     of_range = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
     is_local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or of_range == "LOCALHOST"
-    parts = [_NO_LIMIT, *([_THIS_MACHINE] if is_local else []), os.environ.get("CYCLONEDDS_URI", "")]
-    return ",".join(filter(None, parts))
+    return ",".join(filter(None, [_THIS_MACHINE if is_local else "", os.environ.get("CYCLONEDDS_URI", "")]))
 
 
 def _reason(error: DDSException) -> str:

@@ -10,7 +10,6 @@ import base64
 import contextlib
 import json
 import signal
-import sys
 import threading
 import time
 from typing import Any
@@ -29,6 +28,8 @@ from skinware.ros2.dds import _type
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _POLL_S = 0.005
+_SAYING = threading.Lock()
+_HEAD = 64
 _TYPES = {
     each.name: each
     for each in (types.POINTS, types.IMAGE, types.SKIN_FRAME, types.SENSORS, types.DIAGNOSTICS, types.PARTICIPANT)
@@ -37,11 +38,11 @@ _RELIABLE = Policy.Reliability.Reliable(max_blocking_time=10**9)
 
 
 def say(what: str, **more: Any) -> None:
-    sys.stdout.write(json.dumps({"event": what, **more}) + "\n")  # whole: several threads tell
-    sys.stdout.flush()
+    with _SAYING:  # lines of several threads
+        print(json.dumps({"event": what, **more}), flush=True)
 
 
-def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: bool) -> None:
+def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: bool, only_heads: bool) -> None:
     """Say what comes under a topic."""
     message_type = _TYPES[type_name]
     durability = Policy.Durability.TransientLocal if late else Policy.Durability.Volatile
@@ -54,7 +55,8 @@ def listen(participant: DomainParticipant, topic: str, type_name: str, *, late: 
         taken = ddspy_take(reader._ref, _ANY, 16)
         for data, info in taken if isinstance(taken, list) else []:
             if info.valid_data:
-                say("message", topic=topic, data=base64.b64encode(data).decode())
+                told = data[:_HEAD] if only_heads else data
+                say("message", topic=topic, size=len(data), data=base64.b64encode(told).decode())
         time.sleep(_POLL_S)
 
 
@@ -94,6 +96,7 @@ def main() -> None:
     parser.add_argument("domain", type=int)
     parser.add_argument("--listen", nargs=2, action="append", default=[], metavar=("TOPIC", "TYPE"))
     parser.add_argument("--listen-late", nargs=2, action="append", default=[], metavar=("TOPIC", "TYPE"))
+    parser.add_argument("--only-heads", action="store_true", help="say the beginnings of messages: short lines")
     parser.add_argument("--look", action="store_true")
     parser.add_argument("--call", action="append", default=[])
     parser.add_argument("--json", action="store_true", help="as our commands have it; it always does")
@@ -101,11 +104,15 @@ def main() -> None:
     participant = DomainParticipant(options.domain)
     threads = [
         *(
-            threading.Thread(target=listen, args=(participant, *each), kwargs={"late": False})
+            threading.Thread(
+                target=listen, args=(participant, *each), kwargs={"late": False, "only_heads": options.only_heads}
+            )
             for each in options.listen
         ),
         *(
-            threading.Thread(target=listen, args=(participant, *each), kwargs={"late": True})
+            threading.Thread(
+                target=listen, args=(participant, *each), kwargs={"late": True, "only_heads": options.only_heads}
+            )
             for each in options.listen_late
         ),
         *(threading.Thread(target=call, args=(participant, each)) for each in options.call),

@@ -113,7 +113,7 @@ def main() -> int:
     parser.add_argument("program", type=Path)
     parser.add_argument("--messages", type=int, default=60)
     options = parser.parse_args()
-    domain = random.randint(100, 200)
+    domain = random.randint(1, 99)
     os.environ["CYCLONEDDS_URI"] = (
         "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
         "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"

@@ -91,6 +91,23 @@ class _Question:
             self._query.reply_err(error)
 
 
+def open_session(endpoints: Endpoints) -> zenoh.Session:
+    """A session that shares nothing but what it is told to; it connects again for ever.
+
+    Raises:
+        BridgeError: it cannot be opened; the message says why.
+    """
+    try:
+        return zenoh.open(_configuration(endpoints))
+    except zenoh.ZError as error:
+        raise BridgeError(f"{endpoints}: {_reason(error)}") from None
+
+
+def directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
+    """A callback in the thread that receives: every hand-over to another thread takes 0.1 ms."""
+    return zenoh.handlers.Callback(call, over, indirect=False)
+
+
 class Sender:
     """Sends bytes to all who listen, and waits for nobody: a receiver that is too slow loses some.
 
@@ -131,10 +148,7 @@ class Link:
     """
 
     def __init__(self, endpoints: Endpoints) -> None:
-        try:
-            self._session = zenoh.open(_configuration(endpoints))
-        except zenoh.ZError as error:
-            raise BridgeError(f"{endpoints}: {_reason(error)}") from None
+        self._session = open_session(endpoints)
         self._declared: list[Any] = []
 
     def sender(self, key: str) -> Sender:
@@ -158,11 +172,11 @@ class Link:
         def hear(sample: zenoh.Sample) -> None:
             heard(str(sample.key_expr), sample.payload.to_bytes())
 
-        return self._undeclaring(self._session.declare_subscriber(key, _directly(hear)))
+        return self._undeclaring(self._session.declare_subscriber(key, directly(hear)))
 
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
         """Have the questions under keys; what ends it."""
-        return self._undeclaring(self._session.declare_queryable(key, _directly(lambda query: asked(_Question(query)))))
+        return self._undeclaring(self._session.declare_queryable(key, directly(lambda query: asked(_Question(query)))))
 
     def ask(
         self,
@@ -196,7 +210,7 @@ class Link:
         try:
             self._session.get(
                 f"{key}?{text}" if text else key,
-                _directly(hear, over),
+                directly(hear, over),
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK if is_large else zenoh.CongestionControl.DROP,
@@ -234,11 +248,6 @@ class Link:
                     declared.undeclare()
 
         return undeclare
-
-
-def _directly(call: Callable[[Any], None], over: Callable[[], None] | None = None) -> Any:
-    """A callback in the thread that receives: every hand-over to another thread takes 0.1 ms."""
-    return zenoh.handlers.Callback(call, over, indirect=False)
 
 
 def _configuration(endpoints: Endpoints) -> zenoh.Config:

@@ -20,6 +20,8 @@ from skinware.cli._command import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skinware.ros2.serving import Ros2Server
     from skinware.ros2.transport import Identity, Node
 
@@ -29,12 +31,23 @@ if TYPE_CHECKING:
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
         "skin-bridge ros2                                       then, where ROS is: ros2 topic list",
+        "skin-bridge ros2 --rmw zenoh                           for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp",
         "skin-bridge ros2 arm --domain 7 --ros-namespace /icub  /icub/skin/arm/points/pressure ... in domain 7",
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option(
-    "--rmw", type=click.Choice(["dds"]), default="dds", show_default=True, help="What carries the graph's messages."
+    "--rmw",
+    type=click.Choice(["dds", "zenoh"]),
+    default="dds",
+    show_default=True,
+    help="What carries the graph's messages: zenoh for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp.",
+)
+@click.option(
+    "--connect",
+    multiple=True,
+    metavar="ENDPOINT",
+    help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/localhost:7447]",
 )
 @click.option(
     "--domain",
@@ -60,6 +73,7 @@ if TYPE_CHECKING:
 def command(
     names: tuple[str, ...],
     rmw: str,
+    connect: tuple[str, ...],
     domain: int,
     ros_namespace: str,
     distro: str,
@@ -79,11 +93,13 @@ def command(
     from skinware.ros2.serving import Ros2Server
     from skinware.ros2.transport import Distro, Identity
 
+    if connect and rmw != "zenoh":
+        raise click.UsageError("--connect is for --rmw zenoh: over DDS, nodes find each other without routers")
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
     identity = Identity(f"skinware_{_plain(place.name)}", ros_namespace, domain, Distro(distro))
-    with contextlib.closing(_NODES[rmw](identity)) as node:
+    with contextlib.closing(_node(rmw, identity, connect, _Router(as_json).tell)) as node:
         server = Ros2Server(
             node, place, names, prefix=identity.prefix, rate_hz=rate, is_read_only=read_only, trouble=warn
         )
@@ -98,20 +114,35 @@ def command(
             server.run(status.tell)
 
 
-def _dds_node(identity: Identity) -> Node:
+def _node(rmw: str, identity: Identity, connect: tuple[str, ...], tell: Callable[[bool, str], None]) -> Node:
+    if rmw == "zenoh":
+        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
+
+        return ZenohNode(identity, connect=connect or (ROUTER,), tell=tell)
     from skinware.ros2.dds import DdsNode
 
     return DdsNode(identity)
-
-
-_NODES = {"dds": _dds_node}
-"""What makes a node, by what carries its messages."""
 
 
 def _plain(name: str) -> str:
     from skinware.conversion.showing import in_topic
 
     return in_topic(name)
+
+
+class _Router:
+    """Tells whether there is one."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+
+    def tell(self, is_there: bool, line: str) -> None:
+        if self._as_json:
+            print_json({"event": "router", "is_there": is_there, "why": line})
+        elif is_there:
+            click.echo(line)
+        else:
+            warn(line)
 
 
 class _Status:

@@ -344,8 +344,9 @@ def test_bridge(namespace: Namespace) -> None:
 def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     own_domain(namespace, monkeypatch)
     with publishing(FakeSkin("torso")), running("skin-bridge", "ros2") as bridge:
-        ready = bridge.wait_for("ready")
-        check("`skin-bridge ros2`", ready, bridge.wait_for("status", lambda status: "torso" in status["drivers"]))
+        told = [bridge.wait_for("ready"), bridge.wait_for("status", lambda status: "torso" in status["drivers"])]
+    with running("skin-bridge", "ros2", "--rmw", "zenoh", "--connect", f"tcp/127.0.0.1:{free_port()}") as bridge:
+        check("`skin-bridge ros2`", *told, bridge.wait_for("router"))
 
 
 def test_bridge_to_yarp() -> None:

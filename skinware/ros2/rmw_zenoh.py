@@ -1,0 +1,293 @@
+"""A node of a ROS 2 graph that rmw_zenoh carries: publishers and services that its nodes find as they find their own.
+
+Nodes are peers: each listens on this machine only, and connects to a router, which tells them of each other. Messages
+of one machine then go straight to those who want them; the router passes on those for other machines.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import zenoh
+import zenoh.ext
+
+from skinware.bridge.endpoints import endpoints
+from skinware.bridge.link import directly, open_session
+from skinware.errors import BridgeError
+from skinware.ros2.rmw_zenoh_keys import Attachment, Kind, endpoint_token, gid, key, node_token
+from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
+
+ROUTER = "tcp/localhost:7447"
+"""Where the router of a machine is."""
+_LISTEN = "tcp/localhost:0"
+_SETTINGS = {
+    "scouting/gossip/enabled": "true",
+    "scouting/gossip/target": '{ router: ["router", "peer"], peer: ["router"] }',
+    "timestamping/enabled": "true",
+}
+"""As nodes of rmw_zenoh have them; late subscribers are given stamped messages only."""
+_SERVICE_QOS = Qos(depth=10)
+_MOST_REQUESTS = 10
+"""So many may wait; a node of ROS keeps as many."""
+_LOOK_S = 1.0
+"""How often to look for the router."""
+_NODE = 0
+"""Number of the only node in a session."""
+
+
+class ZenohNode:
+    """A node (:class:`skinware.ros2.transport.Node`).
+
+    Whether there is a router makes no difference to who publishes: the node is found as soon as there is one, and again
+    after it was away.
+
+    Args:
+        identity: of the node.
+        connect: endpoints of routers, ``tcp/HOST:PORT``.
+        tell: is called when the router is away (not earlier than a second after the start), and when it is there
+            again, with which of them it is and a line for people; in a thread of the node.
+
+    Raises:
+        ConfigurationError: something that cannot be connected to.
+        BridgeError: there cannot be such a node; the message says why.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        *,
+        connect: Sequence[str] = (ROUTER,),
+        tell: Callable[[bool, str], None] = lambda _is_there, _line: None,
+    ) -> None:
+        places = endpoints(connect=connect)
+        self._identity, self._tell = identity, tell
+        self._at = ", ".join(places.connect)
+        self._session = open_session(replace(places, listen=(_LISTEN,), security=_SETTINGS))
+        self._zid = str(self._session.info.zid())
+        self._numbers = itertools.count(_NODE + 1)
+        self._endpoints: set[_Publisher | _Service] = set()
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._answering = threading.RLock()
+        self._is_seen = True
+        self._worker = threading.Thread(target=self._work, name=f"node {identity.name}")
+        try:
+            self._token = self._announce(node_token(identity, self._zid, _NODE))
+        except BridgeError:
+            self._close_session()
+            raise
+        self._worker.start()
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether there was a router when it was last looked for: nodes that start without one do not find this one."""
+        return self._is_seen
+
+    def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> Publisher:
+        """What sends under an absolute topic.
+
+        Raises:
+            BridgeError: there cannot be such a publisher.
+        """
+        at = key(self._identity, topic, message_type)
+        token = self._endpoint_token(Kind.PUBLISHER, topic, message_type, qos)
+        with _as_bridge_error(topic):
+            declared = _declare_publisher(self._session, at, qos)
+        made = _Publisher(declared, self._announce(token), gid(token), qos, self._endpoints.discard)
+        self._endpoints.add(made)
+        return made
+
+    def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
+        """Answer under an absolute name, one request after the other; ten may wait, more are refused.
+
+        Returns:
+            What ends the service; waits for a request that is being answered.
+
+        Raises:
+            BridgeError: there cannot be such a service.
+        """
+        at = key(self._identity, name, service_type)
+        token = self._endpoint_token(Kind.SERVICE, name, service_type, _SERVICE_QOS)
+        made = _Service(at, handler, self._answering, self._endpoints.discard)
+        with _as_bridge_error(name):
+            asked = directly(lambda query: self._asked(made, query))
+            made.declared.append(self._session.declare_queryable(at, asked, complete=True))
+        made.declared.append(self._announce(token))
+        self._endpoints.add(made)
+        return made.close
+
+    def close(self) -> None:
+        """Leave the graph. Idempotent; waits for a request that is being answered."""
+        for endpoint in tuple(self._endpoints):
+            endpoint.close()
+        self._jobs.put(None)
+        if self._worker is not threading.current_thread():
+            self._worker.join()
+        self._close_session()
+
+    def _endpoint_token(self, kind: Kind, name: str, of_type: MessageType | ServiceType, qos: Qos) -> str:
+        return endpoint_token(self._identity, self._zid, _NODE, next(self._numbers), kind, name, of_type, qos)
+
+    def _announce(self, token: str) -> zenoh.LivelinessToken:
+        with _as_bridge_error(token):
+            return self._session.liveliness().declare_token(token)
+
+    def _asked(self, service: _Service, query: zenoh.Query) -> None:
+        if self._jobs.qsize() < _MOST_REQUESTS:
+            self._jobs.put(lambda: service.answer(query))
+        else:
+            _refuse(query, "too many requests wait")
+
+    def _work(self) -> None:
+        look_s = time.monotonic() + _LOOK_S
+        while True:
+            try:
+                job = self._jobs.get(timeout=max(0.0, look_s - time.monotonic()))
+            except queue.Empty:
+                look_s = time.monotonic() + _LOOK_S
+                self._look()
+                continue
+            if job is None:
+                return
+            job()
+
+    def _look(self) -> None:
+        is_seen = bool(self._session.info.routers_zid())
+        if is_seen == self._is_seen:
+            return
+        self._is_seen = is_seen
+        name = self._identity.name
+        if is_seen:
+            self._tell(True, f"the zenoh router at {self._at} is there: nodes find {name}")
+        else:
+            start_one = "start one with: ros2 run rmw_zenoh_cpp rmw_zenohd"
+            self._tell(False, f"no zenoh router at {self._at}: nodes that start now do not find {name}; {start_one}")
+
+    def _close_session(self) -> None:
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]
+
+
+class _Publisher:
+    """Of one topic; numbers its messages from 1 on."""
+
+    def __init__(
+        self,
+        publisher: Any,
+        token: zenoh.LivelinessToken,
+        identity: bytes,
+        qos: Qos,
+        closed: Callable[[_Publisher], None],
+    ) -> None:
+        self._publisher, self._token, self._gid, self._qos, self._closed = publisher, token, identity, qos, closed
+        self._sequence = 0
+        self._is_open = True
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether anybody listens; of a latched topic also who comes late."""
+        return self._is_open and (self._qos.latched or bool(self._publisher.matching_status.matching))
+
+    def publish(self, message: Cdr) -> bool:
+        """Send a message; False if it is closed. What a slow subscriber does not take is left out for that one."""
+        if not self._is_open:
+            return False
+        self._sequence += 1
+        attachment = Attachment(self._sequence, time.time_ns(), self._gid).packed()
+        try:
+            self._publisher.put(message, attachment=attachment)
+        except zenoh.ZError:  # the session is closed
+            return False
+        return True
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        if self._is_open:
+            self._is_open = False
+            _undeclare(self._token, self._publisher)
+            self._closed(self)
+
+
+class _Service:
+    """Answers requests under a key, one at a time of all that share a lock.
+
+    Attributes:
+        declared: what ends with it.
+    """
+
+    def __init__(
+        self, at: str, handler: Handler, answering: threading.RLock, closed: Callable[[_Service], None]
+    ) -> None:
+        self._at, self._handler, self._answering, self._closed = at, handler, answering, closed
+        self._is_open = True
+        self.declared: list[Any] = []
+
+    def answer(self, query: zenoh.Query) -> None:
+        with self._answering:
+            if not self._is_open:
+                return _refuse(query, "the service ended")
+            try:
+                asked = Attachment.of(_bytes(query.attachment))
+            except ValueError as error:
+                return _refuse(query, str(error))
+            response = self._handler(_bytes(query.payload))
+        attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
+        with contextlib.suppress(zenoh.ZError), query:
+            query.reply(self._at, response, attachment=attachment, express=True)
+        return None
+
+    def close(self) -> None:
+        """End it. Idempotent; waits for a request that is being answered, and answers none after that."""
+        was_open, self._is_open = self._is_open, False
+        with self._answering:
+            if was_open:
+                _undeclare(*reversed(self.declared))
+                self._closed(self)
+
+
+def _declare_publisher(session: zenoh.Session, at: str, qos: Qos) -> Any:
+    """Messages hardly wait for who is slow; a latched topic keeps its last for who comes late.
+
+    It sends no heartbeats, as rmw_zenoh does: they wait for who hangs, and all other messages with them.
+    """
+    how: dict[str, Any] = {
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "reliability": zenoh.Reliability.RELIABLE if qos.reliable else zenoh.Reliability.BEST_EFFORT,
+        "express": True,
+    }
+    if not qos.latched:
+        return session.declare_publisher(at, **how)
+    cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
+    return zenoh.ext.declare_advanced_publisher(session, at, **how, cache=cache, publisher_detection=True)
+
+
+def _undeclare(*declared: Any) -> None:
+    for one in declared:
+        with contextlib.suppress(zenoh.ZError):  # the session is closed
+            one.undeclare()
+
+
+def _refuse(query: zenoh.Query, why: str) -> None:
+    with contextlib.suppress(zenoh.ZError), query:
+        query.reply_err(why.encode())
+
+
+def _bytes(data: zenoh.ZBytes | None) -> bytes:
+    return b"" if data is None else data.to_bytes()
+
+
+@contextlib.contextmanager
+def _as_bridge_error(what: str) -> Iterator[None]:
+    try:
+        yield
+    except zenoh.ZError as error:
+        raise BridgeError(f"{what}: {error}") from None
+
+
+__all__ = ["ROUTER", "ZenohNode"]

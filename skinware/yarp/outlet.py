@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
@@ -37,6 +38,7 @@ log: logging.Logger = logging.getLogger("skinware.yarp")
 _LOOK_S = 2.0
 """Between two looks whether the name server still knows a port."""
 _END_S = 15.0
+_NOT_OF_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]")
 ANYWHERE = ("0.0.0.0", "::", "")
 
 
@@ -249,7 +251,12 @@ class Outlet:
         except ConfigurationError as error:
             self._tell_once(service, str(error))
             return
-        self._vectors[service] = [(self._port(part, service), vector) for part, vector in vectors.items()]
+        for part, vector in vectors.items():
+            served = self._port(part, service)
+            if served.driver == service:
+                self._vectors[service].append((served, vector))
+            else:
+                self._tell_once(service, f"driver {served.driver} has the port {served.port.name} already")
 
     def took(self, service: str, frame: Frame) -> None:
         """Likewise."""
@@ -260,7 +267,7 @@ class Outlet:
         """Likewise."""
 
     def _port(self, part: str, driver: str) -> _Served:
-        name = f"{self._wanted.prefix}/{part}"
+        name = f"{self._wanted.prefix}/{_NOT_OF_A_NAME.sub('_', part)}"
         if name not in self._ports:
             served = _Served(name, driver, self._names, self._wanted.host, self._loop)
             self._ports[name] = served

@@ -101,7 +101,10 @@ def _parts(
     of_driver = [region for region in regions if not region.driver or name in region.driver]
     if not of_driver and driver_type == "yarp":
         bus = structure.sensor_uid[of_type].astype(np.int64) >> _BUS_SHIFT
-        return {_port_of(text, number): of_type[bus == number] for number, text in enumerate(structure.buses)}
+        numbers = np.unique(bus).tolist()
+        own = [name] if len(numbers) == 1 else [f"{name}_{number}" for number in numbers]
+        names = [_port_of(structure.buses[number]) or other for number, other in zip(numbers, own, strict=True)]
+        return {each: of_type[bus == number] for each, number in zip(names, numbers, strict=True)}
     if not of_driver:
         return {name: of_type}
     index = Regions(regions).of(structure, type_name)
@@ -109,10 +112,10 @@ def _parts(
     return {part: sensors for part, sensors in parts.items() if len(sensors)}
 
 
-def _port_of(bus: str, number: int) -> str:
-    """The last part of a port's name, of the name of its bus."""
+def _port_of(bus: str) -> str:
+    """The last part of a port's name, of the name of its bus; empty: it is not called after a port."""
     last = bus.partition("?")[0].rpartition("/")[2]
-    return last if last.replace("_", "").isalnum() else f"port_{number}"
+    return last if bus.startswith("yarp://") else ""
 
 
 def _places(structure: Structure, driver_type: str, sensors: Indices) -> tuple[Indices, int]:

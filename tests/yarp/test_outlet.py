@@ -16,6 +16,7 @@ from skinware import DriverWriter
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
+from skinware.tactile.regions import Region
 from skinware.yarp.names import NameServer
 from skinware.yarp.outlet import Outlet, Wanted
 from skinware_drivers.description import assemble
@@ -35,10 +36,10 @@ def yarp() -> Iterator[Robot]:
 class Skin:
     """A driver of ``length`` values that publishes again and again; its values can be changed."""
 
-    def __init__(self, name: str, length: int = 24) -> None:
+    def __init__(self, name: str, length: int = 24, *, port: str = "") -> None:
         driver = YarpDriver(YarpOptions())
         patches, _ = driver._of_places(length)
-        structure = assemble([(f"yarp://h/icub/{name}", patches)], driver.types, np.float32).structure
+        structure = assemble([(f"yarp://h/icub/{port or name}", patches)], driver.types, np.float32).structure
         self.values = np.arange(length, dtype=np.float32)
         self._writer = DriverWriter(name, structure, driver_type="yarp")
         self._over = threading.Event()
@@ -123,6 +124,20 @@ def test_a_name_that_another_program_takes_is_left_to_it(
         yarp.ports["/skinware/hand"] = ("10.0.0.9", 10099, "tcp")
         wait_until(lambda: any("another program" in event.get("why", "") for event in told))
     assert yarp.ports["/skinware/hand"] == ("10.0.0.9", 10099, "tcp")
+
+
+def test_a_part_whose_name_no_port_can_have_gets_another(namespace: object, yarp: Robot) -> None:
+    parts = (Region("the left/hand", "pressure", patch=("values 0-23",)),)
+    with contextlib.closing(Skin("hand")), outlet(yarp, regions=parts):
+        wait_until(lambda: "/skinware/the_left_hand" in yarp.ports)
+
+
+def test_two_drivers_of_ports_of_one_name_are_never_mixed(namespace: object, yarp: Robot) -> None:
+    with contextlib.closing(Skin("hand")), outlet(yarp) as (there, told):
+        wait_until(lambda: bool(there.ports()))
+        with contextlib.closing(Skin("other", port="hand", length=30)):
+            wait_until(lambda: any("driver hand has the port" in event.get("why", "") for event in told))
+            assert {name: port["driver"] for name, port in there.ports().items()} == {"/skinware/hand": "hand"}
 
 
 def test_what_is_no_skin_is_left_out_with_a_word(namespace: object, yarp: Robot) -> None:

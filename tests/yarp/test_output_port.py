@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import socket
 import struct
 import threading
@@ -220,6 +221,36 @@ def test_a_reader_that_does_not_read_misses_vectors_and_holds_nobody_up(yarp: Ro
 def test_who_speaks_otherwise_is_hung_up_on(there: There, said: bytes) -> None:
     with called(there, said) as connection, contextlib.suppress(ConnectionError):
         assert connection.recv(100) == b""
+
+
+def test_whatever_is_said_the_port_goes_on(there: There) -> None:
+    rng = random.Random(5)
+    words = [
+        b"a",
+        b"d",
+        b"*",
+        b"?",
+        b"[list]",
+        b"[out]",
+        b"[del]",
+        b"[set]",
+        b"(",
+        b")",
+        b'"',
+        b"/",
+        b"!/x",
+        b"\xff",
+        b"\0",
+        b"",
+    ]
+    for _ in range(30):
+        lines = [b" ".join(rng.choices(words, k=rng.randint(1, 5))) for _ in range(20)]
+        with called(there, b"CONNECT x\r\n" + b"\n".join(lines)), contextlib.suppress(OSError):
+            pass
+    with called(there, b"CONNECT foo\nr\n") as connection:
+        wait_until(lambda: [receiver.name for receiver in there.port.receivers] == ["foo"])
+        there.send(1.0)
+        assert hear(connection, b"1.0\r\n")
 
 
 def test_a_crowd_is_not_served(there: There) -> None:

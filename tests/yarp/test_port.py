@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import socket
 import struct
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -210,6 +212,12 @@ def pile_up(there: Robot, bus: YarpBus, count: int) -> None:
         there.port.callers[-1].sendall(vector([float(number)] + [250.125] * 11))
 
 
+def waiting(bus: YarpBus) -> int:
+    """Bytes that the kernel has for it."""
+    assert bus._port is not None
+    return int.from_bytes(fcntl.ioctl(bus._port.fileno(), termios.FIONREAD, bytes(4)), "little")
+
+
 def test_a_short_pile_is_read_to_its_last_message() -> None:
     with robot(until_gone) as there, opened(there.bus) as (bus, batch):
         pile_up(there, bus, 300)
@@ -221,6 +229,7 @@ def test_of_a_high_pile_only_the_newest_is_used_and_the_port_never_waits() -> No
     count = 1500
     with robot(until_gone) as there, opened(there.bus) as (bus, batch):
         pile_up(there, bus, count)  # which did not block, though nobody read
+        wait_until(lambda: waiting(bus) > 100_000)
         seen: list[float] = []
 
         def has_newest() -> bool:

@@ -85,7 +85,9 @@ def test_ports_of_a_robots_files_keep_their_gaps() -> None:
     driver = YarpDriver(YarpOptions(length=192, triangles=(Triangles(14, 0, (0, 2)),)))
     patches, _ = driver._of_boards()
     structure = assemble([("virtual:yarp", patches)], driver.types, np.float32).structure
-    (vector,) = vectors_of("hand", structure, "yarp").values()
+    vectors = vectors_of("hand", structure, "yarp")
+    assert list(vectors) == ["hand"]
+    (vector,) = vectors.values()
     assert vector.length == 192
     assert vector.places.tolist() == [p for p in (*range(12), *range(24, 36)) if p % 12 not in (6, 10)]
 

@@ -453,7 +453,7 @@ def test_several_recordings_that_do_not_fit(made: Made, tmp_path: Path) -> None:
         learn([made.path, others.path], joined(tmp_path, "time_s,a\n0,1\n2,1\n"))
     with pytest.raises(ConfigurationError, match=r"the episode 0\.\.1 does not tell of which recording"):
         learn([made.path, others.path], LearningSet(intervals=[Interval(0, 1)]))
-    with pytest.raises(ConfigurationError, match=r"of 'x': that is not one of the recordings"):
+    with pytest.raises(ConfigurationError, match=r"of 'x': that is not the name of one of the recordings"):
         learn(made, LearningSet(intervals=[Interval(0, 1, None, "x")]))
 
 

@@ -339,9 +339,11 @@ def convert(seconds: float, skins: list[int], patterns: list[str], formats: list
                 assert not process.returncode
                 files = [target] if target.is_file() else [each for each in target.rglob("*") if each.is_file()]
                 size = sum(each.stat().st_size for each in files)
+                used_s = usage.ru_utime + usage.ru_stime
                 print(
-                    f"    {name:<16} {1e3 * passed_s / frames:7.2f} ms a frame, {size / frames / 1e3:7.1f} kB a frame,"
-                    f" {60 * RATE_HZ * passed_s / frames:5.1f} s a minute, at most {usage.ru_maxrss / 1024:.0f} MiB",
+                    f"    {name:<16} {1e3 * passed_s / frames:6.2f} ms a frame, of a core {1e3 * used_s / frames:6.2f},"
+                    f" {60 * RATE_HZ * used_s / frames:5.1f} s a minute, {size / frames / 1e3:6.1f} kB a frame,"
+                    f" at most {usage.ru_maxrss / 1024:.0f} MiB",
                     flush=True,
                 )
                 shutil.rmtree(target) if target.is_dir() else target.unlink()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,15 @@ import numpy as np
 from skinware.conversion._packages import pyarrow
 from skinware.conversion.converting import Converted, Watched, begun_beside, new_target, opened
 from skinware.conversion.learning.dataset import DatasetWriter
-from skinware.conversion.learning.features import Batch, Feature, Frames, JoinedFeature, SkinFeatures, joined_rows
+from skinware.conversion.learning.features import (
+    IMAGE,
+    Batch,
+    Feature,
+    Frames,
+    JoinedFeature,
+    SkinFeatures,
+    joined_rows,
+)
 from skinware.conversion.learning.joined import Joined
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
 from skinware.conversion.learning.wanted import Interval, LearningSet
@@ -129,7 +138,7 @@ def _intervals(sources: Sequence[Source], wanted: LearningSet) -> list[list[Inte
         ]
         if len(found) != 1:
             raise ConfigurationError(
-                f"the episode {interval} is of {interval.file!r}: that is not one of the recordings"
+                f"the episode {interval} is of {interval.file!r}: that is not the name of one of the recordings"
             )
         asked[found[0]].append(interval)
     return asked
@@ -196,6 +205,7 @@ class _Set:
         row_bytes = sum(
             timed.structure.n_sensors * self._windows[name] * _BYTES_PER_SENSOR for name, timed in self._tables.items()
         )
+        row_bytes += sum(math.prod(each.shape) for each in self._features.values() if each.dtype == IMAGE)
         step = max(1, _BATCH_BYTES // row_bytes)
         for first in range(0, len(episode), step):
             part = slice(first, first + step)

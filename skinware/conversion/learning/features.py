@@ -137,7 +137,10 @@ class Frames:
         self._next = 0
 
     def take(self, numbers: npt.NDArray[np.int64]) -> Block:
-        """The frames with some numbers, ascending; none but the last of a window is before the last of the take before.
+        """The frames with some numbers, in order.
+
+        Args:
+            numbers: ascending; at most a window before the last that was taken before.
 
         Raises:
             BadRecording, OSError: they cannot be read.

@@ -13,6 +13,7 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 TOLD = ("min", "max", "mean", "std", "count", *QUANTILES)
 _SAMPLE_ROWS, _LEAST_ROWS = 1000, 32
 """How many rows quantiles are taken of at most; and at least, however large they are."""
+_AT_ONCE = 4096
 
 Numbers = npt.NDArray[np.float64]
 
@@ -80,8 +81,12 @@ class Sample:
 
     def quantiles(self) -> dict[str, Numbers]:
         """Of each number of a row."""
-        found = np.quantile(np.moveaxis(self._rows[: self._kept], 0, -1), list(QUANTILES.values()), axis=-1)
-        return dict(zip(QUANTILES, found.astype(np.float64), strict=True))
+        rows = self._rows[: self._kept].reshape(self._kept, -1)
+        found = np.zeros((len(QUANTILES), rows.shape[1]))
+        for first in range(0, rows.shape[1], _AT_ONCE):  # quantiles of all at once would be copies of the whole sample
+            part = slice(first, first + _AT_ONCE)
+            found[:, part] = np.quantile(rows[:, part], list(QUANTILES.values()), axis=0)
+        return dict(zip(QUANTILES, found.reshape(-1, *self._rows.shape[1:]), strict=True))
 
 
 class Statistics:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import Any
 
@@ -57,11 +58,12 @@ def hand(patches: tuple[str, ...] = tuple(PATCHES)) -> Structure:
     return structure.replace(geometry=unknown)
 
 
-def driver(namespace: Namespace, structure: Structure | None = None, name: str = "hand") -> DriverWriter:
+def driver(namespace: Namespace, operations: Mapping[str, Callable[..., object]] | None = None) -> DriverWriter:
     return DriverWriter(
-        name,
-        structure or hand(),
+        "hand",
+        hand(),
         namespace=namespace,
+        operations=operations,
         rate_hz=50,
         driver_type="virtual",
         bus_counters=["lost", "read"],
@@ -301,3 +303,36 @@ def test_lost_is_that_of_the_robot(net: Net, namespace: Namespace) -> None:
             publish(writer)
             wait_until(lambda: int(reader.read().values[0]) == writer.sequence - 1)
             assert reader.lost - before == 7
+
+
+def test_operations_are_those_of_the_whole_driver(net: Net, namespace: Namespace) -> None:
+    tared: list[str | None] = []
+
+    def tare(patch: str | None = None) -> str:
+        """Take the present load as none."""
+        tared.append(patch)
+        return f"{patch or 'all'} tared"
+
+    wish, ended = Wish(patches=("thumb",)), threading.Event()
+    with (
+        joining(net, namespace, wish=wish) as ends,
+        serving(net, namespace),
+        driver(namespace, {"tare": tare}) as writer,
+    ):
+
+        def work() -> None:
+            while not ended.is_set():
+                writer._service.answer_requests(0.01)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        try:
+            until_here(ends, writer)
+            with DriverReader("hand", namespace=ends.here, timeout_s=PATIENCE_S) as reader:
+                assert reader.operations()["tare"] == "Take the present load as none."
+                assert reader.call("tare", patch="thumb", timeout_s=PATIENCE_S) == "thumb tared"
+                assert reader.call("tare", timeout_s=PATIENCE_S) == "all tared"
+        finally:
+            ended.set()
+            thread.join()
+    assert tared == ["thumb", None]

@@ -13,7 +13,7 @@ from skinware.bridge.messages import RAW, Service, coded_part, form_of, generati
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.pacing import Pacing
 from skinware.bridge.peer import ANSWER_S, Peer
-from skinware.errors import BadRecording, BridgeError, NameInUse, SkinwareError
+from skinware.errors import BadRecording, BridgeError, SkinwareError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
@@ -23,6 +23,8 @@ from skinware.transfer.generation import Generation
 Slot = npt.NDArray[np.uint8]
 _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
 """A large structure takes its time on a slow link: each time that none comes, it gets twice as long."""
+_AGAIN_NS = NS_PER_S // 4
+"""Until a service that could not be published is tried again."""
 _STATES = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
@@ -76,6 +78,7 @@ class Follower:
         self._count: int | None = None  # the robot's number of the frame published last, over generations
         self._newest = (0, 0)  # position of that frame
         self._last_word = (0, 0)  # of the frame after which it became as it is there
+        self._again_ns = 0  # when it may be tried to publish again
         self._is_gone = False  # from here, since the robot was not heard
         self._silence: Callable[[], None] | None = None  # ends the subscription to frames
         self._pulls = 0  # how often the newest frame was asked for
@@ -304,17 +307,15 @@ class Follower:
 
     def _publish(self, frame: RecordedFrame) -> None:
         generation = self._generation
-        if generation is None or frame.position <= self._newest:
+        if generation is None or frame.position <= self._newest or now_ns() < self._again_ns:
             return
         count = generation.published_before + frame.sequence
         age_ns = now_ns() - self._peer.clock.offset_ns(now_ns()) - frame.published_ns
         try:
             self._mirror.publish(self._name, frame, generation)
-        except NameInUse as error:
-            self._trouble(error, " cannot appear here")
-            return
         except SkinwareError as error:
-            self._trouble(error)
+            self._again_ns = now_ns() + _AGAIN_NS
+            self._trouble(error, " cannot appear here")
             return
         if self._count is not None:
             self.traffic.lost += max(0, count - self._count - 1)

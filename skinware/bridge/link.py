@@ -22,6 +22,8 @@ LEASE_MS = 2000
 """A peer that says nothing for so long is gone."""
 _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _FOREVER_MS = -1
+_BATCHES = 4
+"""Of 64 KiB, that may wait to be sent: a frame of 30,848 sensors takes three, and who puts it waits for none."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
 Payload = bytes
@@ -263,6 +265,7 @@ def _configuration(endpoints: Endpoints) -> zenoh.Config:
         "scouting/gossip/enabled": "false",
         "transport/shared_memory/enabled": "false",
         "transport/link/tx/lease": str(LEASE_MS),
+        "transport/link/tx/queue/size/data": str(_BATCHES),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),
         "adminspace/enabled": "false",
     }

@@ -93,10 +93,12 @@ def serve(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.bridge import DEFAULT_LISTEN, Link, Rules, Server, endpoints
+    from skinware.bridge.messages import Keys
     from skinware.memory.namespace import Namespace, check_name
 
     for name in names:
         check_name(name, "service")
+    Keys(robot)  # what is no name is refused before anything is opened
     place = Namespace(namespace)
     places = endpoints(
         listen=listen or (() if connect else (DEFAULT_LISTEN,)),
@@ -192,9 +194,11 @@ def join(
     """
     from skinware.bridge import Joiner, Link, endpoints
     from skinware.bridge.diagnosis import why_unreachable
+    from skinware.bridge.messages import Keys
     from skinware.memory.namespace import Namespace
 
     wish = _wish(patches, in_regions, region_files)
+    Keys(robot)  # likewise
     place = Namespace(into or robot)
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import fnmatch
 import queue
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from skinware.bridge.link import Link, Payload, Reply, Sender
+
+
+def _match(one: str, other: str) -> bool:
+    """Whether two keys have something in common; ``*`` stands for anything between two slashes."""
+    parts = one.split("/"), other.split("/")
+    return len(parts[0]) == len(parts[1]) and all(a == b or "*" in (a, b) for a, b in zip(*parts, strict=True))
 
 
 class _Asked:
@@ -95,7 +100,7 @@ class _Sender(Sender):
         return bool(self._listeners())
 
     def _listeners(self) -> list[Callable[[str, Payload], None]]:
-        return [heard for pattern, heard in list(self._net.listeners) if fnmatch.fnmatchcase(self._key, pattern)]
+        return [heard for pattern, heard in list(self._net.listeners) if _match(self._key, pattern)]
 
 
 class NetLink(Link):
@@ -111,7 +116,7 @@ class NetLink(Link):
 
     def tell(self, key: str, payload: Payload, priority: object = None) -> None:
         for pattern, heard in list(self._net.listeners):
-            if fnmatch.fnmatchcase(key, pattern):
+            if _match(key, pattern):
                 self._net.carry("told", key, lambda heard=heard: heard(key, payload))  # type: ignore[misc]
 
     def listen(self, key: str, heard: Callable[[str, Payload], None]) -> Callable[[], None]:
@@ -133,7 +138,7 @@ class NetLink(Link):
     ) -> None:
         texts = {name: str(value) for name, value in (parameters or {}).items()}
         for pattern, asked in list(self._net.answerers):
-            if fnmatch.fnmatchcase(key, pattern) or fnmatch.fnmatchcase(pattern, key):
+            if _match(key, pattern):
                 question = _Asked(self._net, key, texts, payload, answered)
                 self._net.carry("question", key, lambda asked=asked, question=question: asked(question))  # type: ignore[misc]
 
@@ -145,7 +150,7 @@ class NetLink(Link):
     def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
         self._entered(self._net.watchers, (key, changed))
         for token in list(self._net.tokens):
-            if fnmatch.fnmatchcase(token, key):
+            if _match(token, key):
                 self._net.carry("token", token, lambda token=token: changed(token, True))  # type: ignore[misc]
 
     def close(self) -> None:
@@ -153,7 +158,7 @@ class NetLink(Link):
             self._net.tokens.discard(key)
             self._tell_watchers(key, False)
         self._own.clear()
-        for end in self._ends:
+        for end in list(self._ends):
             end()
 
     def _entered(self, entries: list[Any], entry: tuple[str, Callable[..., None]]) -> Callable[[], None]:
@@ -162,11 +167,12 @@ class NetLink(Link):
         def leave() -> None:
             if entry in entries:
                 entries.remove(entry)
+                self._ends.remove(leave)
 
         self._ends.append(leave)
         return leave
 
     def _tell_watchers(self, key: str, there: bool) -> None:
         for pattern, changed in list(self._net.watchers):
-            if fnmatch.fnmatchcase(key, pattern):
+            if _match(key, pattern):
                 self._net.carry("token", key, lambda changed=changed: changed(key, there))  # type: ignore[misc]

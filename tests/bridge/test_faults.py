@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
 import shutil
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
 
 from skinware import DriverReader, DriverWriter
+from skinware.bridge.messages import VERSION, About, generation_message
 from skinware.errors import ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware_drivers.testing.waiting import wait_until
-from tests.bridge.net import Net
-from tests.bridge.rig import joining, publish, serving, structure
+from tests.bridge.net import Net, NetLink
+from tests.bridge.rig import ROBOT, Ends, joined, joining, publish, serving, structure
+from tests.commands import refused, run
 
 SIZES = (64, 128)
 SEEDS = (1, 2)
@@ -183,3 +188,101 @@ def test_whatever_breaks_readers_know_and_it_comes_back(namespace: Namespace, mo
             heal()
             begin = bridge.driver.number
             until(lambda begin=begin: bool(witness.taken) and witness.taken[-1] > begin and witness.is_fresh)  # type: ignore[misc]
+
+
+# -- what is told ---------------------------------------------------------------------------------------------------
+
+
+def until_told(ends: Ends, words: str, writer: DriverWriter | None = None) -> None:
+    """Until the joiner has told of some trouble, once."""
+
+    def is_told() -> bool:
+        if writer is not None:
+            publish(writer)
+        return any(words in event.get("why", "") for event in ends.events)
+
+    wait_until(is_told)
+    assert sum(words in event.get("why", "") for event in ends.events) == 1
+
+
+def test_a_full_shared_memory_is_told_once_and_all_comes_when_there_is_room(
+    namespace: Namespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fallocate, is_full = os.posix_fallocate, True
+
+    def on_full_disk(fd: int, offset: int, size: int) -> None:
+        if is_full and "-here" in os.readlink(f"/proc/self/fd/{fd}"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fallocate(fd, offset, size)
+
+    monkeypatch.setattr("os.posix_fallocate", on_full_disk)
+    with (
+        joined(namespace, "push") as ends,
+        serving(ends.net, namespace),
+        DriverWriter("arm", structure(), namespace=namespace, rate_hz=50) as writer,
+    ):
+        until_told(ends, "service 'arm' cannot appear here: cannot make", writer)
+        assert any("No space left on device" in event.get("why", "") for event in ends.events)
+        is_full = False
+
+        def has_come() -> bool:
+            publish(writer)
+            return {"arm", f"{ROBOT}-bridge"} <= set(ends.here.services())
+
+        wait_until(has_come)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(VERSION, VERSION + 1), (VERSION + 1, VERSION)])
+def test_another_version_is_told_whichever_is_older(
+    namespace: Namespace, monkeypatch: pytest.MonkeyPatch, ours: int, theirs: int
+) -> None:
+    monkeypatch.setattr("skinware.bridge.peer.VERSION", ours)
+    monkeypatch.setattr("skinware.bridge.messages.VERSION", ours)
+    with joined(namespace) as ends:
+        other = NetLink(ends.net)
+        other.be_there(f"skinware/live/{ROBOT}/{theirs}/abcd")
+        until_told(ends, f"robot {ROBOT} is served by version {theirs} of the bridge; this one is {ours}: install")
+        other.close()
+
+
+def test_a_robot_whose_files_are_of_another_version_is_told(
+    namespace: Namespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def of_another(about: About, head: bytes) -> bytes:
+        return generation_message(about, head[:8] + bytes([9]) + head[9:])
+
+    monkeypatch.setattr("skinware.bridge.serving.generation_message", of_another)
+    with (
+        joined(namespace, "push") as ends,
+        serving(ends.net, namespace),
+        DriverWriter("arm", structure(), namespace=namespace, rate_hz=50) as writer,
+    ):
+        until_told(ends, "service 'arm' cannot be read: service 'arm': layout version 9.0, this program reads", writer)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "line"),
+    [
+        (("serve", "--robot", "a/b"), 2, "robot 'a/b': give 1 to 47 letters"),
+        (("serve", "--robot", "r", "--listen", "tcp/0.0.0.0:1"), 2, "give --tls DIR, or --insecure"),
+        (("serve", "--robot", "r", "--tls", "/nowhere"), 2, "/nowhere/ca.pem: No such file"),
+        (("join", "r", "--connect", "here"), 2, "'here' is no endpoint"),
+        (("join", "r", "--connect", "tcp/127.0.0.1:1", "--into", "a b"), 2, "namespace name 'a b'"),
+    ],
+)
+def test_commands_that_cannot_be_carried_out_say_why_in_a_line(
+    arguments: tuple[str, ...], status: int, line: str
+) -> None:
+    done = refused("skin-bridge", *arguments)
+    assert (done.returncode, done.stdout) == (status, "")
+    assert done.stderr.startswith("skin-bridge: ")
+    assert line in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_port_that_is_in_use_is_told_in_a_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = run("skin-bridge", "serve", "--robot", "r", "--listen", f"tcp/127.0.0.1:{port}")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"skin-bridge: listening at tcp/127.0.0.1:{port}: Address already in use\n"

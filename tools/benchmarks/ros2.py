@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from multiprocessing.connection import Connection
 
 import numpy as np
-from bridge import Command
+from links import Command
 from processes import Processes, answer, own_namespace
 from record import LARGE, RATE_HZ, SMALL, driving
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from links import descriptors, enter, memory_mb
@@ -114,7 +114,7 @@ class Account:
 
     Attributes:
         frames: published, by its drivers or by its joiners.
-        lost: periods that its drivers missed; frames that did not come over the link.
+        lost: frames that did not come over the link.
         bytes: of the messages that came.
         ages_ns: of the frames that came, from their publication on the robot to the arrival here.
         cpu_s: processor time, without that of drivers.
@@ -159,7 +159,7 @@ def be_robots(pipe: Connection, place: str | None, robots: list[Robot], sensors:
             server = stack.enter_context(closing(Server(robot.name, link, Namespace(robot.there))))
             stack.enter_context(_running(server))
         pipe.send("ready")
-        timer, begin, frames = Periodic(rate_hz * len(skins)), (0.0, 0), 0
+        timer, begin_s, frames = Periodic(rate_hz * len(skins)), 0.0, 0
         for skin in itertools.cycle(skins):
             timer.wait()
             skin.publish()
@@ -167,44 +167,40 @@ def be_robots(pipe: Connection, place: str | None, robots: list[Robot], sensors:
             if pipe.poll():
                 if pipe.recv() == "enough":
                     break
-                begin, frames = (_bridges_cpu_s(), timer.missed), 0
-        account = Account(frames, timer.missed - begin[1], cpu_s=_bridges_cpu_s() - begin[0])
-        pipe.send(_weighed(account))
+                begin_s, frames = _bridges_cpu_s(), 0
+        pipe.send(_weighed(Account(frames, cpu_s=_bridges_cpu_s() - begin_s)))
+        pipe.recv()  # the desk is still looking
 
 
 def be_desk(pipe: Connection, place: str | None, robots: list[Robot], mode: str) -> None:
     """Process of joiners, one for each robot; it is ready when a frame of each is here."""
     enter(place)
     with ExitStack() as stack:
-        joiners: dict[Joiner, int] = {}
+        joiners: list[Joiner] = []
         for robot in robots:
             link = stack.enter_context(closing(Link(endpoints(connect=[robot.connect]))))
             joiner = stack.enter_context(closing(Joiner(robot.name, link, Namespace(robot.here), mode=mode)))
             stack.enter_context(_running(joiner))
-            joiners[joiner] = 0
+            joiners.append(joiner)
         missing = set(joiners)
         while missing and not pipe.poll():
             time.sleep(_LOOK_S)
-            missing -= {joiner for joiner in missing if any(traffic.frames for *_, traffic in _traffic(joiner))}
+            missing -= {
+                joiner for joiner in missing if any(traffic.frames for *_, traffic in joiner.traffic().values())
+            }
         pipe.send("ready")
         if pipe.recv() != "go":
             return
         for joiner in joiners:
-            joiners[joiner] = sum(traffic.lost for *_, traffic in _traffic(joiner))
+            joiner.traffic()
         begin_s = time.process_time()
         if pipe.recv() != "enough":
             return
         account = Account(cpu_s=time.process_time() - begin_s)
-        for joiner, lost in joiners.items():
-            for *_, traffic in _traffic(joiner):
-                came = Account(traffic.frames, traffic.lost, traffic.bytes, traffic.ages_ns)
-                account.add(came)
-            account.lost -= lost
+        for joiner in joiners:
+            for *_, traffic in joiner.traffic().values():
+                account.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=traffic.ages_ns))
         pipe.send(_weighed(account))
-
-
-def _traffic(joiner: Joiner) -> list[Any]:
-    return list(joiner.traffic().values())
 
 
 def _bridges_cpu_s() -> float:

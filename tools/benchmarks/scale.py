@@ -6,7 +6,7 @@ tools/bench scale [sizes|robots|chain] [--sensors N ...] [--robots N ...] [--mod
 sizes   skin-bridge serve and join, as people start them, for skins of different sizes. Ages are from the driver's stamp
         to a reader behind the link, losses those of that reader.
 robots  many robots at one desk, over one link: ten of them to a process, and ten of the desk's joiners. Ages are from a
-        robot's publication to the arrival at the desk, losses those of the joiners.
+        robot's publication to the arrival at the desk; lost is what was published and had not arrived in the end.
 chain   one large skin through all there is: structure, writer, readers, commands, bridge, recording.
 
 Robots are light: drivers that write frames made beforehand. Both ends are on machines of their own (network
@@ -91,7 +91,7 @@ class Row:
     Attributes:
         driver_hz: frames that each robot published.
         arrived_hz: frames that arrived of each.
-        lost: that did not.
+        lost: that did not, or not yet.
         age_p50_ms, age_p99_ms: of those that arrived.
         serve_share, join_share: of a core.
         serve_us, join_us: processor time for a frame that was published, or that arrived.
@@ -222,7 +222,10 @@ def many_robots(setting: Setting) -> Row:
         for side, pipes in zip(sides, (serving, joining), strict=True):
             for pipe in pipes:
                 side.add(answer(pipe, PATIENCE_S))
+        for pipe in serving:
+            pipe.send("end")
     served, joined = sides
+    joined.lost = max(0, served.frames - joined.frames)
     shares = [side.cpu_s / setting.seconds for side in sides]
     weights = [side.memory_mb for side in sides]
     return _row(setting, served.frames, joined, shares, weights, joined.descriptors, first_s, load, sent)

@@ -20,7 +20,7 @@ from links import descriptors, enter, memory_mb
 from record import BUS_COUNTERS, LEVELS, NOISE, PATCH_COUNTERS, structure_of
 
 from skinware import DriverWriter
-from skinware.bridge import Joiner, Link, Server, endpoints
+from skinware.bridge import Joiner, Link, Rules, Server, endpoints
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import Periodic, now_ns
@@ -155,7 +155,7 @@ def be_robots(pipe: Connection, place: str | None, robots: list[Robot], sensors:
         skins = []
         for robot in robots:
             skins.append(stack.enter_context(LightSkin(robot.there, sensors, rate_hz)))
-            link = stack.enter_context(closing(Link(endpoints(listen=[robot.listen], serves=True, insecure=True))))
+            link = stack.enter_context(closing(Link(endpoints(listen=[robot.listen], rules=Rules(), insecure=True))))
             server = stack.enter_context(closing(Server(robot.name, link, Namespace(robot.there))))
             stack.enter_context(_running(server))
         pipe.send("ready")

@@ -28,25 +28,23 @@ def measure(sensors: int, robots: int, seconds: float) -> None:
     with ExitStack() as stack:
         namespace = stack.enter_context(own_namespace())
         stack.enter_context(driving(namespace.name, sensors, "analogue"))
-        router = Command("route", "--listen", at)
-        stack.callback(router.end)
+        router = stack.enter_context(Command("route", "--listen", at))
         serving = []
         for number in range(robots):
             where = ("--namespace", namespace.name, "--connect", at)
-            serving.append(Command("serve", "--robot", f"robot{number}", *where))
-            stack.callback(serving[-1].end)
+            serving.append(stack.enter_context(Command("serve", "--robot", f"robot{number}", *where)))
         time.sleep(3)
         alone, listed, lists, routes, told = [], [], [], [], []
         for _ in range(TURNS):
             alone.append(shares(serving, seconds))
-            listing = Command("list", "--connect", at, "--watch")
-            time.sleep(3)
-            listing.begin()
-            router.begin()
-            listed.append(shares(serving, seconds))
-            lists.append(listing.share())
-            routes.append(router.share())
-            status = [event for event in listing.end() if event["event"] == "status"]
+            with Command("list", "--connect", at, "--watch") as listing:
+                time.sleep(3)
+                listing.begin()
+                router.begin()
+                listed.append(shares(serving, seconds))
+                lists.append(listing.share())
+                routes.append(router.share())
+                status = [event for event in listing.end() if event["event"] == "status"]
             first, last = ({robot["robot"]: robot["bytes"] for robot in status[at]["robots"]} for at in (3, -1))
             told += [(last[name] - first.get(name, 0)) / (len(status) - 4) for name in last]
     print(f"    {mean(told):.0f} bytes a second and robot; of a core per robot:")

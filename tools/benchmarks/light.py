@@ -21,6 +21,7 @@ from record import BUS_COUNTERS, LEVELS, NOISE, PATCH_COUNTERS, structure_of
 
 from skinware import DriverWriter
 from skinware.bridge import Joiner, Link, Rules, Server, endpoints
+from skinware.bridge_state import ServiceState
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import Periodic, now_ns
@@ -136,6 +137,27 @@ class Account:
             setattr(self, name, getattr(self, name) + value)
 
 
+class WatchedJoiner(Joiner):
+    """A joiner that keeps what came, which it forgets each second once it was told."""
+
+    def __init__(self, robot: str, link: Link, namespace: Namespace, *, mode: str) -> None:
+        super().__init__(robot, link, namespace, mode=mode)
+        self._came = Account()
+
+    def came(self) -> Account:
+        """What came since the last call."""
+        with self._lock:
+            self._services_state()
+            came, self._came = self._came, Account()
+        return came
+
+    def _services_state(self) -> dict[str, ServiceState]:
+        for follower in self._followers.values():
+            traffic = follower.traffic
+            self._came.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=traffic.ages_ns))
+        return super()._services_state()
+
+
 @contextmanager
 def _running(thing: Server | Joiner) -> Iterator[None]:
     """A server or joiner in a thread of its own."""
@@ -176,10 +198,10 @@ def be_desk(pipe: Connection, place: str | None, robots: list[Robot], mode: str)
     """Process of joiners, one for each robot; it is ready when a frame of each is here."""
     enter(place)
     with ExitStack() as stack:
-        joiners: list[Joiner] = []
+        joiners: list[WatchedJoiner] = []
         for robot in robots:
             link = stack.enter_context(closing(Link(endpoints(connect=[robot.connect]))))
-            joiner = stack.enter_context(closing(Joiner(robot.name, link, Namespace(robot.here), mode=mode)))
+            joiner = stack.enter_context(closing(WatchedJoiner(robot.name, link, Namespace(robot.here), mode=mode)))
             stack.enter_context(_running(joiner))
             joiners.append(joiner)
         missing = set(joiners)
@@ -192,14 +214,13 @@ def be_desk(pipe: Connection, place: str | None, robots: list[Robot], mode: str)
         if pipe.recv() != "go":
             return
         for joiner in joiners:
-            joiner.traffic()
+            joiner.came()
         begin_s = time.process_time()
         if pipe.recv() != "enough":
             return
         account = Account(cpu_s=time.process_time() - begin_s)
         for joiner in joiners:
-            for *_, traffic in joiner.traffic().values():
-                account.add(Account(traffic.frames, bytes=traffic.bytes, ages_ns=traffic.ages_ns))
+            account.add(joiner.came())
         pipe.send(_weighed(account))
 
 

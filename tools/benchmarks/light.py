@@ -207,9 +207,7 @@ def be_desk(pipe: Connection, place: str | None, robots: list[Robot], mode: str)
         missing = set(joiners)
         while missing and not pipe.poll():
             time.sleep(_LOOK_S)
-            missing -= {
-                joiner for joiner in missing if any(traffic.frames for *_, traffic in joiner.traffic().values())
-            }
+            missing -= {joiner for joiner in missing if joiner.came().frames}
         pipe.send("ready")
         if pipe.recv() != "go":
             return

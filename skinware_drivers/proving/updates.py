@@ -1,7 +1,8 @@
 """What a driver made of a wire, update by update, and the first in which it makes something else of it now.
 
-An update is what a module showed at one time. Two decoders are compared by the updates that have the same time; a
-little apart is allowed, since the clocks of devices are only estimated.
+An update is what a module showed at one time. Two decoders are compared by the updates that have the same time, or
+else one by one from the last one backwards: times by the clock of a device are estimated, at first not very well, and
+another decoder may begin with that at another update.
 """
 
 from __future__ import annotations
@@ -150,13 +151,16 @@ def _in_pairs(then: Decoding, now: Decoding) -> Iterator[tuple[int, Difference |
 def _of_module(old: Updates, new: Updates) -> tuple[int, Difference | None]:
     if old.values.shape[1:] != new.values.shape[1:]:
         return 0, _without_partner(old, 0, is_then=True)
+    common = min(len(old), len(new))
+    if not _differ(old.values[-common:], new.values[-common:]).any():
+        return common, None
     nearest, is_paired = _partners(old.time_ns, new.time_ns)
     rows = np.flatnonzero(is_paired)
     if not len(rows):
         return 0, _without_partner(old, 0, is_then=True)
     within = np.arange(rows[0], rows[-1] + 1)
     one, other = old.values[within], new.values[nearest[within]]
-    differs = (one != other) & ~((one != one) & (other != other))
+    differs = _differ(one, other)
     wrong = np.flatnonzero(~is_paired[within] | differs.any(axis=1))
     if not len(wrong):
         return len(rows), None
@@ -167,6 +171,12 @@ def _of_module(old: Updates, new: Updates) -> tuple[int, Difference | None]:
     time_s = float(old.time_ns[within[first]]) / NS_PER_S
     found = Difference(time_s, old.sensors[sensor], float(one[first, sensor]), float(other[first, sensor]))
     return len(rows), found
+
+
+def _differ(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> Flags:
+    """Which values differ; NaN is equal to NaN."""
+    found: Flags = (one != other) & ~((one != one) & (other != other))
+    return found
 
 
 def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:

@@ -32,16 +32,13 @@ from skinware.sensor_types import PRESSURE, SensorType
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
 from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
+from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers, Refused
-from skinware_drivers.serial.checksums import CRC16_WEISS
-from skinware_drivers.serial.framing import Encoding, Field, Framing
-from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.splitting import Split
+from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -50,19 +47,9 @@ _ON, _RLE = 0x80, 0x01
 _PART, _TORN = 0x100, 0x200  # what the frame of a matrix is called, plus its number; and of data that fit none
 _HEADER, _TIME = 5, 4
 _MOST_MATRICES, _MOST_CELLS = 16, 4096
-_TIMEOUT_S, _TRIES = 1.0, 4  # it is silent for some 8 s after power-up
 _FULL = 0xFFF
 _PARTS = ("proximal", "distal")
-_ANSWERS = Answers("controller", {}, dtype="<u2")
-_WHOLE = Packet(
-    sync=(0xAA, 0xAA, 0xAA),
-    length=Length(Field(4, 2), more=8),
-    maximum=8 + _HEADER + 2 * _MOST_CELLS,
-    checksum=CRC16_WEISS,
-    covers=(3, -2),
-    bare_when_empty=True,
-    identifier=Field(3),
-)
+_WHOLE = weiss_packet(_HEADER + 2 * _MOST_CELLS, covers=(3, -2), bare_when_empty=True)
 
 
 class WeissDsaOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,9 +89,12 @@ class _Matrix(NamedTuple):
         return Grid(self.rows, self.columns, told if 0.0005 <= told <= 0.05 else PITCH_M)
 
 
-class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
+class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
     """One controller; uid = matrix << 12 | cell, row by row."""
 
+    packet = _WHOLE
+    answers = weiss_answers("controller", {})
+    timeout_s, tries = 1.0, 4  # it is silent for some 8 s after power-up
     framing: Framing = _WHOLE
     commands: Encoding | None = _WHOLE
     types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=_FULL),)
@@ -115,12 +105,7 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
         super().__init__(options)
         self.period_s: float = options.period_ms / 1e3
         self.geometry: Geometry | None = None
-        self._matrices: tuple[_Matrix, ...] = ()
-
-    @property
-    def payload_size(self) -> int:
-        """Of the most cells: how many there are is known only when it was asked."""
-        return -(-_WHOLE.maximum_body // 8) * 8
+        self._cells: tuple[_Matrix, ...] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the controller for its matrices; it may still be sending for somebody before us.
@@ -132,7 +117,7 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
             raise BusError("a DSA controller reports its matrices only on request: listening is not enough")
         self.change_framing(_WHOLE)
         await self.stop(link)
-        matrices = await self._ask_matrices(link)
+        matrices = await self._ask_cells(link)
         log.info("%s: matrices of %s cells", link.bus_name, ", ".join(f"{m.rows}x{m.columns}" for m in matrices))
         time, frames, modules, places = DeviceTime(0, "<u4", 1e-3), [], [], []
         for number, matrix in enumerate(matrices):
@@ -148,14 +133,14 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
             for (number, matrix), centre in zip(of_finger, centres, strict=True):
                 uids = range(number << 12, (number << 12) + matrix.cells)
                 places.append(matrix.grid.at(centre, ["pressure"], uids))
-        self.layout, self.geometry, self._matrices = Layout(frames), Geometry.joined(places), matrices
+        self.layout, self.geometry, self._cells = Layout(frames), Geometry.joined(places), matrices
         self.change_framing(self.split())
         return [Patch("DSA", modules)]
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
         """How many matrices it has; nothing that it is asked stops one that sends."""
-        matrices = await cls._ask_matrices(link, tries=1)
+        matrices = await cls._ask_cells(link, tries=1)
         return f"Weiss DSA controller with {len(matrices)} matrices"
 
     async def start(self, link: Link) -> None:
@@ -169,13 +154,6 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
             await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
         except Refused as error:
             log.debug("%s: %s", link.bus_name, error)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
-        if await self._ask_matrices(link, tries=1) == self._matrices:
-            return True
-        self.tell(patch, Notice.CHANGED)
-        return False
 
     @operation(looks=True)
     async def controller(self, link: Link, patches: Sequence[Patch]) -> dict[str, int]:  # noqa: ARG002
@@ -195,7 +173,7 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
         cells = body[_HEADER:]
         if body[_TIME] & _RLE:
             cells = _expanded(body[self.options.rle_offset or _HEADER :])
-        ends = np.cumsum([2 * matrix.cells for matrix in self._matrices]).tolist()
+        ends = np.cumsum([2 * matrix.cells for matrix in self._cells]).tolist()
         if len(cells) != ends[-1]:
             return [(_TORN, body)]
         starts = [0, *ends[:-1]]
@@ -205,7 +183,7 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
         ]
 
     @classmethod
-    async def _ask_matrices(cls, link: Link, *, tries: int = _TRIES) -> tuple[_Matrix, ...]:
+    async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> tuple[_Matrix, ...]:
         [count] = struct.unpack_from("<H", await cls._ask(link, _SENSOR, size=2, tries=tries))
         if not 1 <= count <= _MOST_MATRICES:
             raise BusError(f"the controller says it has {count} matrices: that cannot be")
@@ -217,13 +195,6 @@ class WeissDsaDriver(SerialAdapter[WeissDsaOptions]):
         if not all(found_one.cells for found_one in found) or sum(one.cells for one in found) > _MOST_CELLS:
             raise BusError(f"the controller says it has matrices of {found}: that cannot be")
         return tuple(found)
-
-    @classmethod
-    async def _ask(
-        cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int = _TRIES
-    ) -> bytes:
-        reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S, tries=tries)
-        return _ANSWERS.result(command, reply.payload, size)
 
 
 def _expanded(coded: bytes) -> bytes:

@@ -27,25 +27,20 @@ from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.layout import Byte, DeviceTime, Expand, Frame, Identifier, Layout, Values
-from skinware_drivers.link import Link, Match
-from skinware_drivers.notice import Notice
+from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
-from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.answers import Answers, Refused
-from skinware_drivers.serial.checksums import CRC16_WEISS
-from skinware_drivers.serial.framing import Field, Framing
-from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.answers import Refused
+from skinware_drivers.serial.framing import Framing
+from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
 _HEADER = 5
 _MOST_CELLS = 1024
-_MOST_PAYLOAD = _HEADER + 2 * _MOST_CELLS
-_TIMEOUT_S, _TRIES = 0.5, 3
 _RLE = 1
-_ANSWERS = Answers(
+_ANSWERS = weiss_answers(
     "sensor",
     {
         7: "a timeout",
@@ -54,7 +49,6 @@ _ANSWERS = Answers(
         16: "access is denied",
         27: "overrun: its line is too slow for its data",
     },
-    dtype="<u2",
 )
 
 
@@ -85,27 +79,15 @@ class WeissWtsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigurationError(f"option tare_payload: {self.tare_payload!r} is not hexadecimal") from None
 
 
-class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
+class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
     """One WTS on a serial line."""
 
-    framing: Framing = Packet(
-        sync=(0xAA, 0xAA, 0xAA),
-        length=Length(Field(4, 2), more=8),
-        maximum=8 + _MOST_PAYLOAD,
-        checksum=CRC16_WEISS,
-        identifier=Field(3),
-    )
+    packet = weiss_packet(_HEADER + 2 * _MOST_CELLS)
+    answers = _ANSWERS
+    timeout_s, tries = 0.5, 3
+    framing: Framing = packet
     layout: Layout
     dtype: npt.DTypeLike = np.uint16
-
-    def __init__(self, options: WeissWtsOptions) -> None:
-        super().__init__(options)
-        self._matrix: tuple[int, ...] = ()
-
-    @property
-    def payload_size(self) -> int:
-        """Of the largest matrix: which one it is, is known only when it was asked."""
-        return -(-_MOST_PAYLOAD // 8) * 8
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the sensor for its matrix; it may still be sending for somebody before us.
@@ -116,20 +98,20 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         if link.listen_only:
             raise BusError("a sensor reports its number of cells only on request: listening is not enough")
         await self.stop(link)
-        matrix = await self._ask_matrix(link)
+        matrix = await self._ask_cells(link)
         columns, rows, width, height, full_scale = matrix
         count = columns * rows
         if not 1 <= count <= _MOST_CELLS or not full_scale:
             raise BusError(f"the sensor says it has {columns} x {rows} cells up to {full_scale}: that cannot be")
         log.info("%s: %d x %d cells of %g x %g mm", link.bus_name, columns, rows, width / 100, height / 100)
         self.types = [SensorType("pressure", 1, "raw", minimum=0, maximum=full_scale)]
-        self.layout, self._matrix = self._layout(count), matrix
+        self.layout, self._cells = self._layout(count), matrix
         return [Patch("WTS", [Module([Sensor("pressure", cell) for cell in range(count)], kind=f"{rows}x{columns}")])]
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003
         """Its matrix, which it tells also while it sends."""
-        columns, rows, *_ = await cls._ask_matrix(link)
+        columns, rows, *_ = await cls._ask_cells(link)
         return f"WTS with {columns} x {rows} cells"
 
     async def start(self, link: Link) -> None:
@@ -142,13 +124,6 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
             await self._ask(link, _STOP)
         except Refused as error:
             log.debug("%s: %s", link.bus_name, error)
-
-    async def probe(self, link: Link, patch: Patch) -> bool:
-        """Whether it answers, and still is what it was: then it was reset, and does not send by itself any more."""
-        if await self._ask_matrix(link, tries=1) == self._matrix:
-            return True
-        self.tell(patch, Notice.CHANGED)
-        return False
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
@@ -178,16 +153,9 @@ class WeissWtsDriver(SerialAdapter[WeissWtsOptions]):
         return Layout([plain, Frame("runs", [Identifier(_DATA), Byte(4, _RLE, _RLE)], lengths, runs, time=time)])
 
     @classmethod
-    async def _ask_matrix(cls, link: Link, *, tries: int = _TRIES) -> tuple[int, ...]:
+    async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> tuple[int, ...]:
         """Columns, rows, width and height of a cell in 1/100 mm, greatest value."""
         return struct.unpack_from("<5H", await cls._ask(link, _MATRIX, size=10, tries=tries))
-
-    @classmethod
-    async def _ask(
-        cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int = _TRIES
-    ) -> bytes:
-        reply = await link.request(command, arguments, Match(command), timeout_s=_TIMEOUT_S, tries=tries)
-        return _ANSWERS.result(command, reply.payload, size)
 
 
 Numbers = npt.NDArray[np.int64]

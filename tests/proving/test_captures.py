@@ -56,6 +56,7 @@ THEN = decoding([0, 10, 20, 31], [[1, 2], [3, 4], [5, np.nan], [7, 8]])
         (decoding([0, 10, 15, 20, 31, 41], [[1, 2], [3, 4], [0, 0], [5, np.nan], [7, 8], [9, 9]]), (4, 4, 6)),
         (decoding([0, 10, 20, 31], [[1, 2], [3, 4], [5, 6], [7, 9]]), "at 0.0200 s, tip, taxel 1: nan then, 6 now"),
         (decoding([0, 20, 31], [[1, 2], [5, np.nan], [7, 8]]), "at 0.0100 s, tip, taxel 0: 3 then, no update now"),
+        (decoding([3, 12, 23, 34], [[1, 2], [3, 4], [5, np.nan], [7, 8]]), Comparison(4, 4, 4, None)),
         (decoding([100, 110], [[1, 2], [3, 4]]), "at 0.0000 s, tip, taxel 0: 1 then, no update now"),
         (decoding([0], [[1, 2]], [5, 6]), "at 0.0000 s, tip, taxel 0: 1 then, no update now"),
         ({**THEN, **decoding([7], [[1, 2]], [5, 6])}, "at 0.0070 s, tip, taxel 5: no update then, 1 now"),

@@ -61,7 +61,7 @@ def test_data_of_both_codings_become_matrices(options: dict[str, int]) -> None:
 
 def test_run_lengths_that_do_not_make_a_frame_are_not_shown() -> None:
     driver = WeissDsaDriver(WeissDsaOptions(rle_offset=5))
-    driver._matrices = (_Matrix(2, 1, 3.4, 3.4), _Matrix(1, 1, 3.4, 3.4))
+    driver._cells = (_Matrix(2, 1, 3.4, 3.4), _Matrix(1, 1, 3.4, 3.4))
     header = bytes.fromhex("0A000000 01")
     whole = header + struct.pack("<2H", 2 << 12 | 7, 1 << 12 | 0xFFF)
     assert list(driver._split(0, whole)) == [

@@ -54,7 +54,7 @@ def _icub() -> tuple[Framing, list[bytes]]:
 
 def _dsa() -> tuple[Framing, list[bytes]]:
     driver = WeissDsaDriver(WeissDsaOptions(rle_offset=5))
-    driver._matrices = (_Matrix(6, 14, 3.4, 3.4), _Matrix(6, 13, 3.4, 3.4))
+    driver._cells = (_Matrix(6, 14, 3.4, 3.4), _Matrix(6, 13, 3.4, 3.4))
     controller = Spoken(EmulatedWeissDsa(EmulatedWeissDsaOptions(fingers=1)))
     told = controller.answers(message(3, b"\x81\x1e\0"), 1000) + controller.answers(message(3, b"\x80\x1e\0"), 1000)
     return driver.split(), told

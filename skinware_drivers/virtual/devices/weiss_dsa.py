@@ -13,27 +13,17 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
+from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
 from skinware_drivers.virtual.emulator import Device, on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _OK, _WRONG = 0, 1
-
-
-def crc(data: bytes) -> int:
-    """Bit by bit: the polynomial of the CCITT, shifted the other way."""
-    state = 0xFFFF
-    for byte in data:
-        entry = ((state ^ byte) & 0xFF) << 8
-        for _ in range(8):
-            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
-        state = entry ^ state >> 8
-    return state
 
 
 def message(command: int, payload: bytes) -> bytes:
     """A message as it goes over the line: without payload it has no checksum."""
     said = struct.pack("<BH", command, len(payload)) + payload
-    return b"\xaa\xaa\xaa" + said + (struct.pack("<H", crc(said)) if payload else b"")
+    return BEGIN + said + (struct.pack("<H", crc(said)) if payload else b"")
 
 
 class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -55,14 +45,7 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         """Commands say how long they are."""
-
-        def size(part: bytes) -> int:
-            if len(part) < 6:
-                return 0
-            length = int.from_bytes(part[4:6], "little")
-            return 8 + length if length else 6
-
-        return cut_packets(heard, b"\xaa\xaa\xaa", size)
+        return cut_commands(heard, bare_when_empty=True)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
         """An error, and what was asked for."""

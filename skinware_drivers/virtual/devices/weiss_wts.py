@@ -13,28 +13,17 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
+from skinware_drivers.virtual.devices.weiss import BEGIN, crc, cut_commands
 from skinware_drivers.virtual.emulator import Device, on_a_grid
-from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
+from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
-_BEGIN = b"\xaa\xaa\xaa"
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
 _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
 
 
-def crc(data: bytes) -> int:
-    """As the sensor computes it, bit by bit."""
-    state = 0xFFFF
-    for byte in data:
-        entry = ((state ^ byte) & 0xFF) << 8
-        for _ in range(8):
-            entry = (entry << 1 ^ (0x1021 if entry & 0x8000 else 0)) & 0xFFFF
-        state = entry ^ state >> 8
-    return state
-
-
 def message(command: int, payload: bytes) -> bytes:
     """A message as it goes over the line."""
-    head = _BEGIN + struct.pack("<BH", command, len(payload)) + payload
+    head = BEGIN + struct.pack("<BH", command, len(payload)) + payload
     return head + struct.pack("<H", crc(head))
 
 
@@ -57,7 +46,7 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         """Commands say how long they are."""
-        return cut_packets(heard, _BEGIN, lambda part: 8 + int.from_bytes(part[4:6], "little") if len(part) >= 6 else 0)
+        return cut_commands(heard)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         """A status, and what was asked for."""

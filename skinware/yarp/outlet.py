@@ -271,8 +271,8 @@ class Outlet:
         if name not in self._ports:
             served = _Served(name, driver, self._names, self._wanted.host, self._loop)
             self._ports[name] = served
-            self._lives.append(asyncio.run_coroutine_threadsafe(served.live(), self._loop))
             self._tell({"event": "port", "port": name, "driver": driver})
+            self._lives.append(asyncio.run_coroutine_threadsafe(served.live(), self._loop))
         return self._ports[name]
 
     def _tell_trouble(self) -> None:

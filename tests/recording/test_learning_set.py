@@ -26,6 +26,7 @@ from skinware.conversion.learning import (
     convert_to_learning_set,
     dataset,
     export,
+    features,
     interval_of,
     join_of,
     read_intervals,
@@ -33,6 +34,7 @@ from skinware.conversion.learning import (
 )
 from skinware.conversion.learning.joined import matched
 from skinware.conversion.learning.statistics import Moments, Statistics
+from skinware.conversion.tables import Table
 from skinware.conversion.to_recording import write_recording
 from skinware.errors import BadRecording, ConfigurationError
 from tests.cli.fake_skin import fake_structure
@@ -529,6 +531,22 @@ def test_what_is_no_file_of_episodes(tmp_path: Path, text: str, words: str) -> N
 def test_what_is_no_learning_set(make: Callable[[], object], words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         make()
+
+
+def test_a_recording_that_changes_while_it_is_read(made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = features.Frames.__init__
+
+    def change(frames: features.Frames, table: Table, times_ns: npt.NDArray[np.int64], window: int) -> None:
+        written(frames, table, times_ns + 1, window)
+
+    monkeypatch.setattr(features.Frames, "__init__", change)
+    with pytest.raises(BadRecording, match="torso: the recording changed while it was read"):
+        learn(made)
+    assert list(made.path.parent.iterdir()) == [made.path]
+    monkeypatch.undo()
+    frames = features.Frames(made.tables[0], np.zeros(300, np.int64), 1)
+    with pytest.raises(BadRecording, match="torso: the recording changed while it was read"):
+        frames.take(np.array([250]))
 
 
 def test_features_of_one_name(made: Made, tmp_path: Path) -> None:

@@ -8,8 +8,10 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.conversion._packages import pyarrow
 from skinware.conversion.converting import Converted, Watched, begun_beside, new_target, opened
@@ -27,9 +29,10 @@ from skinware.conversion.learning.joined import Joined
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
 from skinware.conversion.learning.wanted import Interval, LearningSet
 from skinware.conversion.selection import Selection
-from skinware.conversion.tables import Source, sensor_table
+from skinware.conversion.tables import Source, Table, sensor_table
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
+from skinware.structure import Structure
 
 LEARNING_FORMATS = {"lerobot": "-lerobot"}
 """Suffix of the folders of each format."""
@@ -69,72 +72,106 @@ def convert_to_learning_set(
     pyarrow()
     target = new_target(paths[0], target, LEARNING_FORMATS["lerobot"])
     joined = [Joined(join) for join in wanted.joins]
-    with contextlib.ExitStack() as stack:
-        sources: list[Source] = []
-        for path in paths:
-            whole = stack.enter_context(contextlib.closing(opened(path, start_s, end_s)))
-            sources.append(Watched((selection or Selection()).of(whole), is_stopped))
-        notes: list[str] = []
-        sets = _sets(sources, wanted, joined, notes)
-        frames: Counter[str] = Counter()
+
+    def open_one(path: Path) -> Source:
+        whole = opened(path, start_s, end_s)
+        try:
+            return Watched((selection or Selection()).of(whole), is_stopped)
+        except BaseException:
+            whole.close()
+            raise
+
+    notes: list[str] = []
+    frames: Counter[str] = Counter()
+    with contextlib.closing(_Recordings(paths, open_one)) as recordings:
+        sets = _sets(recordings, wanted, joined, notes)
         with begun_beside(target) as begun:
             for number, episodes in enumerate(sets, 1):
                 folder = begun / str(number) if wanted.each_structure else begun
-                _Set(sources, wanted, joined, episodes).write(folder)
+                _Set(recordings, wanted, joined, episodes).write(folder)
                 for episode in episodes:
                     frames.update(dict.fromkeys(episode.frames, len(episode)))
-        notes = [*(problem for source in sources for problem in source.problems), *notes]
-        return Converted(target, frames, notes, sum(map(len, sets)))
+    return Converted(target, frames, notes, sum(map(len, sets)))
+
+
+class _Recordings:
+    """Recordings, of which one is open at a time: what a large skin is made of takes 20 MB in each.
+
+    Args:
+        paths: of them.
+        open_one: opens one.
+    """
+
+    def __init__(self, paths: Sequence[Path], open_one: Callable[[Path], Source]) -> None:
+        self.paths, self._open_one = paths, open_one
+        self._opened: tuple[int, Source] | None = None
+
+    def source(self, number: int) -> Source:
+        """One of them, by its number, until another is asked for."""
+        if self._opened is None or self._opened[0] != number:
+            self.close()
+            self._opened = number, self._open_one(self.paths[number])
+        return self._opened[1]
+
+    def table(self, number: int, name: str) -> Table:
+        """A table of one of them, likewise."""
+        (found,) = (table for table in self.source(number).tables if table.name == name)
+        return found
+
+    def close(self) -> None:
+        """Close the one that is open. Idempotent."""
+        if self._opened is not None:
+            (_, source), self._opened = self._opened, None
+            source.close()
 
 
 def _sets(
-    sources: Sequence[Source], wanted: LearningSet, joined: Sequence[Joined], notes: list[str]
+    recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], notes: list[str]
 ) -> list[list[Episode]]:
     """The episodes of each dataset: those whose drivers have the same structures."""
-    asked = _intervals(sources, wanted)
+    asked = _intervals(recordings.paths, wanted)
     sets: list[list[Episode]] = []
+    structures: list[Structure] = []
     drivers: frozenset[str] | None = None
-    for number, source in enumerate(sources):
+    for number, path in enumerate(recordings.paths):
         if wanted.intervals and not asked[number]:
-            notes.append(f"{source.path}: no episode is in it")
+            notes.append(f"{path}: no episode is in it")
             continue
-        times = [(each, each.times_ns(source, is_only=len(sources) == 1)) for each in joined]
-        planner = Planner(number, source, wanted, times)
+        source = recordings.source(number)
+        times = [(each, each.times_ns(source, is_only=len(recordings.paths) == 1)) for each in joined]
+        planner = Planner(number, source, wanted, times, structures)
         if drivers not in (None, planner.drivers):
             there_are = ", ".join(sorted(planner.drivers))
             raise ConfigurationError(f"{source.path}: other drivers than the first recording ({there_are}): name some")
         drivers = planner.drivers
-        for episode in planner.episodes(asked[number], wanted.task or source.path.stem):
+        for episode in planner.episodes(asked[number], wanted.task or path.stem):
             for others in sets:
                 if others[0].piece.structures == episode.piece.structures:
                     others.append(episode)
                     break
             else:
                 sets.append([episode])
-        notes += planner.notes
+        if len(sets) > 1 and not wanted.each_structure:
+            when_s = (int(sets[1][0].times_ns[0]) - source.start_ns) / NS_PER_S
+            raise ConfigurationError(
+                f"{path}: a driver has another structure from {when_s:.3f} s on than before: --each-structure"
+            )
+        notes += [*source.problems, *planner.notes]
         left_out = sorted({table.service for table in source.tables if table.structure is None})
         notes += [f"{source.path}: {name} is left out: it has no sensors" for name in left_out]
-    if len(sets) > 1 and not wanted.each_structure:
-        first = sources[sets[1][0].recording]
-        when_s = (int(sets[1][0].times_ns[0]) - first.start_ns) / NS_PER_S
-        raise ConfigurationError(
-            f"{first.path}: a driver has another structure from {when_s:.3f} s on than before: --each-structure"
-        )
     return sets
 
 
-def _intervals(sources: Sequence[Source], wanted: LearningSet) -> list[list[Interval]]:
+def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval]]:
     """The intervals that are asked for of each recording."""
-    asked: list[list[Interval]] = [[] for _ in sources]
+    asked: list[list[Interval]] = [[] for _ in paths]
     for interval in wanted.intervals:
-        if not interval.file and len(sources) > 1:
+        if not interval.file and len(paths) > 1:
             raise ConfigurationError(
                 f"the episode {interval} does not tell of which recording: give them in a CSV file with the column file"
             )
         found = [
-            number
-            for number, source in enumerate(sources)
-            if not interval.file or interval.file in (str(source.path), source.path.name)
+            number for number, path in enumerate(paths) if not interval.file or interval.file in (str(path), path.name)
         ]
         if len(found) != 1:
             raise ConfigurationError(
@@ -148,28 +185,26 @@ class _Set:
     """A dataset that is written.
 
     Args:
-        sources: the recordings.
+        recordings: of which the episodes are.
         wanted: how it is made.
         joined: what is joined.
         episodes: of it, by recording and time.
     """
 
     def __init__(
-        self, sources: Sequence[Source], wanted: LearningSet, joined: Sequence[Joined], episodes: Sequence[Episode]
+        self, recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], episodes: Sequence[Episode]
     ) -> None:
-        self._sources, self._wanted, self._episodes = sources, wanted, episodes
-        self._tables = {name: episodes[0].piece.tables[name] for name in sorted(episodes[0].piece.tables)}
+        self._recordings, self._wanted, self._episodes = recordings, wanted, episodes
+        first = episodes[0]
+        self._tables = {name: first.piece.tables[name] for name in sorted(first.piece.tables)}
         self._windows = {name: self._window(name) for name in self._tables}
-        self._skins = {
-            name: SkinFeatures(
-                name,
-                timed.structure,
-                timed.table.sensor_names,
-                self._windows[name],
-                timed.table.origin.period_ns,
-            )
-            for name, timed in self._tables.items()
-        }
+        self._skins: dict[str, SkinFeatures] = {}
+        self._sensors: dict[str, dict[str, npt.NDArray[Any]]] = {}
+        for name, timed in self._tables.items():
+            table = recordings.table(first.recording, timed.name)
+            names, window = table.sensor_names, self._windows[name]
+            self._skins[name] = SkinFeatures(name, timed.structure, names, window, timed.period_ns)
+            self._sensors[name] = sensor_table(table)
         self._joined = [JoinedFeature(each) for each in joined]
         self._features: dict[str, Feature] = {}
         for described in (*(skin.descriptions for skin in self._skins.values()), self._joined_descriptions()):
@@ -185,7 +220,7 @@ class _Set:
             readers: dict[TimedTable, Frames] = {}
             for episode in self._episodes:
                 readers = {
-                    timed: readers.get(timed) or Frames(timed.table, self._windows[name])
+                    timed: readers.get(timed) or self._frames(episode, timed, self._windows[name])
                     for name, timed in episode.piece.tables.items()
                 }
                 writer.add_episode(episode.task, len(episode), self._batches(episode, readers))
@@ -193,6 +228,9 @@ class _Set:
         finally:
             writer.close()
         self._write_beside(folder / "meta" / "skin")
+
+    def _frames(self, episode: Episode, timed: TimedTable, window: int) -> Frames:
+        return Frames(self._recordings.table(episode.recording, timed.name), timed.told_ns, window)
 
     def _window(self, name: str) -> int:
         """Of how many frames of a driver rows have the values."""
@@ -225,11 +263,10 @@ class _Set:
         """What LeRobot does not know: where sensors are, and when each episode was."""
         arrow = pyarrow()
         folder.mkdir()
-        for name, timed in self._tables.items():
-            path = folder / f"{name.replace('/', '_')}.sensors.parquet"
-            arrow.parquet.write_table(arrow.table(sensor_table(timed.table)), path)
+        for name, sensors in self._sensors.items():
+            arrow.parquet.write_table(arrow.table(sensors), folder / f"{name.replace('/', '_')}.sensors.parquet")
         told = [
-            {"episode": number, "file": self._sources[each.recording].path.name, "start_ns": int(each.times_ns[0])}
+            {"episode": number, "file": self._recordings.paths[each.recording].name, "start_ns": int(each.times_ns[0])}
             for number, each in enumerate(self._episodes)
         ]
         (folder / "episodes.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from skinware.conversion._packages import pillow
 from skinware.conversion.learning.joined import Joined
 from skinware.conversion.tables import COLUMNS, TIME, Block, Table
-from skinware.errors import ConfigurationError
+from skinware.errors import BadRecording, ConfigurationError
 from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
@@ -127,12 +127,13 @@ class Frames:
 
     Args:
         table: of the driver.
+        times_ns: (f,) of all of its frames, as they were before.
         window: how many frames before the last one may be asked for again.
     """
 
-    def __init__(self, table: Table, window: int) -> None:
+    def __init__(self, table: Table, times_ns: npt.NDArray[np.int64], window: int) -> None:
+        self._name, self._times_ns, self._window = table.name, times_ns, window
         self._blocks = table.blocks((*_NEEDED, *_MORE))
-        self._window = window
         self._kept: list[tuple[int, Block]] = []
         self._next = 0
 
@@ -143,7 +144,8 @@ class Frames:
             numbers: ascending; at most a window before the last that was taken before.
 
         Raises:
-            BadRecording, OSError: they cannot be read.
+            BadRecording: they cannot be read, or are others than before.
+            OSError: they cannot be read.
         """
         needed = int(numbers[-1]) - self._window + 1
         parts: list[Block] = []
@@ -156,15 +158,23 @@ class Frames:
             if end > needed:
                 kept.append((first, block))
         self._kept = kept
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        taken = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        if not np.array_equal(taken[TIME], self._times_ns[numbers]):
+            raise self._changed()
+        return taken
 
     def _until(self, last: int) -> Iterator[tuple[int, Block]]:
         """The blocks that are kept, and those that come, up to the one with a frame."""
         yield from self._kept
         while self._next <= last:
-            block = next(self._blocks)
+            block = next(self._blocks, None)
+            if block is None:
+                raise self._changed()
             first, self._next = self._next, self._next + len(block[TIME])
             yield first, block
+
+    def _changed(self) -> BadRecording:
+        return BadRecording(f"{self._name}: the recording changed while it was read")
 
 
 class JoinedFeature:

@@ -27,38 +27,36 @@ Times = npt.NDArray[np.int64]
 
 
 class TimedTable:
-    """The frames of a driver for as long as its structure stayed the same.
+    """When the frames of a driver were, for as long as its structure stayed the same.
 
     Args:
         table: of a driver.
+        structure: of it.
 
     Attributes:
-        table: as given.
-        times_ns: (f,) when each of its frames was published, wall clock.
+        name: of the table.
+        structure: as given.
+        period_ns: the driver's nominal period, 0 if it has none.
+        told_ns: (f,) when each of its frames was published, wall clock, as recorded.
+        times_ns: (f,) the same, never going back.
 
     Raises:
         BadRecording: the wall clock was set back between two frames.
     """
 
-    def __init__(self, table: Table) -> None:
-        self.table = table
-        told_ns = np.concatenate([np.zeros(0, np.int64), *(block[TIME] for block in table.blocks([TIME]))])
-        self.times_ns: Times = np.maximum.accumulate(told_ns)
-        if (self.times_ns - told_ns > _CLOCK_ERROR_NS).any():
+    def __init__(self, table: Table, structure: Structure) -> None:
+        self.name, self.structure, self.period_ns = table.name, structure, table.origin.period_ns
+        blocks = [np.zeros(0, np.int64), *(block[TIME] for block in table.blocks([TIME]))]
+        self.told_ns: Times = np.concatenate(blocks)
+        self.times_ns: Times = np.maximum.accumulate(self.told_ns)
+        if (self.times_ns - self.told_ns > _CLOCK_ERROR_NS).any():
             raise BadRecording(f"{table.name}: the clock was set back while it was recorded: choose a part by its time")
-
-    @property
-    def structure(self) -> Structure:
-        """Of the driver."""
-        structure = self.table.structure
-        assert structure is not None  # noqa: S101, of a driver
-        return structure
 
     @property
     def rate_hz(self) -> float:
         """Frames a second, as the driver says, or else as they came; 0: there are not two."""
-        if self.table.origin.period_ns:
-            return NS_PER_S / self.table.origin.period_ns
+        if self.period_ns:
+            return NS_PER_S / self.period_ns
         periods = np.diff(self.times_ns)
         return NS_PER_S / max(float(np.median(periods)), 1.0) if len(periods) else 0.0
 
@@ -125,6 +123,7 @@ class Planner:
         source: it, with the drivers that are wanted.
         wanted: how the set is made.
         joined: with the times of each, wall clock.
+        structures: of recordings before; those of this one are added. Equal ones are kept once: they can be large.
 
     Attributes:
         notes: what was left out; a line each.
@@ -135,15 +134,23 @@ class Planner:
     """
 
     def __init__(
-        self, number: int, source: Source, wanted: LearningSet, joined: Sequence[tuple[Joined, Times]]
+        self,
+        number: int,
+        source: Source,
+        wanted: LearningSet,
+        joined: Sequence[tuple[Joined, Times]],
+        structures: list[Structure],
     ) -> None:
         self._number, self._path, self._start_ns = number, source.path, source.start_ns
         self._wanted, self._joined = wanted, joined
         self._drivers: dict[str, list[TimedTable]] = {}
         for table in source.tables:
             if table.structure is not None:
-                timed = TimedTable(table)
+                structure = next((each for each in structures if each == table.structure), table.structure)
+                timed = TimedTable(table, structure)
                 if len(timed.times_ns):
+                    if structure is table.structure:
+                        structures.append(structure)
                     self._drivers.setdefault(table.service, []).append(timed)
         if not self._drivers:
             raise ConfigurationError(f"{self._path}: no frames of a driver are in it: nothing to learn from")

@@ -322,12 +322,12 @@ def test_operations_are_those_of_the_whole_driver(net: Net, namespace: Namespace
 
         def work() -> None:
             while not ended.is_set():
+                publish(writer)
                 writer._service.answer_requests(0.01)
 
         thread = threading.Thread(target=work)
         thread.start()
         try:
-            until_here(ends, writer)
             with DriverReader("hand", namespace=ends.here, timeout_s=PATIENCE_S) as reader:
                 assert reader.operations()["tare"] == "Take the present load as none."
                 assert reader.call("tare", patch="thumb", timeout_s=PATIENCE_S) == "thumb tared"

@@ -15,7 +15,7 @@ import click
 import numpy as np
 import pytest
 
-from skinware import DriverReader, Frame, Namespace, ServiceReader, ServiceWriter
+from skinware import DriverReader, Frame, Namespace, PatchState, ServiceReader, ServiceWriter
 from skinware.bridge_state import BridgeState, BridgeStateWriter
 from skinware.cli._command import exit_status
 from skinware.cli.calibrate import command as calibrate
@@ -46,7 +46,7 @@ from tests.cli.test_calibrate import calm_skin, finger_presses, stroked_state, s
 from tests.cli.test_contacts import touched_skin
 from tests.cli.test_regions import BLOCK, idle, painting, placed_structure, pressed
 from tests.cli.test_sensor_health import looked_after
-from tests.commands import running
+from tests.commands import run, running
 from tests.finding.fakes import see_only
 from tests.icub.conftest import WRAPPER, device
 from tests.icub.test_positions import TRIANGLE, positions
@@ -341,6 +341,26 @@ def test_bridge(namespace: Namespace) -> None:
         shutil.rmtree(Namespace(here).path, ignore_errors=True)
 
 
+def test_many_robots() -> None:
+    at = f"tcp/127.0.0.1:{free_port()}"
+    routing = ("skin-bridge", "route", "--listen", at, "--connect", "tcp/127.0.0.1:9")
+    watching = ("skin-bridge", "list", "--connect", at, "--watch")
+    skin = FakeSkin("torso")
+    skin.patch_state[1] = PatchState.STALE
+    with running(*watching) as nobody:
+        alone = nobody.wait_for("status", lambda status: bool(status["problems"]))
+    with running(*routing) as router, publishing(skin), running(*watching) as listing:
+        ready = router.wait_for("ready")
+        with running("skin-bridge", "serve", "--robot", "r", "--connect", at):
+            seen = [listing.wait_for("ready"), listing.wait_for("status", _is_known)]
+            check("`skin-bridge route`", ready, router.wait_for("status", lambda status: bool(status["robots"])))
+    check("`skin-bridge list`", alone, *seen)
+
+
+def _is_known(status: dict[str, Any]) -> bool:
+    return any(robot["clock"] and robot.get("drivers") for robot in status["robots"])
+
+
 def test_ros2(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
     own_domain(namespace, monkeypatch)
     with publishing(FakeSkin("torso")), running("skin-bridge", "ros2") as bridge:
@@ -417,8 +437,13 @@ def test_a_capture_and_a_proof(tmp_path: Path) -> None:
         with running("skin-prove", "xela", *options) as prove:
             step = prove.wait_for("step")
             done = prove.wait_for("done")
-        check("`skin-prove`", step, done)
         check("`captured`", driver.stop())
+    same, other = _compared(f"{tmp_path}/it.mcap"), _compared(f"{tmp_path}/it.mcap", "--", "--rows", "2")
+    check("`skin-prove`", step, done, same, other)
+
+
+def _compared(file: str, *options: str) -> Any:
+    return json.loads(run("skin-prove", "--captured", file, "--json", *options).stdout)
 
 
 def test_an_emulation() -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader, Namespace
+from skinware_drivers.testing.waiting import wait_until
 from tests.commands import BIN, refused, run, running
 
 VIRTUAL = ("--bus", "virtual?boards=7,8")
@@ -85,7 +86,7 @@ def test_skin_dump_and_skin_info_keep_their_contracts() -> None:
         assert len(json.loads(physical.stdout)["values"]) == 320
         assert "board 7" in run("skin-info").stdout
         assert "torso #" in run("skin-dump", "-n", "1").stdout
-        assert "fresh 384" in run("skin-top", "--plain", "-T", "1").stdout
+        wait_until(lambda: "fresh 384" in run("skin-top", "--plain", "-T", "1").stdout)
 
 
 def test_a_killed_driver_is_shown_as_dead_and_its_readers_live_on() -> None:

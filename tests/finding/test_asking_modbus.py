@@ -11,6 +11,7 @@ from skinware import Namespace
 from skinware_drivers.cli.find import look
 from skinware_drivers.finding.guess import known_drivers
 from skinware_drivers.finding.looking import can_ask
+from skinware_drivers.testing.waiting import wait_until
 from tests.finding.fakes import see_only
 from tests.modbus.peers import Action, device, rtu_server, tcp_server
 
@@ -60,7 +61,7 @@ def test_nobody_is_asked_without_a_word() -> None:
 def test_who_has_the_registers_answers_and_nothing_is_written(over: Any) -> None:
     functions: list[int] = []
     with over(device(1, 3000, HAND, noting(functions))) as bus:
-        assert found_on(bus, probe=True)["probe"].answers == {"inspire": ANSWER}
+        wait_until(lambda: found_on(bus, probe=True)["probe"].answers == {"inspire": ANSWER})  # it waits for 0.1 s only
     assert set(functions) == {3}
 
 

@@ -456,6 +456,8 @@ def leaks_in_process(options: argparse.Namespace) -> bool:
                         raise SystemExit("it did not come back")
             while ends.joiner.is_connected:
                 time.sleep(0.001)
+            net.answered.clear()  # what the network of tests remembers
+            ends.events.clear()
         gc.collect()
         now, left = Belonging.of(os.getpid(), there, here), belongings.left_since()
     print(f"  {options.reconnects // 3}: {begun}; {options.reconnects}: {now}; left: {', '.join(left) or 'nothing'}")

@@ -81,8 +81,8 @@ class Fingers(ModbusAdapter[NoOptions]):
 class _End(ModbusBus):
     """A bus at the end of a pair of sockets, whatever its name says."""
 
-    def __init__(self, channel: str) -> None:
-        super().__init__(channel, payload_size=Fingers(NoOptions()).payload_size)
+    def __init__(self, channel: str, clock: HandClock) -> None:
+        super().__init__(channel, payload_size=Fingers(NoOptions()).payload_size, make_timer=clock.timer)
         self.far, self.near = socket.socketpair()
         self.far.setblocking(False)
 
@@ -109,8 +109,8 @@ class _InPython:
 
     in_c = 0
 
-    def __init__(self, channel: str, stack: ExitStack) -> None:
-        self.bus = _End(channel)
+    def __init__(self, channel: str, clock: HandClock, stack: ExitStack) -> None:
+        self.bus = _End(channel, clock)
         stack.callback(_close, self.bus)
         self._batch = FrameBatch(64, self.bus.payload_size)
         Fingers(NoOptions()).fit(self.bus)
@@ -125,8 +125,8 @@ class _InPython:
 class _InC(_InPython):
     """One for which C asks, and Python where it has to."""
 
-    def __init__(self, channel: str, stack: ExitStack) -> None:
-        self.bus = _End(channel)
+    def __init__(self, channel: str, clock: HandClock, stack: ExitStack) -> None:
+        self.bus = _End(channel, clock)
         stack.callback(_close, self.bus)
         epoll = stack.enter_context(select.epoll())
         self._loop_fd = os.eventfd(1)  # Python always has something to do: C takes once, and comes back
@@ -183,7 +183,7 @@ def run(clock: HandClock, data: bytes) -> Outcome:
     over_tcp = script.number(2) == 1
     channel = "tcp://127.0.0.1:1" if over_tcp else "/dev/line"
     with ExitStack() as stack:
-        return _Fuzz(clock, script, [way(channel, stack) for way in (_InPython, _InC)], over_tcp=over_tcp).run()
+        return _Fuzz(clock, script, [way(channel, clock, stack) for way in (_InPython, _InC)], over_tcp=over_tcp).run()
 
 
 class _Fuzz:
@@ -201,7 +201,7 @@ class _Fuzz:
     def run(self) -> Outcome:
         is_modbus = True
         while is_modbus and not self._script.is_over:
-            self._clock.now_ns += (0, 0, 0, 1, 5, 30, 60, 300)[self._script.number(8)] * _MS
+            self._clock.pass_to(self._clock.now_ns + (0, 0, 0, 1, 5, 30, 60, 300)[self._script.number(8)] * _MS)
             is_modbus = self._take()
             if is_modbus and (said := self._say()):
                 self._heard += len(said)

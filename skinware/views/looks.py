@@ -180,7 +180,7 @@ class Look:
             return None, 0.0
         values = driver.all_physical()
         from_rest = np.where(quantity.shear >= 0, (values - watched.rest.baseline)[quantity.shear], np.float32(0))
-        lengths = np.nan_to_num(np.linalg.norm(from_rest, axis=1))
+        lengths = np.nan_to_num(np.linalg.norm(from_rest, axis=1)).astype(np.float32, copy=False)
         noise = max(map(watched.rest.noise, quantity.axes))
         longest = watched.spans.setdefault((quantity.name, "shear"), ChangeSpan()).follow(
             lengths, noise, driver.frame.published_ns

@@ -224,7 +224,7 @@ class Viewer:
             pose = self._follower.scene.pose(contact.frame)
             position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
             if not np.isfinite(position).all():  # without places: in the middle of where its taxels are laid out
-                position = laid_out[contact.taxels].mean(axis=0)
+                position = laid_out[contact.taxels].mean(axis=0, dtype=np.float64)
             told.append(
                 {
                     "id": contact.id,

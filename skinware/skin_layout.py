@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import texts
+from skinware._matrices import Matrices
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.structure import Index, Structure
@@ -133,6 +134,27 @@ class SkinLayout:
         row = int(self._rows(type_name)[position]) - first
         module = self.modules[self.module_of(type_name)[position]]
         return _names.joined(module, self.structures[driver].name_in_module(row))
+
+    def matrices(self, type_name: str) -> Matrices:
+        """Where the sensors of a type are in modules that are matrices: indices for arrays in the same order.
+
+        ``snapshot.physical("pressure")[layout.matrices("pressure")["index tip"]]`` is (rows, columns).
+
+        Returns:
+            By names of modules, (rows, columns) int64.
+
+        Raises:
+            StructureError: no driver has such sensors.
+        """
+        module_of = self.module_of(type_name)
+        if type_name not in self._matrices:
+            kinds = [kind for structure in self.structures for kind in texts(structure.module_kind)]
+            self._matrices[type_name] = Matrices(type_name, self.modules, kinds, module_of)
+        return self._matrices[type_name]
+
+    @cached_property
+    def _matrices(self) -> dict[str, Matrices]:
+        return {}
 
     def geometry(self, type_name: str) -> Geometry:
         """Where every sensor of a type is, in the same order; not known where its driver does not tell.

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
+from skinware._matrices import Matrices
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
@@ -279,6 +280,24 @@ class Structure:
     def patch_of(self, type_name: str) -> npt.NDArray[np.int64]:
         """(n,) int64, index of the patch of each sensor of a type, likewise."""
         return self.module_patch[self.module_of(type_name)].astype(np.int64)
+
+    def matrices(self, type_name: str) -> Matrices:
+        """Where the sensors of a type are in modules that are matrices: indices for arrays in the order of ``index``.
+
+        Returns:
+            By names of modules, (rows, columns) int64.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        module_of = self.module_of(type_name)
+        if type_name not in self._matrices:
+            self._matrices[type_name] = Matrices(type_name, self.module_names, texts(self.module_kind), module_of)
+        return self._matrices[type_name]
+
+    @cached_property
+    def _matrices(self) -> dict[str, Matrices]:
+        return {}
 
     def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Physical values of all sensors of a type.

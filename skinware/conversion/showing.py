@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Schema
 
+from skinware._matrices import rows_and_columns
 from skinware._names import distinct
 from skinware.conversion import definitions
 from skinware.conversion.cdr import Cdr
@@ -30,7 +31,6 @@ _FIELDS = (
     ("status", _UINT8),
 )
 _POINT = np.dtype([(name, "<f4" if kind == _FLOAT32 else "u1") for name, kind in _FIELDS])
-_GRID = re.compile(r"[1-9]\d*x[1-9]\d*")
 _NOT_IN_TOPICS = re.compile(r"[^A-Za-z0-9_]")
 
 
@@ -236,7 +236,7 @@ def _images(name: str, structure: Structure, *, only_grids: bool) -> Iterator[_I
         for patch, patch_name in enumerate(patches):
             of_patch = np.flatnonzero(structure.module_patch[modules] == patch)
             numbers = list(dict.fromkeys(modules[of_patch].tolist()))
-            is_grid = all(_GRID.fullmatch(kinds[module]) for module in numbers)
+            is_grid = all(rows_and_columns(kinds[module]) for module in numbers)
             if numbers and (is_grid or not only_grids):
                 rows = [of_patch[modules[of_patch] == module] for module in numbers]
                 pixels = _side_by_side([_pixels(kinds[m], each) for m, each in zip(numbers, rows, strict=True)])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from functools import cache
+
+from skinware._matrices import rows_and_columns
 
 Cell = tuple[int, int]
 """Row, and column in halves of a sensor: rows of a triangle are shifted by half a sensor."""
@@ -19,7 +20,6 @@ _FINGERTIP = ((3, 2), (3, 4), (3, 6), (3, 8), (3, 0), (2, 6), (2, 4), (2, 2), (1
 """The twelve taxels of a ROBOSKIN fingertip, unrolled, its tip above; after the map that its maker publishes."""
 
 _BY_KIND = {("triangle", 10): _TRIANGLE, ("fingertip", 12): _FINGERTIP}
-_GRID = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ def shape_of(kind: str, count: int) -> Shape:
     known = _BY_KIND.get((kind, count))
     if known is not None:
         return Shape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
-    grid = _GRID.fullmatch(kind)
-    if grid is not None and int(grid[1]) * int(grid[2]) == count:
-        return rows_of(count, int(grid[2]))
+    grid = rows_and_columns(kind)
+    if grid is not None and grid[0] * grid[1] == count:
+        return rows_of(count, grid[1])
     return rows_of(count, block_columns(count))
 
 

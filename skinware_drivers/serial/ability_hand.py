@@ -106,7 +106,8 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
             [Frame("finger", [finger], [_FINGER_BYTES], values, module=Bits(0, 3), flags=flags)]
         )
         modules = [
-            Module(taxels(_N, kind.name, first_uid=_N * key), key, "3x2", name) for key, name in enumerate(_FINGERS)
+            Module(taxels(_N, kind.name, first_uid=_N * key), key, "6 points", name)
+            for key, name in enumerate(_FINGERS)
         ]
         self.patches: Sequence[Patch] = (Patch(f"{options.side} hand", modules),)
         self.geometry: Geometry | None = _places(Hand(options.side), kind.name)

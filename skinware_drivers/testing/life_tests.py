@@ -8,8 +8,12 @@ import tracemalloc
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from skinware.errors import BusError, ConfigurationError, StructureError
+from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
+from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.layout_check import check_layout
@@ -24,6 +28,21 @@ _ABSENT_S = 1.5
 _LISTEN_S = 2.0
 _MANY_BURSTS = 200
 _MOST_GROWN = 1.5
+
+
+def _check_matrices(structure: Structure, geometry: Geometry) -> None:
+    """Taxels of matrices lie as their rows and columns say: each step along one is a step forwards."""
+    for sensor_type in structure.types:
+        places = geometry.of(structure, sensor_type.name).position_m
+        for name, taxels in structure.matrices(sensor_type.name).items():
+            for axis, along in enumerate(("column", "row")):
+                steps = np.diff(places[taxels], axis=axis).reshape(-1, 3)
+                require(
+                    not len(steps) or not (steps @ steps.mean(axis=0) <= 0).any(),
+                    f"module {name!r} is called a matrix ({taxels.shape[0]}x{taxels.shape[1]}), but by `geometry` its"
+                    f" {sensor_type.name} sensors go to and fro along a {along}: its sensors are row by row; is their"
+                    " order or the kind another?",
+                )
 
 
 class LifeTests(Suite):
@@ -66,6 +85,8 @@ class LifeTests(Suite):
             check_layout(adapter.layout, patches, tables, adapter.period_s)
         except (StructureError, ConfigurationError) as error:
             return defect(f"the description is not valid: {error}")
+        if adapter.geometry is not None:
+            _check_matrices(tables.structure, adapter.geometry)
         return tables
 
     def test_handshakes_in_any_order(self) -> None:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.hand import Grid
 from skinware_drivers.layout import Bits, Byte, Cycle, Expand, Frame, Identifier, Layout, SequenceNumber, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.options import NoOptions
@@ -246,6 +247,15 @@ class MissingModule(Fingertips):
 
 class SameUids(Fingertips):
     patches = tuple(Patch(f"finger {node}", [Module(taxels(6))], key=node) for node in NODES)
+
+
+class NoMatrix(Fingertips):
+    """Its places are three rows of two."""
+
+    patches = tuple(
+        Patch(f"finger {node}", [Module(taxels(6, first_uid=node << 8), kind="2x3")], key=node) for node in NODES
+    )
+    geometry = Grid(3, 2).at((0.0, 0.0, 0.0), ["pressure"], [NODES[0] << 8 | taxel for taxel in range(6)])
 
 
 class ChangesItsMind(Fingertips):

@@ -75,6 +75,12 @@ DEFECTS: list[tuple[type[AnyAdapter], str, tuple[str, ...], str]] = [
     ),
     (f.SameUids, "test_the_description_is_valid_complete_and_stable", (), r"the description is not valid: .*uid"),
     (
+        f.NoMatrix,
+        "test_the_description_is_valid_complete_and_stable",
+        (),
+        r"'finger 1' is called a matrix \(2x3\), but by `geometry` its pressure sensors go to and fro along a row",
+    ),
+    (
         f.ChangesItsMind,
         "test_the_description_is_valid_complete_and_stable",
         (),

@@ -102,11 +102,11 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
 
     def _told(self, device: Device, asked: _Asked) -> bytes:
         address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
-        sample: dict[int, int] = {**self.beside(device), **device.memory.get(_SAMPLE, {})}
+        known: dict[int, int] = {**self.beside(device), **device.memory.get(_SAMPLE, {})}
         wanted = range(address, address + count * self.step, self.step)
-        if not all(one in sample for one in wanted):
+        if not all(one in known for one in wanted):
             return _reply(asked, bytes([asked.message[0] | 0x80, _NO_SUCH_REGISTERS]))
-        data = b"".join(sample[one].to_bytes(2, "big") for one in wanted)
+        data = b"".join(known[one].to_bytes(2, "big") for one in wanted)
         return _reply(asked, bytes([asked.message[0], len(data)]) + data)
 
     def _write(self, device: Device, asked: _Asked, address: int) -> bytes:

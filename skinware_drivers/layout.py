@@ -87,6 +87,7 @@ class Flag:
         dtype: unsigned numpy dtype with byte order (``">u2"``).
         mask: any of these bits set the status of the whole module. 0: none does.
         each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
+        normal: the word when nothing is to be told: bits count as set where they differ from it.
     """
 
     status: Status
@@ -94,6 +95,7 @@ class Flag:
     dtype: str
     mask: int = 0
     each: Sequence[tuple[int, int]] = ()
+    normal: int = 0
 
 
 @dataclass(frozen=True)
@@ -342,7 +344,9 @@ def _check_frame(frame: Frame) -> None:
         raise refuse(frame.sequence.wrong(min(frame.length)))
     for flag in frame.flags:
         if isinstance(flag, Flag) and not _has_bits(flag):
-            raise refuse(f"a flag's `mask` and `each` are bits of an unsigned word, not of {flag.dtype!r}: {flag}")
+            raise refuse(
+                f"a flag's `mask`, `each` and `normal` are bits of an unsigned word, not of {flag.dtype!r}: {flag}"
+            )
     if frame.time is not None and frame.time.end > min(frame.length):
         raise refuse("the device's time is not in every right payload")
 
@@ -351,7 +355,12 @@ def _has_bits(flag: Flag) -> bool:
     """Whether the word of a flag is unsigned, and has all the bits that are meant."""
     word = np.dtype(flag.dtype)
     bits = 8 * word.itemsize
-    return word.kind == "u" and 0 <= flag.mask < 1 << bits and all(0 <= shift < bits for _, shift in flag.each)
+    words = flag.mask, flag.normal
+    return (
+        word.kind == "u"
+        and all(0 <= one < 1 << bits for one in words)
+        and all(0 <= shift < bits for _, shift in flag.each)
+    )
 
 
 def _check_counters(cycle: Cycle, members: Sequence[Frame]) -> None:

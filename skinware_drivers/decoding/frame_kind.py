@@ -135,7 +135,7 @@ class FrameKind:
             columns: where this frame's values are among them.
             channels: (all,) channel of each of them.
         """
-        words: dict[tuple[int, str], tuple[Indices, Words]] = {}  # several flags share one
+        words: dict[tuple[int, str, int], tuple[Indices, Words]] = {}  # several flags share one
         for flag in self.frame.flags:
             if isinstance(flag, Sentinel | Above):
                 status[:, columns] |= np.where(_hit(flag, raw), np.uint8(flag.status), np.uint8(0))
@@ -146,7 +146,7 @@ class FrameKind:
                 if len(rows):  # else it may lie behind all payloads
                     status[rows, columns] |= payload[rows, flag.offset : end] & np.uint8(flag.mask)
                 continue
-            place = flag.offset, np.dtype(flag.dtype).str
+            place = flag.offset, np.dtype(flag.dtype).str, flag.normal
             if place not in words:
                 words[place] = _flag_words(flag, payload, length)
             flagged, word = words[place]
@@ -172,12 +172,12 @@ def _hit(flag: Sentinel | Above, raw: npt.NDArray[Any]) -> Flags:
 
 
 def _flag_words(flag: Flag, payload: Bytes, length: Bytes) -> tuple[Indices, Words]:
-    """The frames in which a flag's word is there and not 0 (few, as a rule), and the word of each."""
+    """The frames in which a flag's word is there and not normal (few, as a rule), and in which bits it is not."""
     dtype = np.dtype(flag.dtype)
     end = flag.offset + dtype.itemsize
     if end > payload.shape[1]:
         return np.zeros(0, np.int64), np.zeros(0, np.uint64)
-    word = np.ascontiguousarray(payload[:, flag.offset : end]).view(dtype)[:, 0]
+    word = np.ascontiguousarray(payload[:, flag.offset : end]).view(dtype)[:, 0] ^ dtype.type(flag.normal)
     flagged = np.flatnonzero(word)
     if len(flagged):
         flagged = flagged[length[flagged] >= end]

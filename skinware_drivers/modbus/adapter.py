@@ -159,7 +159,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         """
         question = wire.question_to_read(function, address, count)
         answer = await self._ask(link, unit, question)
-        return np.frombuffer(answer[2:], ">u2" if self.byte_order == "big" else "<u2").astype(np.uint16)
+        return np.frombuffer(answer[2:], self._register).astype(np.uint16)
 
     async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:
         """Write registers (function 16): only what a device's documentation allows, and only when a person wants it.
@@ -171,8 +171,13 @@ class ModbusAdapter(Adapter[OptionsT]):
         """
         if not 1 <= len(values) <= wire.MOST_WRITTEN:
             raise ValueError(f"{len(values)} registers: give 1 to {wire.MOST_WRITTEN}")
-        data = np.array(values, ">u2" if self.byte_order == "big" else "<u2").tobytes()
+        data = np.array(values, self._register).tobytes()
         await self._ask(link, unit, struct.pack(">BHHB", wire.WRITE_MANY, address, len(values), len(data)) + data)
+
+    @property
+    def _register(self) -> np.dtype[np.uint16]:
+        order = self.byte_order if self._line is None else self._line.byte_order
+        return np.dtype(">u2" if order == "big" else "<u2")
 
     async def _ask(self, link: Link, unit: int, question: bytes) -> bytes:
         timeout_s = 4 * self.timeout_s + 1  # it waits for the read before, and for what is written beside it

@@ -145,6 +145,11 @@ class ModbusBus(KernelBus):
         """Whether it waits for a reply: what comes next depends on how soon that is taken."""
         return not self.listen_only
 
+    @property
+    def byte_order(self) -> Order:
+        """Of a register: as the bus' name says, else the driver."""
+        return self._wanted.byte_order
+
     def use(self, wanted: Wanted, period_s: float, timeout_s: float, turnaround_s: float | None, baudrate: int) -> None:
         """Say what is asked for; takes effect at once, and anew when it is opened.
 

@@ -10,7 +10,6 @@ that addresses count bytes in all reads, and that a read may go over the border 
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
@@ -22,17 +21,14 @@ from msgspec import Meta
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Above, AnyFlag, Sentinel
 from skinware_drivers.modbus.adapter import ModbusAdapter
+from skinware_drivers.modbus.order_watch import OrderWatch
 from skinware_drivers.modbus.registers import Registers
 from skinware_drivers.options import check_options
 from skinware_drivers.watch import Watch
-from skinware_drivers.zero_watch import ZeroWatch
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _FIRST, _BYTES = 3000, 2
 _FULL_SCALE = 4096
@@ -88,23 +84,6 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_options(self)
 
 
-class InspireWatch(ZeroWatch):
-    """Also tells what values mean that no taxel can have."""
-
-    _has_told = False
-
-    def look(self, updates: Updates) -> None:
-        """See whether values are above all that a taxel tells."""
-        super().look(updates)
-        if not self._has_told and (updates.status & Status.SUSPECT).any():
-            self._has_told = True
-            log.warning(
-                "values above %d, which no taxel has, are suspect; if there are many, the hand may send the bytes of"
-                " registers in the other order: add byte_order=little to the options of the bus",
-                _FULL_SCALE,
-            )
-
-
 class InspireDriver(ModbusAdapter[InspireOptions]):
     """One hand."""
 
@@ -125,7 +104,7 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:
         """Matrices that tell nothing but 0, and values that no taxel has."""
-        return InspireWatch(tables)
+        return OrderWatch(tables, _FULL_SCALE)
 
 
 def _channels(matrix: _Matrix) -> list[int]:

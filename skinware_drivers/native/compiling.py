@@ -192,7 +192,7 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
         return structs.Flag(form=_STATUS_BYTES, offset=flag.offset, mask=int(flag.mask))
     dtype, is_swapped = _type(flag.dtype)
     n_each, each = arrays.structs(structs.ChannelBit, (structs.ChannelBit(*pair) for pair in flag.each))
-    word = {"offset": flag.offset, "type": dtype, "is_swapped": is_swapped, "mask": flag.mask}
+    word = {"offset": flag.offset, "type": dtype, "is_swapped": is_swapped, "mask": flag.mask, "normal": flag.normal}
     return structs.Flag(form=_WORD, status=int(flag.status), n_each=n_each, each=each, **word)
 
 

@@ -56,8 +56,8 @@ struct channel_bit {
     int64_t channel, shift;
 };
 
-struct flag { /* mask: of a word, or of the status bytes */
-    int64_t form, status, offset, type, is_swapped, mask, n_each;
+struct flag { /* mask: of a word, or of the status bytes; normal: the word when nothing is to be told */
+    int64_t form, status, offset, type, is_swapped, mask, normal, n_each;
     const struct channel_bit *each;
     int64_t is_float, integer; /* of a sentinel or a limit: how values are compared, and with what */
     double real;

@@ -155,7 +155,7 @@ static void flag_word(const struct path *path, const struct assembly *assembly, 
     int64_t width = path->plan->width;
     if (length < flag->offset + bytes_of_type[flag->type])
         return;
-    uint64_t word = read_word(payload + flag->offset, flag->type, flag->is_swapped);
+    uint64_t word = read_word(payload + flag->offset, flag->type, flag->is_swapped) ^ (uint64_t)flag->normal;
     if (!word)
         return;
     for (int64_t i = 0; word & (uint64_t)flag->mask && i < width; i++)

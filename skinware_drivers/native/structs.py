@@ -71,7 +71,7 @@ class Flag(ctypes.Structure):
     """What sets status bits."""
 
     _fields_ = [
-        *_fields("form status offset type is_swapped mask n_each"),
+        *_fields("form status offset type is_swapped mask normal n_each"),
         *_fields("each", _POINTER),
         *_fields("is_float integer"),
         *_fields("real", _REAL),

@@ -31,7 +31,7 @@ class _Asked(NamedTuple):
 class ModbusEmulator(SerialEmulator[OptionsT]):
     """Emulated Modbus units, whose numbers are their addresses.
 
-    A unit samples its sensors when it is asked for its lowest register, or for others before any sample. Until then,
+    A unit samples its sensors when it is asked for their lowest register, or for others before any sample. Until then,
     questions for the others are answered from the same sample: a whole round of questions is one burst.
 
     Attributes:
@@ -46,6 +46,10 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
     @abstractmethod
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
         """What is in the registers while the sensors feel this: address -> 16 bits."""
+
+    def beside(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
+        """What is in registers that do not belong to its sensors, in the same way. By default there are none."""
+        return {}
 
     def written(self, device: Device, address: int, value: int) -> bool:  # noqa: ARG002
         """A register is written; tells whether it can be. By default none can."""
@@ -76,8 +80,9 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         function = asked.message[0]
         address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
         if function == self.function and 1 <= count <= _MOST_READ:
-            device.memory[_ASKED] = asked
-            if _SAMPLE not in device.memory or address == min(device.memory[_SAMPLE]):
+            wanted = range(address, address + count * self.step, self.step)
+            if self._is_to_sample(device, wanted):
+                device.memory[_ASKED] = asked
                 self.burst(device, now_ns)
                 return b""
             return self._told(device, asked)
@@ -90,13 +95,18 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         device.memory[_SAMPLE] = self.registers(device, values)
         return [self._told(device, device.memory[_ASKED])]
 
+    def _is_to_sample(self, device: Device, wanted: range) -> bool:
+        if _SAMPLE in device.memory:
+            return min(device.memory[_SAMPLE]) in wanted
+        return not set(wanted) <= set(self.beside(device))
+
     def _told(self, device: Device, asked: _Asked) -> bytes:
         address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
-        sample: dict[int, int] = device.memory[_SAMPLE]
+        known: dict[int, int] = {**self.beside(device), **device.memory.get(_SAMPLE, {})}
         wanted = range(address, address + count * self.step, self.step)
-        if not all(one in sample for one in wanted):
+        if not all(one in known for one in wanted):
             return _reply(asked, bytes([asked.message[0] | 0x80, _NO_SUCH_REGISTERS]))
-        data = b"".join(sample[one].to_bytes(2, "big") for one in wanted)
+        data = b"".join(known[one].to_bytes(2, "big") for one in wanted)
         return _reply(asked, bytes([asked.message[0], len(data)]) + data)
 
     def _write(self, device: Device, asked: _Asked, address: int) -> bytes:

@@ -18,6 +18,7 @@ from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.modbus.dfrobot import DfrobotDriver
 from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.modbus.revo2 import Revo2Driver
 from skinware_drivers.modbus.revo3 import Revo3Driver
@@ -48,6 +49,7 @@ from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
 from skinware_drivers.virtual.devices.inspire import EmulatedInspire
@@ -375,6 +377,24 @@ class TestPaxiniHighSpeed(DriverConformance):
 class TestInspire(DriverConformance):
     driver = InspireDriver
     emulator = EmulatedInspire
+
+
+class TestDfrobot(DriverConformance):
+    """Two arrays, which are asked for their shape."""
+
+    driver = DfrobotDriver
+    emulator = EmulatedDfrobot
+    driver_options: ClassVar[Mapping[str, Any]] = {"units": (1, 31)}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"units": (1, 31)}
+
+
+class TestDfrobot4x8(DriverConformance):
+    """Whose shape is not asked, and whose cells are read alone."""
+
+    driver = DfrobotDriver
+    emulator = EmulatedDfrobot
+    driver_options: ClassVar[Mapping[str, Any]] = {"shapes": ("4x8",), "state": False}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"shapes": ("4x8",)}
 
 
 class TestRevo2(DriverConformance):

@@ -46,7 +46,7 @@ def noting(functions: list[int]) -> Action:
 
 def test_these_drivers_read() -> None:
     readers = {name for name, driver in known_drivers("modbus").items() if can_ask(driver)}
-    assert readers >= {"inspire", "revo2", "revo3"}
+    assert readers >= {"dfrobot", "inspire", "revo2", "revo3"}
 
 
 def test_nobody_is_asked_without_a_word() -> None:
@@ -70,3 +70,18 @@ def test_a_device_with_other_registers_says_so() -> None:
         probe = found_on(bus, probe=True)["probe"]
     assert probe.answers == {}
     assert "exception 2" in probe.problems["inspire"]
+
+
+@pytest.mark.parametrize(
+    ("maker", "answers"), [(0x3343, {"dfrobot": "DFRobot tactile array, unit 1, 4x8"}), (3343, {})]
+)
+def test_an_array_of_dfrobot_says_itself_what_it_is(maker: int, answers: dict[str, str]) -> None:
+    functions: list[int] = []
+    with rtu_server(device(1, 0, [0, maker, *[1] * 41, 0], noting(functions))) as bus:
+
+        def is_found() -> bool:
+            probe = found_on(bus, probe=True, drivers=("dfrobot",))["probe"]
+            return probe.answers == answers and not probe.problems  # it waits for 0.1 s only
+
+        wait_until(is_found)
+    assert set(functions) == {4}

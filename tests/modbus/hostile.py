@@ -5,6 +5,7 @@ moment.
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -13,17 +14,29 @@ import numpy as np
 
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import assemble
+from skinware_drivers.link import Link
 from skinware_drivers.modbus import ModbusAdapter, wire
+from skinware_drivers.modbus.dfrobot import DfrobotDriver, DfrobotOptions
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.master import Master, Timing
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
 from skinware_drivers.modbus.wire import Message
+from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
 
 MS = 1_000_000
+
+
+def _described(adapter: ModbusAdapter[Any]) -> ModbusAdapter[Any]:
+    """One that learns from its options what there is, and asks nobody."""
+    asyncio.run(adapter.describe(Link(make_bus("modbus:/dev/null"))))
+    return adapter
+
+
 FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
+    "dfrobot": lambda: _described(DfrobotDriver(DfrobotOptions(units=(1, 2), shapes=("6x6", "4x8")))),
     "inspire": lambda: InspireDriver(InspireOptions()),
     "inspire-by_matrix": lambda: InspireDriver(InspireOptions(by_matrix=True)),
     "revo2": lambda: Revo2Driver(Revo2Options()),

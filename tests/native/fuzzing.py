@@ -106,7 +106,7 @@ def _headers() -> Layout:
             Values(2, dtype, 4 // np.dtype(dtype).itemsize),
             Bits(4, 4),
             Bits(2, 3, byte=1),
-            [Flag(Status.NO_ACK, 6, "<u2", 0x8001, [(0, 3), (1, 15)]), Sentinel(Status.MASKED, 7)],
+            [Flag(Status.NO_ACK, 6, "<u2", 0x8001, [(0, 3), (1, 15)], normal=0x8), Sentinel(Status.MASKED, 7)],
             SequenceNumber(5, "u1", 200),
             DeviceTime(4, "<u2", 1e-3, 60_000),
         )

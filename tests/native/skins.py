@@ -174,7 +174,8 @@ def _flags(draw: st.DrawFn, longest: int, n_channels: int) -> Sequence[AnyFlag]:
             bits = 8 * np.dtype(dtype).itemsize
             each = draw(st.lists(st.tuples(st.integers(0, n_channels - 1), st.integers(0, bits - 1)), max_size=3))
             mask = draw(st.sampled_from([0, 1, 0x80, 1 << bits - 1, (1 << bits) - 1]))
-            found.append(Flag(status, draw(st.integers(0, longest)), dtype, mask, each))
+            normal = draw(st.sampled_from([0, 0, 1, (1 << bits) - 1]))
+            found.append(Flag(status, draw(st.integers(0, longest)), dtype, mask, each, normal))
         elif what in ("sentinel", "above"):
             value = draw(st.sampled_from([0, 1, -1, 255, 65535, -32768, 1 << 40, 0.0, 1.5, float("nan"), float("inf")]))
             found.append(Sentinel(status, value) if what == "sentinel" else Above(status, value))

@@ -43,6 +43,7 @@ def devices(emulator: str, wire: str) -> Iterator[str]:
         ("udp", "allegro_v5", "allegro_v5_udp", {"side": "right"}),
         ("udp", "icub_eth", "", {}),
         ("websocket", "xela_server", "", {}),
+        ("modbus", "dfrobot", "", {}),
         ("modbus", "revo2", "", {}),
         ("modbus:tcp", "inspire", "", {}),
     ],

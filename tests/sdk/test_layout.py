@@ -293,6 +293,16 @@ def test_flags_in_the_upper_half_of_a_long_word() -> None:
     assert other.state.status.tolist() == [0, Status.MASKED]
 
 
+@pytest.mark.parametrize(("word", "flagged"), [(1, [0, 0]), (0, [1, 1]), (3, [1, 1]), (0x101, [0, 2]), (0x100, [1, 3])])
+def test_a_word_that_tells_something_where_it_is_not_normal(word: int, flagged: list[int]) -> None:
+    flag, other = Status.NO_ACK, Status.MASKED
+    flags = [Flag(flag, 2, ">u2", mask=0xFF, normal=1), Flag(other, 2, ">u2", each=[(1, 8)], normal=1)]
+    layout = one(Values(0, "u1", 2), 4, flags=flags)
+    decoder = decode(layout, [Module(taxels(2))], "u1", [(0x100, b"\0\0" + word.to_bytes(2, "big"))])
+    means = [0, flag, other, flag | other]
+    assert decoder.state.status.tolist() == [means[one_of] for one_of in flagged]
+
+
 def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
     mask = Status.NO_ACK | Status.SUSPECT
     frame = Frame("d", [Identifier(0x100)], (2, 4), Values(0, "u1", 2, to=(1, 0)), flags=[StatusBytes(2, mask)])
@@ -488,6 +498,10 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", mask=0x100)]), "bits of an unsigned word"),
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", each=[(0, 8)])]), "bits of an unsigned"),
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "<i2", mask=1)]), "unsigned word, not of '<i2'"),
+        (
+            lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", 1, normal=256)]),
+            "bits of an unsigned word",
+        ),
     ],
 )
 def test_layouts_that_cannot_be_decoded_are_refused(make: Any, words: str) -> None:

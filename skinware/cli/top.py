@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -135,7 +134,8 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
             if time.monotonic() >= lines_at_s:
                 _print_lines(drivers, contacts, as_json)
                 if not as_json:
-                    _print_bridges(bridges, drivers.others)
+                    bridges.look(drivers.others)
+                    _print_bridges(bridges)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
             next_s = time.monotonic() + _TAKE_PERIOD_S
             time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
@@ -169,10 +169,10 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_
         click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
 
 
-def _print_bridges(bridges: LiveBridges, names: Iterable[str]) -> None:
+def _print_bridges(bridges: LiveBridges) -> None:
     from skinware.cli._bridges import as_data, summary
 
-    for bridge in bridges.look(names):
+    for bridge in bridges.states():
         click.echo(summary(bridge.robot, as_data(bridge)))
 
 

@@ -74,6 +74,22 @@ def tls_option(command: _Decorated) -> _Decorated:
     )(command)
 
 
+def caller_option(command: _Decorated) -> _Decorated:
+    """``--caller NAME``."""
+    return click.option(
+        "--caller",
+        "callers",
+        multiple=True,
+        metavar="NAME",
+        help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
+    )(command)
+
+
+def insecure_option(command: _Decorated) -> _Decorated:
+    """``--insecure``."""
+    return click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")(command)
+
+
 def version_option(command: _Decorated) -> _Decorated:
     """``--version``."""
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)

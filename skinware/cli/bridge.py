@@ -12,7 +12,9 @@ from skinware.cli import bridge_ros2, bridge_yarp
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     DEFAULT_REGIONS,
+    caller_option,
     examples,
+    insecure_option,
     json_option,
     namespace_option,
     print_json,
@@ -65,14 +67,8 @@ for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router to connect to, instead of being called.")
 @tls_option
-@click.option(
-    "--caller",
-    "callers",
-    multiple=True,
-    metavar="NAME",
-    help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
-)
-@click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+@caller_option
+@insecure_option
 @namespace_option
 @json_option
 def serve(

@@ -24,7 +24,7 @@ from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
+from skinware.realtime import boot
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
@@ -100,7 +100,6 @@ class Server:
         self._coding = ThreadPoolExecutor(1, "skinware bridge coding")
         self._parts = Parts(self._stream)
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
-        self._stopping = False
         self._collector = Collector(namespace, names, self)
         self._collector.take()  # who asks is told of all that there is
         self._answering = [
@@ -119,20 +118,17 @@ class Server:
 
     def run(self, tell: Callable[[], object] = lambda: None) -> None:
         """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
-        with short_turns():
-            while not self._stopping:
-                self._collector.take()
-                if now_ns() >= tell_ns:
-                    tell_ns = max(tell_ns + NS_PER_S, now_ns())
-                    self._let_go()
-                    self._soon(self._summarise)
-                    tell()
-                self._collector.wait(WAIT_SLICE_NS)
+
+        def each_second() -> None:
+            self._let_go()
+            self._soon(self._summarise)
+            tell()
+
+        self._collector.run(each_second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
-        self._stopping = True
+        self._collector.stop()
         self._calls.end()
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ import msgspec
 from skinware.bridge.calling import Calls
 from skinware.bridge.giving import Stream
 from skinware.bridge.link import Link, Question
-from skinware.bridge.messages import About, Keys, Service, Services, Wish, generation_message, parts_of
+from skinware.bridge.messages import About, Head, Keys, Service, Services, Wish, generation_message, parts_of
 from skinware.bridge.parts import Parts
 from skinware.bridge.pinging import answering
 from skinware.bridge.summaries import Summaries, Summarised
@@ -43,13 +43,13 @@ class _Whole:
     """
 
     name: str
-    head: bytes
+    head: Head
 
     @cached_property
     def of_driver(self) -> Generation | None:
         """It, if it is one of a driver that can be read; this takes its time."""
         try:
-            generation = Generation(self.head, self.name)
+            generation = Generation(self.head.raw, self.name)
         except BadRecording:
             return None
         return generation if generation.is_driver else None
@@ -154,7 +154,7 @@ class Server:
         """See :class:`skinware.transfer.collecting.Listener`."""
         segment = segments.recorded(head, service)
         told = Service(segment.generation, self._states.get(service, Service()).state)
-        whole = _Whole(service, head)
+        whole = _Whole(service, Head(head))
         with self._lock:
             served = self._services.get(service)
             if served is None:
@@ -264,13 +264,13 @@ class Server:
         if number:
             part = self._parts.find(number)
             cut = None if part is None else part.cut(name)
-            head = None if cut is None else cut.generation.head
+            head = None if cut is None else cut.head
         if head is None:
             question.fail(b"no such service")
         else:
             self._calls.submit(question, self._tell_generation, name, head)
 
-    def _tell_generation(self, question: Question, name: str, head: bytes) -> None:
+    def _tell_generation(self, question: Question, name: str, head: Head) -> None:
         question.reply(generation_message(About(dict(self._calls.operations(name))), head))
 
     def _newest_asked(self, question: Question) -> None:

@@ -24,9 +24,6 @@ from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
 
-DEFAULT_REGIONS = "regions.toml"
-"""File of regions where none is named, in the current folder."""
-
 CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 """For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
 

@@ -61,6 +61,16 @@ def json_option(command: _Decorated) -> _Decorated:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
 
 
+def group_option(command: _Decorated) -> _Decorated:
+    """``--group GROUP``."""
+    return click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")(command)
+
+
+def verbose_option(command: _Decorated) -> _Decorated:
+    """``--verbose``, for :func:`log_to_stderr`."""
+    return click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")(command)
+
+
 def tls_option(command: _Decorated) -> _Decorated:
     """``--tls DIR``."""
     return click.option(
@@ -102,6 +112,17 @@ def print_json(data: object) -> None:
 def warn(text: str) -> None:
     """One line on stderr under the running command's name, for what is worth knowing but no error."""
     click.echo(f"{click.get_current_context().info_name}: {text}", err=True)
+
+
+def log_to_stderr(verbose: bool) -> None:
+    """Warnings, or more, on stderr under the running command's name."""
+    import logging
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING,
+        format=f"{click.get_current_context().info_name}: %(message)s",
+        stream=sys.stderr,
+    )
 
 
 @contextlib.contextmanager

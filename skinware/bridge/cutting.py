@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import Index, as_index, texts
+from skinware.bridge.messages import Head
 from skinware.errors import StructureError
 from skinware.memory.file_layout import SLOT
 from skinware.memory.ring import Frame
@@ -35,6 +36,7 @@ class Cut:
 
     Attributes:
         generation: of the same number, with what stays.
+        head: its file up to its slots.
 
     Raises:
         StructureError: it is not a driver, or no sensor stays.
@@ -64,8 +66,8 @@ class Cut:
         others = columns.keys() - {name for name, *_ in self._stay}
         self._stay += [(name, 1, 1, slice(0, 1)) for name in others if math.prod(columns[name].shape)]
         cut = _structure(structure, positions, modules, patches, buses)
-        head = whole.head_with(cut, Schema(columns, whole.schema.description))
-        self.generation: Generation = Generation(head, whole.name)
+        self.head = Head(whole.head_with(cut, Schema(columns, whole.schema.description)))
+        self.generation: Generation = Generation(self.head.raw, whole.name)
 
     def frame(self, frame: Frame) -> RecordedDriverFrame:
         """What stays of a frame of the generation."""

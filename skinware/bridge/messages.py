@@ -33,6 +33,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
+import threading
 import zlib
 
 import msgspec
@@ -286,10 +287,31 @@ def coded_part(message: bytes) -> memoryview:
     return memoryview(message)[len(_CODED_HEAD) :]
 
 
-def generation_message(about: About, head: bytes) -> bytes:
+class Head:
+    """A service's file up to its slots, packed once for all who ask; for any thread.
+
+    Args:
+        raw: its bytes.
+
+    Attributes:
+        raw: the same bytes.
+    """
+
+    def __init__(self, raw: bytes) -> None:
+        self.raw = raw
+        self._lock, self._packed = threading.Lock(), b""
+
+    def packed(self) -> bytes:
+        """It, for the link; the first time takes milliseconds."""
+        with self._lock:
+            self._packed = self._packed or zlib.compress(self.raw)
+            return self._packed
+
+
+def generation_message(about: About, head: Head) -> bytes:
     """What a generation is, for the link."""
     text = msgspec.json.encode(about)
-    return _SIZE.pack(len(text)) + text + zlib.compress(head)
+    return _SIZE.pack(len(text)) + text + head.packed()
 
 
 def split_generation(message: bytes) -> tuple[About, bytes]:

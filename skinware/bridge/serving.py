@@ -16,7 +16,7 @@ import msgspec
 from skinware.bridge.calling import Calls
 from skinware.bridge.giving import Stream
 from skinware.bridge.link import Link, Question
-from skinware.bridge.messages import About, Keys, Service, Services, Wish, generation_message, parts_of
+from skinware.bridge.messages import About, Head, Keys, Service, Services, Wish, generation_message, parts_of
 from skinware.bridge.parts import Parts
 from skinware.bridge.pinging import answering
 from skinware.bridge.summaries import Summaries, Summarised
@@ -24,7 +24,7 @@ from skinware.errors import BadRecording, BridgeError, ConfigurationError
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
+from skinware.realtime import boot
 from skinware.structure import Structure
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
@@ -43,13 +43,13 @@ class _Whole:
     """
 
     name: str
-    head: bytes
+    head: Head
 
     @cached_property
     def of_driver(self) -> Generation | None:
         """It, if it is one of a driver that can be read; this takes its time."""
         try:
-            generation = Generation(self.head, self.name)
+            generation = Generation(self.head.raw, self.name)
         except BadRecording:
             return None
         return generation if generation.is_driver else None
@@ -100,7 +100,6 @@ class Server:
         self._coding = ThreadPoolExecutor(1, "skinware bridge coding")
         self._parts = Parts(self._stream)
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
-        self._stopping = False
         self._collector = Collector(namespace, names, self)
         self._collector.take()  # who asks is told of all that there is
         self._answering = [
@@ -119,20 +118,17 @@ class Server:
 
     def run(self, tell: Callable[[], object] = lambda: None) -> None:
         """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
-        with short_turns():
-            while not self._stopping:
-                self._collector.take()
-                if now_ns() >= tell_ns:
-                    tell_ns = max(tell_ns + NS_PER_S, now_ns())
-                    self._let_go()
-                    self._soon(self._summarise)
-                    tell()
-                self._collector.wait(WAIT_SLICE_NS)
+
+        def each_second() -> None:
+            self._let_go()
+            self._soon(self._summarise)
+            tell()
+
+        self._collector.run(each_second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
-        self._stopping = True
+        self._collector.stop()
         self._calls.end()
 
     def close(self) -> None:
@@ -158,7 +154,7 @@ class Server:
         """See :class:`skinware.transfer.collecting.Listener`."""
         segment = segments.recorded(head, service)
         told = Service(segment.generation, self._states.get(service, Service()).state)
-        whole = _Whole(service, head)
+        whole = _Whole(service, Head(head))
         with self._lock:
             served = self._services.get(service)
             if served is None:
@@ -268,13 +264,13 @@ class Server:
         if number:
             part = self._parts.find(number)
             cut = None if part is None else part.cut(name)
-            head = None if cut is None else cut.generation.head
+            head = None if cut is None else cut.head
         if head is None:
             question.fail(b"no such service")
         else:
             self._calls.submit(question, self._tell_generation, name, head)
 
-    def _tell_generation(self, question: Question, name: str, head: bytes) -> None:
+    def _tell_generation(self, question: Question, name: str, head: Head) -> None:
         question.reply(generation_message(About(dict(self._calls.operations(name))), head))
 
     def _newest_asked(self, question: Question) -> None:

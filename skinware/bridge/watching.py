@@ -116,10 +116,16 @@ class Watcher:
                 seen.clock.add(sample)
 
         seen.next_clock_ns = now_ns() + seen.clock.pause_ns()
-        if seen.pinger is None:
-            seen.pinger = Pinger(self._link, self._who, told)
-            seen.pinger.follow(Keys(seen.robot, seen.instance))
-        seen.pinger.ask()
+        pinger = seen.pinger
+        if pinger is None:
+            pinger = Pinger(self._link, self._who, told)
+            pinger.follow(Keys(seen.robot, seen.instance))
+            with self._lock:
+                if self._seen.get((seen.robot, seen.instance)) is seen:
+                    seen.pinger = pinger
+            if seen.pinger is None:  # the robot has gone meanwhile
+                pinger.close()
+        pinger.ask()
 
 
 __all__ = ["Seen", "Watcher"]

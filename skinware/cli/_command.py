@@ -24,9 +24,6 @@ from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
 
-DEFAULT_REGIONS = "regions.toml"
-"""File of regions where none is named, in the current folder."""
-
 CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 """For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
 
@@ -64,6 +61,16 @@ def json_option(command: _Decorated) -> _Decorated:
     return click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")(command)
 
 
+def group_option(command: _Decorated) -> _Decorated:
+    """``--group GROUP``."""
+    return click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")(command)
+
+
+def verbose_option(command: _Decorated) -> _Decorated:
+    """``--verbose``, for :func:`log_to_stderr`."""
+    return click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")(command)
+
+
 def tls_option(command: _Decorated) -> _Decorated:
     """``--tls DIR``."""
     return click.option(
@@ -72,6 +79,22 @@ def tls_option(command: _Decorated) -> _Decorated:
         type=click.Path(path_type=Path, file_okay=False),
         help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
     )(command)
+
+
+def caller_option(command: _Decorated) -> _Decorated:
+    """``--caller NAME``."""
+    return click.option(
+        "--caller",
+        "callers",
+        multiple=True,
+        metavar="NAME",
+        help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
+    )(command)
+
+
+def insecure_option(command: _Decorated) -> _Decorated:
+    """``--insecure``."""
+    return click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")(command)
 
 
 def version_option(command: _Decorated) -> _Decorated:
@@ -89,6 +112,17 @@ def print_json(data: object) -> None:
 def warn(text: str) -> None:
     """One line on stderr under the running command's name, for what is worth knowing but no error."""
     click.echo(f"{click.get_current_context().info_name}: {text}", err=True)
+
+
+def log_to_stderr(verbose: bool) -> None:
+    """Warnings, or more, on stderr under the running command's name."""
+    import logging
+
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING,
+        format=f"{click.get_current_context().info_name}: %(message)s",
+        stream=sys.stderr,
+    )
 
 
 @contextlib.contextmanager

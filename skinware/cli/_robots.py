@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, signals_end, tls_option
+from skinware.cli._command import (
+    CONTEXT_SETTINGS,
+    caller_option,
+    examples,
+    insecure_option,
+    json_option,
+    print_json,
+    signals_end,
+    tls_option,
+)
 from skinware.cli._format import (
     NO_VALUE,
     age_text,
@@ -57,13 +66,7 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
     "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are to be reached here."
 )
 @tls_option
-@click.option(
-    "--caller",
-    "callers",
-    multiple=True,
-    metavar="NAME",
-    help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
-)
+@caller_option
 @click.option(
     "--robot",
     "robots",
@@ -74,7 +77,7 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "lost", "
 @click.option(
     "--router", "routers", multiple=True, metavar="NAME", help="The certificate of another router; may be repeated."
 )
-@click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+@insecure_option
 @json_option
 def route(
     listen: tuple[str, ...],

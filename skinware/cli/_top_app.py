@@ -280,7 +280,8 @@ class SkinTop(App[None]):
                 count += 1
                 rows += rows_of(driver.reader, driver.frame, driver.health(), driver.patch_rates_hz)
             self._contacts.look(self._drivers.others)
-            bridges = self._bridges.look(self._drivers.others)
+            self._bridges.look(self._drivers.others)
+            bridges = self._bridges.states()
         except NamespaceError as error:
             why = str(error)
         told = [_bridges.summary(bridge.robot, _bridges.as_data(bridge)) for bridge in bridges]

@@ -11,8 +11,9 @@ import click
 from skinware.cli import bridge_ros2, bridge_yarp
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
-    DEFAULT_REGIONS,
+    caller_option,
     examples,
+    insecure_option,
     json_option,
     namespace_option,
     print_json,
@@ -22,8 +23,8 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
+from skinware.cli._regions import regions_asked_for, regions_option
 from skinware.cli._robots import list_robots, route
-from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from skinware.bridge import Server, Wish
@@ -65,14 +66,8 @@ for _each in (route, list_robots, bridge_ros2.command, bridge_yarp.command):
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="A router to connect to, instead of being called.")
 @tls_option
-@click.option(
-    "--caller",
-    "callers",
-    multiple=True,
-    metavar="NAME",
-    help="Only who has a certificate of this name may call operations (tare ...); may be repeated.",
-)
-@click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
+@caller_option
+@insecure_option
 @namespace_option
 @json_option
 def serve(
@@ -165,14 +160,7 @@ class _Serving:
 @click.option(
     "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
 )
-@click.option(
-    "--regions",
-    "region_files",
-    metavar="FILE",
-    multiple=True,
-    type=click.Path(path_type=Path, dir_okay=False),
-    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
-)
+@regions_option
 @json_option
 def join(
     robot: str,
@@ -223,14 +211,8 @@ def join(
 def _wish(patches: tuple[str, ...], in_regions: tuple[str, ...], region_files: tuple[Path, ...]) -> Wish | None:
     """Which sensors are wanted; None: all, and all services."""
     from skinware.bridge import Wish
-    from skinware.tactile.choosing import unknown
-    from skinware.tactile.region_files import read_regions
 
-    if region_files and not in_regions:
-        raise click.UsageError("--regions says where regions are: say which with --region")
-    regions = read_regions(*(region_files or (Path(DEFAULT_REGIONS),))) if in_regions else ()
-    for why in unknown("region", in_regions, [region.name for region in regions]):
-        raise ConfigurationError(why)
+    regions = regions_asked_for(in_regions, region_files)
     return Wish(patches, in_regions, tuple(regions)) if patches or in_regions else None
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +11,14 @@ import click
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
+    group_option,
     json_option,
+    log_to_stderr,
     namespace_option,
     print_json,
     run,
     signals_end,
+    verbose_option,
     version_option,
 )
 
@@ -73,11 +74,11 @@ if TYPE_CHECKING:
     show_default=True,
     help="Name of the service of its sensors' health, beside it; empty: none, and no sensor is marked.",
 )
-@click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
+@group_option
 @namespace_option
 @json_option
 @version_option
-@click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
+@verbose_option
 def command(
     name: str,
     into: str,
@@ -108,9 +109,7 @@ def command(
     from skinware.tactile.chain_state import default_path
     from skinware.tactile.region_files import read_regions
 
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="skin-calm: %(message)s", stream=sys.stderr
-    )
+    log_to_stderr(verbose)
     check_name(name, "driver")
     for service_name in filter(None, (contacts, motion, health)):
         check_name(service_name, "service")

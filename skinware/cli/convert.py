@@ -10,7 +10,6 @@ import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
-    DEFAULT_REGIONS,
     examples,
     json_option,
     print_json,
@@ -21,6 +20,7 @@ from skinware.cli._command import (
     warn,
 )
 from skinware.cli._learning import asked_for, learning_options, learning_set
+from skinware.cli._regions import regions_asked_for, regions_option
 
 if TYPE_CHECKING:
     from skinware.conversion import Selection
@@ -64,14 +64,7 @@ _LEARNING_FORMATS = ("lerobot",)
 @click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; repeat it for several.")
 @click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; likewise.")
 @click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; likewise.")
-@click.option(
-    "--regions",
-    "region_files",
-    metavar="FILE",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
-)
+@regions_option
 @click.option("--start", "start_s", type=seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=seconds, metavar="SECONDS", help="End there.")
 @learning_options
@@ -148,14 +141,8 @@ def _selection(
     region_files: tuple[Path, ...],
 ) -> Selection:
     from skinware.conversion import Selection
-    from skinware.tactile.region_files import read_regions
 
-    if not in_regions:
-        if region_files:
-            raise click.UsageError("--regions says where regions are: say which with --region")
-        return Selection(names, types, patches)
-    regions = read_regions(*(region_files or (Path(DEFAULT_REGIONS),)))
-    return Selection(names, types, patches, regions, in_regions)
+    return Selection(names, types, patches, regions_asked_for(in_regions, region_files), in_regions)
 
 
 def main() -> None:

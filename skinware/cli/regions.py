@@ -10,7 +10,6 @@ import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
-    DEFAULT_REGIONS,
     examples,
     json_option,
     namespace_option,
@@ -19,6 +18,7 @@ from skinware.cli._command import (
     seconds,
     version_option,
 )
+from skinware.cli._regions import DEFAULT_REGIONS, regions_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,9 +49,8 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
     """List regions, and how many sensors the running drivers have in each."""
     from skinware.cli._format import plural
     from skinware.skin import Skin
-    from skinware.tactile.region_files import read_regions
 
-    regions = read_regions(*(files or (Path(DEFAULT_REGIONS),)))
+    regions = regions_of(files)
     with Skin(namespace) as skin:
         layout = skin.refresh()
     counts: dict[str, dict[str, int]] = {region.name: {} for region in regions}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +12,6 @@ import click
 
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
-    DEFAULT_REGIONS,
     examples,
     json_option,
     namespace_option,
@@ -23,11 +21,11 @@ from skinware.cli._command import (
     version_option,
     warn,
 )
+from skinware.cli._regions import regions_of, regions_option
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
     from skinware.tactile.contacts_service import ContactsFrame
-    from skinware.tactile.regions import Regions
     from skinware.views.bridges import LiveBridges
     from skinware.views.live import LiveDrivers
     from skinware.views.touches import LiveSources
@@ -62,14 +60,7 @@ _NEEDED = "textual>=8"
     help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
 @click.option("--region", metavar="NAME", help="Draw only sensors in this region at first.")
-@click.option(
-    "--regions",
-    "region_files",
-    multiple=True,
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help=f"File with regions; repeat it for several.  [default with --region: {DEFAULT_REGIONS}]",
-)
+@regions_option
 @namespace_option
 @json_option
 @version_option
@@ -92,7 +83,8 @@ def command(
     from skinware.memory.namespace import Namespace
 
     place = Namespace(namespace)
-    regions = _regions(region, region_files)
+    names = () if region is None else (region,)
+    regions = regions_of(region_files, names) if names or region_files else None
     if not plain and not as_json and _on_terminal():
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
@@ -102,20 +94,6 @@ def command(
             context.exit(app.return_code or 0)
         warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
     show_lines(place, duration_s, as_json)
-
-
-def _regions(name: str | None, files: tuple[Path, ...]) -> Regions | None:
-    """The regions of files, which must have the one that is named; None where nobody asks for any."""
-    if name is None and not files:
-        return None
-    from skinware.errors import ConfigurationError
-    from skinware.tactile.region_files import read_regions
-
-    regions = read_regions(*(files or (Path(DEFAULT_REGIONS),)))
-    names = [region.name for region in regions]
-    if name is not None and name not in names:
-        raise ConfigurationError(f"no region {name!r}; there are: {', '.join(names) or 'none'}")
-    return regions
 
 
 def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
@@ -135,7 +113,8 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
             if time.monotonic() >= lines_at_s:
                 _print_lines(drivers, contacts, as_json)
                 if not as_json:
-                    _print_bridges(bridges, drivers.others)
+                    bridges.look(drivers.others)
+                    _print_bridges(bridges)
                 lines_at_s = max(lines_at_s + _LINE_PERIOD_S, time.monotonic())
             next_s = time.monotonic() + _TAKE_PERIOD_S
             time.sleep(max(0.0, min(next_s, lines_at_s, end_s or next_s) - time.monotonic()))
@@ -169,10 +148,10 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_
         click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
 
 
-def _print_bridges(bridges: LiveBridges, names: Iterable[str]) -> None:
+def _print_bridges(bridges: LiveBridges) -> None:
     from skinware.cli._bridges import as_data, summary
 
-    for bridge in bridges.look(names):
+    for bridge in bridges.states():
         click.echo(summary(bridge.robot, as_data(bridge)))
 
 

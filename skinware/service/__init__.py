@@ -3,8 +3,9 @@
 from skinware.memory.schema import Column, Schema
 from skinware.service._client import PendingRequest
 from skinware.service._ownership import Columns
-from skinware.service._reader import Position, ServiceReader
+from skinware.service._reader import ServiceReader
 from skinware.service._server import Request, RequestServer
+from skinware.service._taking import Position
 from skinware.service._writer import ServiceWriter
 
 __all__ = [

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Self
 
 from skinware._renamed import renamed
-from skinware.errors import Overrun, ServiceTimeout, StructureChanged
+from skinware.errors import Overrun
 from skinware.memory.announcement import ReaderRecord
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
-from skinware.memory.ring import COPY_ATTEMPTS, Frame, FrameT, RingReader
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
-from skinware.service._accounts import Accounts
-from skinware.service._attachment import GENERATION_ENDED, Attachment
+from skinware.memory.ring import Frame, FrameT
+from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
+from skinware.service._attachment import GENERATION_ENDED
+from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
-Position = tuple[int, int]
-"""(generation, sequence) of a frame."""
 
-
-class ServiceReader(Attachment[FrameT]):
+class ServiceReader(Taking[FrameT]):
     """Reads one service, and attaches again by itself when the writer comes back.
 
     Not for several threads at once; make one per thread. Frames of one generation come in order; a reader that is
@@ -47,11 +44,7 @@ class ServiceReader(Attachment[FrameT]):
         timeout_s: float | None = 0.0,
         announce: bool = True,
     ) -> None:
-        super().__init__(name, namespace, timeout_s)
-        self._last_taken: Position | None = None
-        self._open_turn: tuple[int, int] | None = None
-        self._turns_in_c = False  # whether the ring counts at the moment, for a loop
-        self._accounts = Accounts(self.namespace, name, announce)
+        super().__init__(name, namespace, timeout_s, announce)
 
     @property
     def lost(self) -> int:
@@ -241,203 +234,6 @@ class ServiceReader(Attachment[FrameT]):
         self._client.close()
         self._ring.segment.descriptor.close()
 
-    def _adopt(self, ring: RingReader[FrameT]) -> None:
-        self._end_turn()
-        if self._last is not None and ring.generation != self._ring.generation:
-            before = self._ring.segment
-            taken = before.published_before + self._last[1]
-            published = ring.segment.published_before
-            if published < taken:  # the count began anew: somebody removed the lock's file
-                published = before.published
-            self._accounts.record.lost += published - taken
-            self._last = (ring.generation, 0)
-        super()._adopt(ring)
-
-    # -- waiting ------------------------------------------------------------------------------------------------
-
-    def _read(self, known: Position | None, max_age_s: float | None, deadline_ns: int | None) -> FrameT:
-        """The newest frame that is newer than ``known`` and young enough, as ``read`` has it."""
-        if known is None:
-            alive = self._keep_up()
-            if self._ring.latest:
-                frame = self._newest_now(self._ring.copy, alive)
-                if _is_young(frame, max_age_s):
-                    return frame
-                known = frame.position
-        while True:
-            frame = self._next_frame(known, deadline_ns, max_age_s=max_age_s)
-            if _is_young(frame, max_age_s):
-                return frame
-            known = frame.position
-
-    def _read_in_order(self, deadline_ns: int | None) -> FrameT:
-        self._require_open()
-        if self._lags():
-            self._end_turn()
-            return self._taken(self._whole(self._next_in_order), self.alive)
-        return self._next_frame(self._last, deadline_ns, in_order=True)
-
-    def _next_frame(
-        self,
-        known: Position | None,
-        deadline_ns: int | None,
-        *,
-        in_order: bool = False,
-        max_age_s: float | None = None,
-    ) -> FrameT:
-        """Wait for a frame that is newer than ``known``: the newest, or the next in order.
-
-        One that is slept for was published within the last slice: its writer lived then, which saves the question
-        at the very moment at which a reader is in a hurry.
-        """
-        look_around = False
-        self._end_turn()
-        while True:
-            self._require_open()
-            ring = self._ring
-            wake_count = ring.wake_count
-            outdated = known is not None and ring.generation < known[0]
-            if (look_around or outdated or ring.state & GENERATION_ENDED) and not self._moved:
-                self._follow()
-                ring = self._ring
-                wake_count = ring.wake_count
-            latest = ring.latest
-            if latest and (known is None or (ring.generation, latest) > known):
-                take = self._next_in_order if in_order else self._ring.copy
-                return self._taken(self._whole(take), self.alive)
-            if self._moved:
-                raise self._structure_changed()
-            remaining_ns = WAIT_SLICE_NS if deadline_ns is None else deadline_ns - now_ns()
-            if remaining_ns <= 0:
-                raise ServiceTimeout(self._why_nothing_came(max_age_s))
-            self._end_turn()
-            timeout_ns = min(remaining_ns, WAIT_SLICE_NS)
-            try:
-                frame = ring.wait(wake_count, latest, timeout_ns, latest + 1 if in_order else None)
-            except Overrun:
-                self._accounts.record.overruns += 1
-                raise
-            if frame is not None and (known is None or frame.position > known):
-                self._count(frame)
-                return frame
-            look_around = frame is None
-
-    def _structure_changed(self) -> StructureChanged:
-        return StructureChanged(
-            f"service {self.name!r} came back with another structure; call reattach() and read it again"
-        )
-
-    def _why_nothing_came(self, max_age_s: float | None) -> str:
-        wanted = "newer frame" if max_age_s is None else f"frame younger than {max_age_s:g} s"
-        if not self.alive:
-            return f"no {wanted} of {self.name!r}: its writer is dead or was stopped; start it again"
-        if self.paused:
-            return f"no {wanted} of {self.name!r}: its writer is paused"
-        if not self._ring.latest:
-            return f"no frame of {self.name!r} yet: its writer is running, but has published nothing so far"
-        return f"no {wanted} of {self.name!r}: its writer is running, but is silent (hung, stopped or waiting)"
-
-    def _lags(self) -> bool:
-        """Whether the generation that is being read has newer frames, though there may be another one already."""
-        last = self._last
-        return last is not None and last < (self._ring.generation, self._ring.latest)
-
-    def _next_in_order(self) -> FrameT | None:
-        last = self._last[1] if self._last is not None and self._last[0] == self._ring.generation else None
-        if last is None:
-            return self._ring.copy()
-        frame = self._ring.copy(last + 1)
-        if frame is not None:
-            return frame
-        for _ in range(COPY_ATTEMPTS):  # it lost some
-            latest = self._ring.latest
-            oldest = max(last + 1, latest - self._ring.slot_count + 2)
-            for sequence in range(oldest, latest + 1):
-                frame = self._ring.copy(sequence)
-                if frame is not None:
-                    return frame
-        raise Overrun(
-            f"no slot of {self.name!r} could be read, {COPY_ATTEMPTS} times in a row: give it more slots, publish less"
-            " often, or start it again if it died while it filled one"
-        )
-
-    def _newest_now(self, take: Callable[[], FrameT | None], alive: bool) -> FrameT:
-        """The newest frame without a wait, so that this is the moment to count it."""
-        frame = self._taken(self._whole(take), alive)
-        self._end_turn()
-        return frame
-
-    def _whole(self, take: Callable[[], FrameT | None]) -> FrameT | None:
-        try:
-            return take()
-        except Overrun:
-            self._accounts.record.overruns += 1
-            raise
-
-    def _taken(self, frame: FrameT | None, alive: bool) -> FrameT:
-        frame = self._checked(frame, alive)
-        self._count(frame)
-        return frame
-
-    def _checked(self, frame: FrameT | None, alive: bool) -> FrameT:
-        if frame is None:
-            raise ServiceTimeout(f"service {self.name!r} has published nothing yet")
-        frame.stale = not alive
-        return frame
-
-    @property
-    def _last(self) -> Position | None:
-        """Position of the frame that was taken last."""
-        self._settle()
-        return self._last_taken
-
-    @_last.setter
-    def _last(self, position: Position | None) -> None:
-        self._come_back()
-        self._last_taken = position
-
-    def _deadline_ns(self, timeout_ns: int | None, in_c: bool) -> int | None:
-        """Of the wait for a frame that begins now, or began when C was asked for it."""
-        if timeout_ns is None:
-            return None
-        return (self._ring.begun_ns if in_c else now_ns()) + timeout_ns
-
-    def _go_round_in_c(self) -> None:
-        """Leave a loop's next turns to C, where there is C, until they have to be done here."""
-        if self._last_taken is not None:
-            self._turns_in_c = self._ring.resume_turns(self._last_taken[1], self._accounts.due_ns, self._open_turn)
-        if self._turns_in_c:
-            self._open_turn = None
-
-    def _come_back(self) -> None:
-        """The next turn is done here."""
-        if self._turns_in_c:
-            self._settle()
-            self._open_turn = self._ring.end_turn()
-            self._turns_in_c = False
-
-    def _settle(self) -> None:
-        """Count the frames that were taken in C since the last time."""
-        turns = self._ring.settle_turns() if self._turns_in_c else None
-        if turns is not None:
-            self._last_taken = self._ring.generation, turns.last
-            self._accounts.settle(turns)
-
-    def _end_turn(self) -> None:
-        """What was taken last is done with."""
-        self._come_back()
-        turn, self._open_turn = self._open_turn, None
-        self._accounts.end_turn(turn)
-
-    def _count(self, frame: FrameT) -> None:
-        last = self._last
-        lost = 0
-        if last is not None and frame.sequence > last[1] + 1:  # of this generation: _adopt saw to it
-            lost = frame.sequence - last[1] - 1
-        self._last = frame.generation, frame.sequence
-        self._accounts.taken(lost)
-        self._open_turn = frame.acquired_ns, now_ns()
-
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------
 
     def peek(self) -> Position | None:
@@ -463,10 +259,6 @@ class ServiceReader(Attachment[FrameT]):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.name!r} in {self.namespace.name!r}>"
-
-
-def _is_young(frame: Frame, max_age_s: float | None) -> bool:
-    return max_age_s is None or frame.age_ns <= max_age_s * NS_PER_S
 
 
 def _in_ns(timeout_s: float | None) -> int | None:

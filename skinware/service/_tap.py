@@ -9,7 +9,8 @@ from skinware.memory.futex import Word
 from skinware.memory.ring import FrameT, RingReader
 from skinware.realtime import now_ns
 from skinware.service._attachment import GENERATION_ENDED
-from skinware.service._reader import Position, ServiceReader
+from skinware.service._reader import ServiceReader
+from skinware.service._taking import Position
 
 
 def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -11,7 +11,7 @@ from skinware.memory import futex, segments
 from skinware.memory.announcement import Announcement
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.service._tap import Tap, wake_word_of
 from skinware.wire import KIND, WISH, service_name
 
@@ -95,6 +95,7 @@ class Collector:
         self._next_discovery_ns = self._next_life_ns = 0
         self._is_first_look = True
         self._trouble: dict[str, str] = {}
+        self._stopping = False
 
     @property
     def lost(self) -> int:
@@ -136,6 +137,25 @@ class Collector:
         words = [wake_word_of(source.reader) for source in self._sources.values()]
         if not any(self._has_more(source) for source in self._sources.values()):
             futex.sleep_on(words, until_ns)
+
+    def run(self, each_second: Callable[[], object]) -> None:
+        """Take what comes until ``stop``.
+
+        Args:
+            each_second: called once a second, between two takes.
+        """
+        second_ns = now_ns() + NS_PER_S
+        with short_turns():
+            while not self._stopping:
+                self.take()
+                if now_ns() >= second_ns:
+                    second_ns = max(second_ns + NS_PER_S, now_ns())
+                    each_second()
+                self.wait(WAIT_SLICE_NS)
+
+    def stop(self) -> None:
+        """End ``run``; from any thread, and from a signal handler."""
+        self._stopping = True
 
     def close(self) -> None:
         """Let go of all services. Idempotent."""

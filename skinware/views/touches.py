@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Generic, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from skinware.errors import (
-    BadServiceFile,
-    ConfigurationError,
-    Overrun,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureError,
-)
+from skinware.errors import StructureError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import FrameT
 from skinware.structure import Structure
@@ -22,6 +14,7 @@ from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsFrame, ContactsReader
 from skinware.tactile.motion_service import MotionFrame, MotionReader
 from skinware.tactile.source_reader import SourceReader
+from skinware.views.live_services import LiveServices
 
 
 class TouchedPlace(NamedTuple):
@@ -41,60 +34,15 @@ class TouchedPlace(NamedTuple):
     module: str
 
 
-class LiveSources(Generic[FrameT]):
-    """The services of one kind that tell something of drivers, in one namespace, followed live.
-
-    Args:
-        namespace: where to look.
-        reader: class of the readers of this kind.
-    """
-
-    def __init__(self, namespace: Namespace, reader: type[SourceReader[Any, FrameT]]) -> None:
-        self._namespace, self._reader = namespace, reader
-        self._readers: dict[str, SourceReader[Any, FrameT]] = {}
-
-    def look(self, names: Iterable[str]) -> None:
-        """Look for services of the kind that are new, and for those that went.
-
-        Args:
-            names: of the services that there are now; those of drivers may be missing.
-        """
-        there = set(names)
-        for name in self._readers.keys() - there:
-            self._drop(name)
-        for name in sorted(there - self._readers.keys()):
-            try:
-                self._readers[name] = self._reader(name, namespace=self._namespace)
-            except (BadServiceFile, ConfigurationError, ServiceNotFound):
-                continue  # another kind of service, or just gone
+class LiveSources(LiveServices[SourceReader[Any, FrameT], FrameT]):
+    """The services of one kind that tell something of drivers, in one namespace, followed live."""
 
     def of(self, driver: str) -> FrameT | None:
         """What was told last of a driver; None where no service tells anything."""
-        for name, reader in sorted(self._readers.items()):
+        for name, reader in self._readers.items():
             if reader.source.driver == driver:
-                return self._newest(name, reader)
+                return self._newest(name)
         return None
-
-    def close(self) -> None:
-        """Detach from all services. Idempotent."""
-        for name in list(self._readers):
-            self._drop(name)
-
-    def _newest(self, name: str, reader: SourceReader[Any, FrameT]) -> FrameT | None:
-        try:
-            reader.refresh()
-            if reader.structure_changed:
-                reader.reattach()
-            frame = reader.read(timeout_s=0.0)
-        except (ServiceTimeout, Overrun):
-            return None  # nothing published yet
-        except (ServiceNotFound, BadServiceFile):
-            self._drop(name)
-            return None
-        return None if frame.stale else frame
-
-    def _drop(self, name: str) -> None:
-        self._readers.pop(name).close()
 
 
 def live_contacts(namespace: Namespace) -> LiveSources[ContactsFrame]:

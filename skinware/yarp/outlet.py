@@ -23,7 +23,7 @@ import numpy.typing as npt
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.regions import Region
 from skinware.transfer.collecting import Collector
@@ -164,7 +164,6 @@ class Outlet:
         self._lives: list[Future[None]] = []
         self._vectors: dict[str, list[tuple[_Served, Vector]]] = {}
         self._told: dict[str, str] = {}
-        self._stopping = False
         self._collector = Collector(namespace, set(wanted.names) or None, self)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="skinware yarp")
@@ -177,23 +176,20 @@ class Outlet:
 
     def run(self, tell: Callable[[], object] = lambda: None) -> None:
         """Until ``stop``; ``tell`` is called once a second."""
-        tell_ns = now_ns() + NS_PER_S
-        with short_turns():
-            while not self._stopping:
-                self._collector.take()
-                if now_ns() >= tell_ns:
-                    tell_ns = max(tell_ns + NS_PER_S, now_ns())
-                    self._tell_trouble()
-                    tell()
-                self._collector.wait(WAIT_SLICE_NS)
+
+        def each_second() -> None:
+            self._tell_trouble()
+            tell()
+
+        self._collector.run(each_second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
-        self._stopping = True
+        self._collector.stop()
 
     def close(self) -> None:
         """Unregister all ports, and hang up. Idempotent."""
-        self._stopping = True
+        self._collector.stop()
         if self._loop.is_closed():
             return
         for served in self._ports.values():

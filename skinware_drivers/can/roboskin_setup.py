@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
-from skinware_drivers.can.roboskin_options import TRIANGLES, Inertial, Kind, RoboskinOptions, runs
+from skinware_drivers.can.roboskin_options import TRIANGLES, Inertial, Kind, RoboskinOptions, SpecialBoards, runs
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -102,6 +102,11 @@ class BoardSetUp:
     def _imu_mask(self) -> int:
         return sum(_IMU_BITS.get(sensor, 0) for sensor in self.inertial)
 
+    def _set_board(self, special: SpecialBoards) -> None:
+        self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
+        self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
+        self._no_load = self._no_load if special.no_load is None else special.no_load
+
     # The new way
 
     def _set_up_new(self, options: RoboskinOptions, modules: Iterable[Kind]) -> set[int]:
@@ -115,9 +120,7 @@ class BoardSetUp:
             if special.inertial is not None:
                 self.inertial = special.inertial
             if special.sets_board:
-                self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
-                self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
-                self._no_load = self._no_load if special.no_load is None else special.no_load
+                self._set_board(special)
                 self.special_board.append(self._board_configuration())
         for module in modules:
             if module.sets_triangles:
@@ -160,9 +163,7 @@ class BoardSetUp:
     def _set_up_old(self, options: RoboskinOptions, modules: Iterable[Kind], is_mtb4: bool) -> None:
         for special in options.special_boards:
             if self.board in special.boards:
-                self.period_ms = self.period_ms if special.period_ms is None else special.period_ms
-                self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
-                self._no_load = self._no_load if special.no_load is None else special.no_load
+                self._set_board(special)
         self._on.update(range(TRIANGLES) if options.enabled else ())
         for module in modules:
             if module.enabled is not None:

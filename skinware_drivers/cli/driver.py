@@ -16,10 +16,13 @@ import click
 from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
+    group_option,
     json_option,
+    log_to_stderr,
     namespace_option,
     print_json,
     run,
+    verbose_option,
     version_option,
 )
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
@@ -147,7 +150,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     type=click.Path(path_type=Path),
     help="TOML file with the positions of the sensors, which the driver publishes.",
 )
-@click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
+@group_option
 @click.option("--realtime", metavar="PROFILE", help="normal, or fifo:PRIORITY with 1 to 99: scheduling and memory.")
 @click.option("--cpus", metavar="LIST", help="CPUs to run on, such as 1,2-3.")
 @click.option(
@@ -167,7 +170,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @namespace_option
 @json_option
 @version_option
-@click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
+@verbose_option
 def command(
     buses: tuple[str, ...],
     driver_name: str | None,
@@ -209,9 +212,7 @@ def command(
     from skinware_drivers.running.guard import hook
     from skinware_drivers.running.runner import Runner
 
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="skin-driver: %(message)s", stream=sys.stderr
-    )
+    log_to_stderr(verbose)
     file = _read(config)
     settings = file.settings
     profile = _profile(settings.realtime if realtime is None else realtime, cpus, settings.cpus)

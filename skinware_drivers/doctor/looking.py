@@ -50,7 +50,8 @@ def look(namespace: Namespace, seconds: float, tell: Callable[[float], object] =
 def _bridges(namespace: Namespace) -> tuple[BridgeState, ...]:
     live = LiveBridges(namespace)
     try:
-        return tuple(live.look(namespace.services()))
+        live.look(namespace.services())
+        return tuple(live.states())
     except NamespaceError:
         return ()
     finally:

@@ -6,9 +6,10 @@ from typing import Literal
 
 import pytest
 
-from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock, why_python
+from skinware_drivers.testing.both_paths import Pair, hand_clock, why_python
 from skinware_drivers.testing.both_streams import both_streams
 from skinware_drivers.testing.defect import require
+from skinware_drivers.testing.one_path import Publishing
 from skinware_drivers.testing.rig import Running, play
 from skinware_drivers.testing.stumbling import Stumbling
 from skinware_drivers.testing.suite import Suite

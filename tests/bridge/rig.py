@@ -24,9 +24,9 @@ from tests.bridge.net import Net, NetLink
 ROBOT = "walle"
 
 
-def structure(sensors: int = 64) -> Structure:
-    """A patch of modules of eight sensors."""
-    modules = sensors // 8
+def structure(sensors: int = 64, dtype: str = "u2") -> Structure:
+    """A patch of modules of eight sensors; the last may have fewer."""
+    modules = -(-sensors // 8)
     return Structure(
         types=[PRESSURE.measured(unit="counts")],
         buses=["can0"],
@@ -37,7 +37,7 @@ def structure(sensors: int = 64) -> Structure:
         sensor_uid=np.arange(sensors),
         sensor_type=[PRESSURE.id] * sensors,
         sensor_module=np.arange(sensors) // 8,
-        dtype="u2",
+        dtype=dtype,
     )
 
 

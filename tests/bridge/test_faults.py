@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from skinware import DriverReader, DriverWriter
-from skinware.bridge.messages import VERSION, About, generation_message
+from skinware.bridge.messages import VERSION, About, Head, generation_message
 from skinware.errors import ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware_drivers.testing.waiting import wait_until
@@ -248,8 +248,8 @@ def test_another_version_is_told_whichever_is_older(
 def test_a_robot_whose_files_are_of_another_version_is_told(
     namespace: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def of_another(about: About, head: bytes) -> bytes:
-        return generation_message(about, head[:8] + bytes([9]) + head[9:])
+    def of_another(about: About, head: Head) -> bytes:
+        return generation_message(about, Head(head.raw[:8] + bytes([9]) + head.raw[9:]))
 
     monkeypatch.setattr("skinware.bridge.serving.generation_message", of_another)
     with (

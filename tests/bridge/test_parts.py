@@ -19,6 +19,7 @@ from skinware.bridge.messages import (
     CODED,
     RAW,
     About,
+    Head,
     Keys,
     coded_message,
     form_of,
@@ -185,7 +186,9 @@ def test_frames_and_generations_come_as_they_were(namespace: Namespace) -> None:
             message = coded_message(encoder.encode(frame))
             assert (form_of(message), generation_of(message)) == (CODED, frame.generation)
     about = About({"tare": "Take the present load as none."})
-    assert split_generation(generation_message(about, b"head" * 1000)) == (about, b"head" * 1000)
+    head = Head(b"head" * 1000)
+    assert split_generation(generation_message(about, head)) == (about, head.raw)
+    assert head.packed() is head.packed(), "it is packed once for all who ask"
 
 
 @given(st.binary(max_size=200))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
@@ -155,3 +155,28 @@ def test_a_robot_of_another_version_is_there_and_tells_nothing() -> None:
         wait_until(lambda: [(seen.robot, seen.version) for seen in watcher.robots()] == [("eve", 9)])
         other.close()
         wait_until(lambda: not watcher.robots())
+
+
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_a_robot_that_goes_as_its_clock_is_asked_for_leaves_nothing(moment: str) -> None:
+    with network() as net:
+        robot = NetLink(net)
+
+        class Vanishing(NetLink):
+            """The robot goes right before, or right after, somebody listens to the answers of its clock."""
+
+            def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:
+                end = super().listen(key, heard) if moment == "after" else None
+                if "/pong/" in key:
+                    robot.close()
+                    net.idle()
+                    watcher.stop()
+                return end or super().listen(key, heard)
+
+        link = Vanishing(net)
+        watcher = Watcher(link)
+        robot.be_there(Keys("eve", "0").token)
+        watcher.run()
+        assert not watcher.robots()
+        assert not [key for key, _ in net.listeners if "/pong/" in key]
+        link.close()

@@ -16,7 +16,8 @@ from skinware_drivers.bus import wire_dtype
 from skinware_drivers.conditions import Bits, Byte, Identifier
 from skinware_drivers.description import assemble
 from skinware_drivers.layout import Frame
-from skinware_drivers.testing.both_paths import Pair, Publishing, hand_clock
+from skinware_drivers.testing.both_paths import Pair, hand_clock
+from skinware_drivers.testing.one_path import Publishing
 
 _ROWS = 512
 _RIGHT, _WHOLE, _IN_ORDER = 0.9, 0.3, 0.5

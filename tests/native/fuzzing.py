@@ -37,7 +37,8 @@ from skinware_drivers.layout import (
     Values,
 )
 from skinware_drivers.registry import DRIVERS, load_driver
-from skinware_drivers.testing.both_paths import Pair, Publishing, Way
+from skinware_drivers.testing.both_paths import Pair
+from skinware_drivers.testing.one_path import Publishing, Way
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import flow_fuzzing
 from tests.native.skins import BusDesign, SkinDesign, nibbles, run_lengths

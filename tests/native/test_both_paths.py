@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.layout import Frame, Identifier, Layout, Values
-from skinware_drivers.testing.both_paths import Marking, MarkingAll, Pair, Publishing, hand_clock
+from skinware_drivers.testing.both_paths import Pair, hand_clock
+from skinware_drivers.testing.one_path import Marking, MarkingAll, Publishing
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native import needs_native
 from tests.native.fuzzing import designs

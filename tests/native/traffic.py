@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from skinware_drivers.bus import EXTENDED_FLAG, REMOTE_FLAG
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Bits, Byte, Frame, Identifier, Layout, SequenceNumber
-from skinware_drivers.testing.both_paths import Pair, Way
+from skinware_drivers.testing.both_paths import Pair
+from skinware_drivers.testing.one_path import Way
 from tests.native.skins import SkinDesign
 
 Wire = tuple[int, int, int, bytes]

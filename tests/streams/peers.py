@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
+from skinware.errors import BusNotAvailable
+from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Framing
+from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import FRAMING
 
 LOCAL = "127.0.0.1"
+ReadT = TypeVar("ReadT")
 
 
 class Server:
@@ -65,6 +69,32 @@ def opened(name: str, framing: Framing = FRAMING, **more: Any) -> Iterator[Seria
         yield bus
     finally:
         bus.close()
+
+
+def received(bus: Bus, batch: FrameBatch, read: Callable[[FrameBatch], list[ReadT]], count: int) -> list[ReadT]:
+    """What is read from the frames of a bus, when it is so many at least."""
+
+    def enough() -> bool:
+        bus.receive(batch, 0)
+        return len(read(batch)) >= count
+
+    wait_until(enough)
+    return read(batch)
+
+
+def why_lost(bus: Bus, batch: FrameBatch) -> str:
+    """Receive until the connection is no more: why."""
+    found: list[str] = []
+
+    def lost() -> bool:
+        try:
+            bus.receive(batch, 0)
+        except BusNotAvailable as error:
+            found.append(str(error))
+        return bool(found)
+
+    wait_until(lost)
+    return found[0]
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

@@ -18,7 +18,7 @@ from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.stuffing import LINES
 from skinware_drivers.streams.websocket import WebSocketBus
 from skinware_drivers.testing.waiting import wait_until
-from tests.streams.peers import LOCAL, free_port, server
+from tests.streams.peers import LOCAL, free_port, received, server, why_lost
 from tests.streams.webservers import Handler, WebServer, says, web_server
 
 TEXT = Delimited(stuffing=LINES, maximum_body=200, trusts_first=True)
@@ -49,28 +49,7 @@ def lines(batch: FrameBatch) -> list[bytes]:
 
 def take(bus: WebSocketBus, batch: FrameBatch, count: int) -> list[bytes]:
     """So many frames."""
-
-    def enough() -> bool:
-        bus.receive(batch, 0)
-        return len(batch) >= count
-
-    wait_until(enough)
-    return lines(batch)
-
-
-def until_lost(bus: WebSocketBus, batch: FrameBatch) -> str:
-    """Why the connection is no more."""
-    found: list[str] = []
-
-    def lost() -> bool:
-        try:
-            bus.receive(batch, 0)
-        except BusNotAvailable as error:
-            found.append(str(error))
-        return bool(found)
-
-    wait_until(lost)
-    return found[0]
+    return received(bus, batch, lines, count)
 
 
 def test_each_message_is_a_line_whatever_is_in_it() -> None:
@@ -120,7 +99,7 @@ def test_a_message_that_is_too_long_is_left_out_and_counted() -> None:
 
 def test_one_that_is_far_too_long_ends_the_connection_with_its_code() -> None:
     with heard(says("x" * (1 << 20) + "x")) as (bus, batch, _):
-        assert "1009" in until_lost(bus, batch)
+        assert "1009" in why_lost(bus, batch)
         assert bus.counters.refused == 1
 
 
@@ -131,7 +110,7 @@ def test_a_server_that_closes_is_quoted(code: int, reason: str) -> None:
         connection.close(code, reason)
 
     with heard(handle) as (bus, batch, there):
-        why = until_lost(bus, batch)
+        why = why_lost(bus, batch)
         assert f"the server has closed the connection: {code}" in why
         assert reason in why
         assert lines(batch) == [b"last words"]
@@ -156,7 +135,7 @@ def test_half_a_message_is_none_and_counted() -> None:
             return
 
     with heard(handle) as (bus, batch, _):
-        assert "without a word" in (why := until_lost(bus, batch)) or "lost" in why
+        assert "without a word" in (why := why_lost(bus, batch)) or "lost" in why
         assert lines(batch) == [b"whole"]
         assert bus.counters.refused == 1
 

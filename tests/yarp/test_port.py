@@ -21,6 +21,7 @@ from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.yarp_bus import YarpBus
 from skinware_drivers.streams.yarp_text import LENGTH, YarpText
 from skinware_drivers.testing.waiting import wait_until
+from tests.streams.peers import received, why_lost
 from tests.yarp.peers import LOCAL, PORT, Robot, robot, until_gone, vector
 
 TWELVE = [float(value) for value in range(12)]
@@ -58,27 +59,7 @@ def firsts(batch: FrameBatch) -> list[float]:
 
 def take(bus: YarpBus, batch: FrameBatch, count: int) -> list[float]:
     """So many frames."""
-
-    def enough() -> bool:
-        bus.receive(batch, 0)
-        return len(firsts(batch)) >= count
-
-    wait_until(enough)
-    return firsts(batch)
-
-
-def why_lost(bus: YarpBus, batch: FrameBatch) -> str:
-    found: list[str] = []
-
-    def lost() -> bool:
-        try:
-            bus.receive(batch, 0)
-        except BusNotAvailable as error:
-            found.append(str(error))
-        return bool(found)
-
-    wait_until(lost)
-    return found[0]
+    return received(bus, batch, firsts, count)
 
 
 def test_a_port_is_found_and_nothing_is_said_but_what_makes_it_speak() -> None:

@@ -34,11 +34,10 @@ from typing import Any
 import numpy as np
 from processes import own_namespace
 
-from skinware import DriverReader, DriverWriter, Namespace, Structure
+from skinware import DriverReader, DriverWriter, Namespace
 from skinware.errors import Overrun, ServiceNotFound, ServiceTimeout, SkinwareError, StructureChanged
 from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S, Periodic, now_ns
-from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.leaks import Belongings
 from tests.bridge.net import Net
 from tests.bridge.rig import joining, publish, serving, structure
@@ -62,25 +61,9 @@ GROWTH_FILES = 12
 # -- the driver ---------------------------------------------------------------------------------------------------
 
 
-def skin(sensors: int) -> Structure:
-    modules = -(-sensors // 8)
-    return Structure(
-        types=[PRESSURE.measured(unit="counts")],
-        buses=["can0"],
-        patch_name=["palm"],
-        patch_bus=[0],
-        module_patch=[0] * modules,
-        module_kind=["triangle"] * modules,
-        sensor_uid=np.arange(sensors),
-        sensor_type=[PRESSURE.id] * sensors,
-        sensor_module=np.arange(sensors) // 8,
-        dtype="i4",
-    )
-
-
 def drive(namespace: str, sensors: int, life: int) -> None:
     """Publish until somebody ends it: the number of the frame over all lives, which life this is, and the time, ms."""
-    with DriverWriter("arm", skin(sensors), namespace=namespace, rate_hz=RATE_HZ) as writer:
+    with DriverWriter("arm", structure(sensors, "i4"), namespace=namespace, rate_hz=RATE_HZ) as writer:
         timer, is_told = Periodic(RATE_HZ), False
         while timer.wait():
             columns = writer.begin()

@@ -44,7 +44,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _STRUCTURE = Match(0)
 _FIRST_S = 5.0
-_COUNTS = tuple(kind.measured(unit="counts", minimum=0, maximum=0xFFFF) for kind in (SHEAR_X, SHEAR_Y, PRESSURE))
+_COUNTS = tuple(kind.measured(unit="counts", minimum=0) for kind in (SHEAR_X, SHEAR_Y, PRESSURE))
 _NAMES = (tuple(kind.name for kind in _COUNTS), tuple(kind.name for kind in FORCE))
 _GRID_OF = re.compile(r"(?:uSPa|XR19|XR18)(\d)(\d)")
 _GRID_TEXT = re.compile(r"(\d+)=(\d{1,3})x(\d{1,3})")

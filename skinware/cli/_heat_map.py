@@ -246,10 +246,13 @@ class _Grid:
     margin: int
     compact: bool
     """Every block as a rectangle: what has another shape takes less room so."""
+    name: int
+    """Columns of the longest name above a block."""
 
     @property
     def width(self) -> int:
-        return (self.halves * self.zoom + 1) // 2
+        """Columns of a place: of a block, or of a name that is longer."""
+        return max((self.halves * self.zoom + 1) // 2, self.name)
 
     @property
     def pitch(self) -> int:
@@ -288,7 +291,8 @@ def _choose_grid(
         halves = min(natural, 2 * max(1, room // zoom))
         fits = halves == natural
         gap = 2 if zoom > 1 else 1
-        most = max(1, (room + gap) // ((halves * zoom + 1) // 2 + gap))
+        name = label_width if head else 0
+        most = max(1, (room + gap) // (max((halves * zoom + 1) // 2, name) + gap))
         rows_of_blocks = math.ceil(longest / most)
         grid = _Grid(
             zoom=zoom,
@@ -299,8 +303,9 @@ def _choose_grid(
             gap=0 if head else gap,
             margin=margin,
             compact=compact,
+            name=name,
         )
-        if head and (len(blocks) == 1 or not 0 < label_width <= grid.width):
+        if head and (len(blocks) == 1 or not 0 < label_width <= room):
             continue
         if fits and grid.lines(groups) <= height:
             return grid

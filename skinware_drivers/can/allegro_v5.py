@@ -16,7 +16,8 @@ On CAN, 1 Mbit/s, little-endian, identifier = number of the message << 2:
 Sense over UDP, from its port 7000 to port 8000, every 3 ms, little-endian: ``56 35 42 32``, version 1, type, length
 u16, number u32, ms u32; of type 2 follow 164 bytes: number of the sample u32, position and current of 16 joints
 (int16), the sixteen pads (u16, 0.1 kPa), velocity of the joints (int32). What the length counts is not known [INF]:
-datagrams of type 2 have 180 bytes, others are not shown. Which value means that there is none is not known either.
+datagrams of type 2 have 180 bytes, others are not shown. Which value means that there is none is not known either:
+65535, which is no pressure of a pad, is suspect.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.description import Module, Patch, taxels
+from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match, Reply
@@ -43,6 +44,8 @@ from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing, Unframed
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -56,9 +59,10 @@ _TIP_FRAMES = [
     for name, ids in TIPS.items()
     for one in ids
 ]
+_NONE, _MOST = 0xFF, 0xFE
+_PAD_FLAGS = (Sentinel(Status.NO_ACK, _NONE), Sentinel(Status.OUT_OF_RANGE, _MOST))
 _PAD_FRAMES = [
-    Frame(name, [Identifier(one)], [8], Values(0, "u1", 8), module=one, flags=[Sentinel(Status.NO_ACK, 0xFF)])
-    for name, one in PADS.items()
+    Frame(name, [Identifier(one)], [8], Values(0, "u1", 8), module=one, flags=_PAD_FLAGS) for name, one in PADS.items()
 ]
 _PA_IN_A_BYTE, _PA_OVER_UDP = 400.0, 100.0
 _AIR_PA = range(60_000, 150_000)
@@ -103,6 +107,7 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
                 [180],
                 Values(84, "<u2", N_PADS),
                 sequence=SequenceNumber(16, "<u4"),
+                flags=[Sentinel(Status.SUSPECT, 0xFFFF)],
             )
         ]
     )
@@ -111,6 +116,11 @@ class AllegroV5UdpDriver(SerialAdapter[AllegroV5Options]):
     def __init__(self, options: AllegroV5Options) -> None:
         super().__init__(options)
         self.geometry: Geometry | None = _places_of_pads(options.side)
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Hands that tell nothing but 0."""
+        return ZeroWatch(tables)
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         """Nothing is asked."""
@@ -161,6 +171,11 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         """Nothing is asked."""
         return False
 
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Modules that tell nothing but 0."""
+        return ZeroWatch(tables)
+
     def _take_tips(self) -> None:
         self.types = (PRESSURE.measured(offset=-float(self.options.zero_pa)),)
         self.dtype, self.layout = np.int32, Layout(_TIP_FRAMES)
@@ -171,7 +186,7 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         self.geometry = _places_of_tips(self.options.side)
 
     def _take_pads(self) -> None:
-        self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=254 * _PA_IN_A_BYTE),)
+        self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=_MOST * _PA_IN_A_BYTE),)
         self.dtype, self.layout = np.uint8, Layout(_PAD_FRAMES)
         modules = [
             Module(taxels(8, first_uid=8 * at), one, "pads", name) for at, (name, one) in enumerate(PADS.items())

@@ -37,13 +37,15 @@ from skinware_drivers.bus import LARGEST_STANDARD, identifier_text
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.can.linkerhand_touch import PARTS, TOUCH, Question, every_layout, parts_heard
 from skinware_drivers.conditions import Identifier
-from skinware_drivers.description import Patch
+from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.hand import FINGERS, Hand
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Heard, Link, Match
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
 from skinware_drivers.polling import Poll
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -181,6 +183,11 @@ class LinkerHandDriver(CanAdapter[LinkerHandOptions]):
                         link.bus_name,
                         _name(frame.identifier),
                     )
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Fingers that tell nothing but 0."""
+        return ZeroWatch(tables)
 
     @operation(looks=True)
     async def serial_number(self, link: Link, patches: Sequence[Patch]) -> dict[str, str]:

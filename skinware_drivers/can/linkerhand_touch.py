@@ -22,7 +22,8 @@ Beginnings = Mapping[tuple[int, int], int]
 """How many frames of a hand begin with this byte and have this length."""
 MATRIX = 0xB1
 """Command for the thumb's matrix; the next ones are for the others of ``PARTS``."""
-NO_DIRECTION = 255
+_SATURATED = Sentinel(Status.OUT_OF_RANGE, 255)
+"""The end of every range; of the direction of a force: there is none."""
 _HAND, _COMMAND = Bits(0, 11), Bits(0, 8, byte=0)
 _LONGEST_REPLY_S, _LONGEST_RUNS_S, _RUNS_WAIT_S = 0.008, 0.02, 0.05
 _RUN, _SUMS, _ASKS_FOR_RUNS = 5, 0xFF, 4
@@ -112,6 +113,7 @@ class Matrices(Touch):
                 Values(2, "u1", self.columns, to=range(row * self.columns, (row + 1) * self.columns)),
                 patch=_HAND,
                 module=_COMMAND,
+                flags=[_SATURATED],
             )
             for row in range(self.rows)
         ]
@@ -205,7 +207,8 @@ class RunMatrices(Touch):
             row, column = divmod(first, columns)
             values = Values(3, "u1", min(_RUN, count - first), to=range(first, min(first + _RUN, count)))
             at = Byte(1, row), Byte(2, column)
-            found.append(Frame(f"{name} {row}, {column}", [*when, *at], [values.end], values, _HAND, _COMMAND))
+            what = f"{name} {row}, {column}"
+            found.append(Frame(what, [*when, *at], [values.end], values, _HAND, _COMMAND, [_SATURATED]))
         return found
 
 
@@ -231,18 +234,10 @@ class FingerValues(Touch):
     def layout(self, identifier: Identifier) -> Layout:
         """Frames that stand alone. A sixth value, which some hands send, is dropped."""
         is_reply = identifier, Byte(len(FINGERS), 0, mask=0)  # long enough
-        is_direction = Byte(0, self.command + self.types.index(DIRECTION))
-        none = Sentinel(Status.OUT_OF_RANGE, NO_DIRECTION)
         lengths, values = (1 + len(FINGERS), 2 + len(FINGERS)), Values(1, "u1", len(FINGERS))
-        return Layout(
-            [
-                _other(identifier),
-                Frame(f"values {self.command:X}", is_reply, lengths, values, _HAND, _COMMAND),
-                Frame(
-                    f"directions {self.command:X}", (*is_reply, is_direction), lengths, values, _HAND, _COMMAND, [none]
-                ),
-            ]
-        )
+        what = f"values {self.command:X}"
+        frame = Frame(what, is_reply, lengths, values, _HAND, _COMMAND, [_SATURATED])
+        return Layout([_other(identifier), frame])
 
     def questions(self, parts: Sequence[str]) -> list[Question]:
         """One for each of the four."""
@@ -305,7 +300,6 @@ __all__ = [
     "DIRECTION",
     "FORCE",
     "MATRIX",
-    "NO_DIRECTION",
     "PARTS",
     "TANGENTIAL",
     "TOUCH",

@@ -94,6 +94,7 @@ class DriverLog:
         self._interval, self._delay = (np.zeros((n, BUCKETS), np.int64) for _ in range(2))
         self.load = np.zeros(len(self.structure.buses), np.uint16)
         self._always: npt.NDArray[np.uint8] = np.full(self.structure.n_sensors, 0xFF, np.uint8)
+        self._is_lit: npt.NDArray[np.bool_] = np.zeros(self.structure.n_sensors, bool)
 
     def take(self, frame: DriverFrame, tables: Tables, time_s: float) -> None:
         """Take in the next frame.
@@ -115,6 +116,7 @@ class DriverLog:
         self.load = np.maximum(self.load, np.where(frame.bus_load == 0xFFFF, 0, frame.bus_load))
         self._follow_states(frame, time_s)
         self._always &= frame.status
+        self._is_lit |= frame.values != 0
         self.frames += 1
         self.newest = frame
 
@@ -204,7 +206,7 @@ class DriverLog:
         )
 
     def affected(self, status: npt.NDArray[np.uint8]) -> tuple[dict[str, int], dict[str, tuple[str, ...]]]:
-        """Sensors by status, and the names of the first few of each but ``fresh``.
+        """Sensors by status, and the names of the first few of each but ``fresh``, and of modules that are dark.
 
         A sensor that was out of range for a while was pressed hard: only those that always are count as such.
 
@@ -213,10 +215,12 @@ class DriverLog:
         """
         shown = status & (self._always | ~np.uint8(Status.OUT_OF_RANGE))
         counts = count_statuses(shown)
+        dark = self._dark_modules()[self.structure.sensor_module]
+        named = np.where(dark, shown & ~np.uint8(Status.SUSPECT), shown)
         names = {
             bit.name.lower(): tuple(
                 self.structure.sensor_name(position)
-                for position in np.flatnonzero(shown & np.uint8(bit))[:_MOST_NAMES].tolist()
+                for position in np.flatnonzero(named & np.uint8(bit))[:_MOST_NAMES].tolist()
             )
             for bit in Status
             if bit.name and counts[bit.name.lower()]
@@ -224,8 +228,21 @@ class DriverLog:
         return counts, names
 
     def lines(self) -> tuple[str, ...]:
-        """Names of the rows and columns of matrices of which nothing good came, in no frame."""
-        return whole_lines(self.structure, (self._always & _BAD) != 0) if self.frames else ()
+        """Names of the rows and columns of matrices of which nothing good came, in no frame; of dark ones, none."""
+        dark = self._dark_modules()[self.structure.sensor_module]
+        return whole_lines(self.structure, ((self._always & _BAD) != 0) & ~dark) if self.frames else ()
+
+    def dark(self) -> dict[str, int]:
+        """The modules that told nothing but 0, and are suspect for it, with their numbers of sensors."""
+        sensors = np.bincount(self.structure.sensor_module, minlength=self.structure.n_modules)
+        dark = np.flatnonzero(self._dark_modules()).tolist()
+        return {self.structure.module_names[module]: int(sensors[module]) for module in dark}
+
+    def _dark_modules(self) -> npt.NDArray[np.bool_]:
+        is_dark = ((self._always & np.uint8(Status.SUSPECT)) != 0) & ~self._is_lit & (self.frames > 0)
+        found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
+        found[self.structure.sensor_module[~is_dark]] = False
+        return found
 
 
 __all__ = ["DriverLog"]

@@ -177,6 +177,7 @@ class DriverSeen:
         statuses: sensors by status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``, for people.
         lines: names of the rows and columns of matrices of which nothing good came.
+        dark: modules that told nothing but 0 and are suspect for it, with their numbers of sensors; none of ``lines``.
         buses, patches: its.
         timing: its.
         health: of its taxels; None: not judged.
@@ -196,6 +197,7 @@ class DriverSeen:
     statuses: Counts
     affected: Mapping[str, tuple[str, ...]]
     lines: tuple[str, ...]
+    dark: Mapping[str, int]
     buses: tuple[BusSeen, ...]
     patches: tuple[PatchSeen, ...]
     timing: Timing

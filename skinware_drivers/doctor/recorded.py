@@ -198,6 +198,7 @@ class _DriverTrack:
             statuses=statuses,
             affected=affected,
             lines=log.lines(),
+            dark=log.dark(),
             buses=_joined(log.buses(), [one.buses() for one in self._earlier]),
             patches=_joined(
                 log.patches(status, newest.published_ns),

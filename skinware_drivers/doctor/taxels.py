@@ -56,6 +56,7 @@ def check(evidence: Evidence) -> Iterator[Note]:
             AREA, f"driver {driver.name}", f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}"
         )
         yield from _statuses(driver)
+        yield from _dark(driver)
         yield from _lines(driver)
         yield from _health(driver)
         yield from _places(driver)
@@ -63,8 +64,8 @@ def check(evidence: Evidence) -> Iterator[Note]:
 
 def _statuses(driver: DriverSeen) -> Iterator[Finding]:
     for name, meaning in _BY_STATUS.items():
-        count = driver.statuses.get(name, 0)
-        if not count:
+        count = driver.statuses.get(name, 0) - (sum(driver.dark.values()) if name == "suspect" else 0)
+        if count <= 0:
             continue
         named = driver.affected.get(name, ())
         more = " ..." if count > len(named) else ""
@@ -81,6 +82,22 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
             meaning.action,
             (command,),
             _STATUS if name != "unhealthy" else _HEALTH,
+        )
+
+
+def _dark(driver: DriverSeen) -> Iterator[Finding]:
+    if driver.dark:
+        count = len(driver.dark)
+        named = "; ".join(list(driver.dark)[:_MOST_LINES])
+        yield Finding(
+            Severity.WARNING,
+            AREA,
+            f"{plural(count, 'module')} {'tells' if count == 1 else 'tell'} nothing but 0",
+            f"driver {driver.name}",
+            f"{named}{' ...' if count > _MOST_LINES else ''}",
+            "touch each once: those that go on with 0 are dead or switched off; look at their cables and plugs",
+            (f"skin-top {driver.name}",),
+            _STATUS,
         )
 
 

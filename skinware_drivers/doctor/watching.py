@@ -135,6 +135,7 @@ class _DriverWatch:
             statuses=statuses,
             affected=affected,
             lines=log.lines(),
+            dark=log.dark(),
             buses=log.buses(),
             patches=log.patches(status, now_ns()),
             timing=self._timing(life),

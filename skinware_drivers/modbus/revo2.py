@@ -40,9 +40,10 @@ from skinware_drivers.zero_watch import ZeroWatch
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _VENDOR = 0x7E07F << 12
-TANGENTIAL = SensorType("tangential_force", _VENDOR | 1, "counts", minimum=0, maximum=0xFFFE)
-DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0, maximum=0xFFFE)
-"""Of the tangential force. In which unit and from where on it counts is not known."""
+TANGENTIAL = SensorType("tangential_force", _VENDOR | 1, "counts", minimum=0)
+DIRECTION = SensorType("force_direction", _VENDOR | 2, "counts", minimum=0)
+"""Of the tangential force. In which unit and from where on it counts is not known, nor the end of any range: a firm
+press has a force of about 2500, and is to be seen."""
 _FORCES = ("pressure", TANGENTIAL.name, DIRECTION.name)
 
 _UNITS = {"left": 126, "right": 127}
@@ -89,10 +90,10 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
     """One hand."""
 
     types: Sequence[SensorType] = (
-        PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFE),
+        PRESSURE.measured(unit="counts", minimum=0),
         TANGENTIAL,
         DIRECTION,
-        PROXIMITY.measured(unit="counts", minimum=0, maximum=0xFFFF_FFFE),
+        PROXIMITY.measured(unit="counts", minimum=0),
     )
     dtype: npt.DTypeLike = np.float32
     baudrate = 460_800

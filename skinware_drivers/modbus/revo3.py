@@ -86,7 +86,7 @@ class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Revo3Driver(ModbusAdapter[Revo3Options]):
     """One hand."""
 
-    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
+    types: Sequence[SensorType] = (PRESSURE.measured(unit="counts", minimum=0),)
     dtype: npt.DTypeLike = np.uint16
     baudrate = 460_800
     largest_gap = 40

@@ -22,7 +22,7 @@ from msgspec import Meta
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.sensor_types import SensorType
-from skinware_drivers.description import Patch
+from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.hand import Hand
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link, Match
@@ -39,6 +39,8 @@ from skinware_drivers.serial.paxini_board import Board
 from skinware_drivers.serial.paxini_converter import IDENTIFIER, SENSORS, ConverterBoard, ask_version
 from skinware_drivers.serial.paxini_high_speed import HighSpeedBoard
 from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, TYPES
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 _HEADERS = 48
 """More than there is around the taxels in any body."""
@@ -175,6 +177,11 @@ class PaxiniDriver(SerialAdapter[PaxiniOptions]):
         patches = await self.describe(link)
         await self.start(link)
         return patches
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Modules that tell nothing but 0."""
+        return ZeroWatch(tables)
 
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:

@@ -30,7 +30,15 @@ from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.serial.paxini_board import Board
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, POINTS_OF_PART, TAXEL, model_of, module, values
+from skinware_drivers.serial.paxini_modules import (
+    MOST_POINTS,
+    POINTS_OF_PART,
+    SATURATED,
+    TAXEL,
+    model_of,
+    module,
+    values,
+)
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -252,7 +260,7 @@ def _frame(sensor: int, points: int) -> Frame:
     when: list[Condition] = [Identifier(sensor), *(Byte(1 + at, byte) for at, byte in enumerate(expected[1:]))]
     taxels_at = _BODY_HEADER + _BEFORE_TAXELS
     where = values(points, taxels_at, _BODY_HEADER, _RESULTANT_STEP)
-    return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor)
+    return Frame(f"sensor {sensor}", when, [taxels_at + TAXEL * points], where, patch=sensor, flags=SATURATED)
 
 
 __all__ = ["SENSORS", "VERSION_BYTES", "ConverterBoard", "ask_version", "read", "version_in", "write"]

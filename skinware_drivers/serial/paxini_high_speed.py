@@ -38,7 +38,7 @@ from skinware_drivers.serial.checksums import LRC
 from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from skinware_drivers.serial.paxini_board import Board
-from skinware_drivers.serial.paxini_modules import MOST_POINTS, TAXEL, Slot, module, nominal_places, values
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, SATURATED, TAXEL, Slot, module, nominal_places, values
 from skinware_drivers.serial.splitting import Split
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -268,7 +268,7 @@ def _frame(slot: Slot) -> Frame:
     where = values(slot.points, taxels_at, _LENGTH_AND_ERROR, _RESULTANT_STEP)
     has_error = Flag(Status.SUSPECT, _LENGTH_AND_ERROR - 1, "u1", mask=0xFF)
     when, length = [Identifier(slot.number)], [taxels_at + TAXEL * slot.points]
-    return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error])
+    return Frame(slot.name, when, length, where, module=slot.number, flags=[has_error, *SATURATED])
 
 
 def _is_empty(frame: Reply) -> bool:

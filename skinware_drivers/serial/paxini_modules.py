@@ -12,9 +12,10 @@ from dataclasses import dataclass
 
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE_X, FORCE_Y, FORCE_Z, SensorType
+from skinware.status import Status
 from skinware_drivers.description import Module, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
-from skinware_drivers.layout import Values
+from skinware_drivers.layout import Sentinel, Values
 
 TAXEL = 3
 """Bytes of a taxel."""
@@ -40,6 +41,8 @@ _RESULTANT_TYPES = (
     _normal(SensorType("resultant_z", _PAXINI << 12 | 3, "N")),
 )
 TYPES: Sequence[SensorType] = (*_TAXEL_TYPES, *_RESULTANT_TYPES)
+SATURATED: Sequence[Sentinel] = (Sentinel(Status.OUT_OF_RANGE, -128), Sentinel(Status.OUT_OF_RANGE, 255))
+"""The ends of ranges, but for 127 within the skin, which along the normal is in the middle."""
 
 POINTS_OF_PART: Mapping[str, int] = {
     "PXSR-STDCP03A": 239,
@@ -181,6 +184,7 @@ def _block(points: int) -> Grid:
 __all__ = [
     "MOST_POINTS",
     "POINTS_OF_PART",
+    "SATURATED",
     "TAXEL",
     "TYPES",
     "Slot",

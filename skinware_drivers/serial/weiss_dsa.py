@@ -29,9 +29,10 @@ from msgspec import Meta
 from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
-from skinware_drivers.description import Module, Patch, taxels
+from skinware.status import Status
+from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import FINGERS, PITCH_M, Grid, Hand
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import Above, AnyFlag, DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.options import check_options
@@ -39,6 +40,8 @@ from skinware_drivers.serial.answers import Refused
 from skinware_drivers.serial.framing import Encoding, Framing
 from skinware_drivers.serial.splitting import Split
 from skinware_drivers.serial.weiss import WeissAdapter, weiss_answers, weiss_packet
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -48,6 +51,7 @@ _PART, _TORN = 0x100, 0x200  # what the frame of a matrix is called, plus its nu
 _HEADER, _TIME = 5, 4
 _MOST_MATRICES, _MOST_CELLS = 16, 4096
 _FULL = 0xFFF
+_FLAGS: Sequence[AnyFlag] = (Sentinel(Status.OUT_OF_RANGE, _FULL), Above(Status.SUSPECT, _FULL))
 _PARTS = ("proximal", "distal")
 _WHOLE = weiss_packet(_HEADER + 2 * _MOST_CELLS, covers=(3, -2), bare_when_empty=True)
 
@@ -126,7 +130,8 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
                 Module(taxels(matrix.cells, first_uid=first), number, f"{matrix.rows}x{matrix.columns}", name)
             )
             cells = Values(_TIME, "<u2", matrix.cells)
-            frames.append(Frame(name, [Identifier(_PART | number)], [cells.end], cells, module=number, time=time))
+            when = [Identifier(_PART | number)]
+            frames.append(Frame(name, when, [cells.end], cells, module=number, time=time, flags=_FLAGS))
         for finger in range(min(len(FINGERS), -(-len(matrices) // 2))):
             of_finger = list(enumerate(matrices))[2 * finger : 2 * finger + 2][::-1]  # the distal one is above
             centres = Hand().down(FINGERS[finger], [matrix.grid for _, matrix in of_finger])
@@ -161,6 +166,11 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
         answer = await self._ask(link, _CONTROLLER, size=7)
         serial_number, hardware, software = struct.unpack_from("<IBH", answer)
         return {"serial_number": serial_number, "hardware": hardware, "software": software}
+
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Matrices that tell nothing but 0."""
+        return ZeroWatch(tables)
 
     def split(self) -> Split:
         """How the frames of this controller lie in the stream."""

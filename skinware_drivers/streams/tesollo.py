@@ -28,7 +28,7 @@ from skinware.errors import BusError
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.description import Module, Patch, Sensor
+from skinware_drivers.description import Module, Patch, Sensor, SkinTables
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
@@ -40,6 +40,8 @@ from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
 from skinware_drivers.serial.length_first import LengthFirst
 from skinware_drivers.serial.splitting import Part, Split, by_length
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -214,6 +216,11 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         self.tell(patch, Notice.CHANGED)
         return False
 
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Fingertips that tell nothing but 0."""
+        return ZeroWatch(tables)
+
     @operation(sets_up=True)
     async def tare(self, link: Link, patches: Sequence[Patch]) -> None:  # noqa: ARG002
         """Have the force sensors take what they feel as zero; tactile sensors have no such command."""
@@ -276,8 +283,8 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
 
 def _layout(hand: _Hand, tip: _Tip, order: Sequence[int]) -> Layout:
-    most = np.iinfo(np.dtype(tip.dtype)).max
-    saturated = (Sentinel(Status.OUT_OF_RANGE, most),) if tip.grid else ()
+    ends = np.iinfo(np.dtype(tip.dtype))
+    saturated = [Sentinel(Status.OUT_OF_RANGE, end) for end in (ends.min, ends.max) if end]
     values = Values(0, tip.dtype, tip.values, to=order)
     frames = [
         Frame(f"finger {number}", [Identifier(_FINGER | number)], [tip.size], values, module=number, flags=saturated)

@@ -30,21 +30,24 @@ from msgspec import Meta
 from skinware.errors import BusError, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
-from skinware_drivers.description import Module, Patch, taxels
+from skinware.status import Status
+from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid
-from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Values
+from skinware_drivers.layout import DeviceTime, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match
 from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.streams.xela_messages import RAW, Seen, XelaMessages
+from skinware_drivers.watch import Watch
+from skinware_drivers.zero_watch import ZeroWatch
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _STRUCTURE = Match(0)
 _FIRST_S = 5.0
-_COUNTS = tuple(kind.measured(unit="counts", minimum=0, maximum=0xFFFF) for kind in (SHEAR_X, SHEAR_Y, PRESSURE))
+_COUNTS = tuple(kind.measured(unit="counts", minimum=0) for kind in (SHEAR_X, SHEAR_Y, PRESSURE))
 _NAMES = (tuple(kind.name for kind in _COUNTS), tuple(kind.name for kind in FORCE))
 _GRID_OF = re.compile(r"(?:uSPa|XR19|XR18)(\d)(\d)")
 _GRID_TEXT = re.compile(r"(\d+)=(\d{1,3})x(\d{1,3})")
@@ -142,6 +145,11 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
                 if any(self._known.get(number) != sensor for number, sensor in seen.items()):
                     self.tell(self._describe(self._known)[0], Notice.CHANGED)
 
+    @classmethod
+    def watch(cls, tables: SkinTables) -> Watch:
+        """Sensors that tell nothing but 0."""
+        return ZeroWatch(tables)
+
     def _describe(self, seen: Seen) -> list[Patch]:
         frames, patches, places = [], [], []
         has_counts, has_forces = (any(forces is kind for _, _, forces in seen.values()) for kind in (False, True))
@@ -161,6 +169,7 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
                     Values(4, "<f4", 3 * count),
                     patch=number,
                     time=DeviceTime(0, "<u4", 1e-3),
+                    flags=[] if forces else [Sentinel(Status.OUT_OF_RANGE, 0xFFFF)],
                 )
             )
             if grid:

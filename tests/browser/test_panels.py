@@ -47,6 +47,23 @@ def let_rest(page: Page) -> None:
         eyes.append(tell(page, "skin.camera.position"))
 
 
+FIGURES_BESIDE_NAMES = """(() => {
+  const row = document.querySelector(a[0]), name = row.querySelector(".name"), cut = [];
+  const room = row.querySelector(".figures"), own = name.textContent;
+  let whole = 0;
+  for (let length = 1; length <= 40; length++) {
+    name.textContent = "n".repeat(length);
+    const box = room.getBoundingClientRect(), figure = room.firstElementChild.getBoundingClientRect();
+    if (figure.top >= box.bottom - 1) continue;
+    if (figure.left < box.left - 0.5 || figure.right > box.right + 0.5) cut.push(length);
+    else whole++;
+  }
+  name.textContent = own;
+  return [whole, cut];
+})()"""
+"""JavaScript: beside how many of 40 names the first figure of a row is seen whole, and beside which it is cut."""
+
+
 def test_a_taxel_is_named_where_the_mouse_points(sleeve: Sleeve, address: str, open_page: OpenPage) -> None:
     page = open_page(f"{address}#{RAW_SCALE}")
     until(page, READY)
@@ -92,6 +109,14 @@ def test_problems_stand_first_and_a_row_leads_to_its_taxels(sleeve: Sleeve, addr
     until(page, "skin.selected?.endsWith('/board 8')")
     page.wait_for_timeout(300)
     assert abs(look(page) - before).mean() > 1
+
+
+def test_a_figure_beside_a_long_name_is_whole_or_not_there(address: str, sleeve: Sleeve, open_page: OpenPage) -> None:
+    page = open_page(address)
+    until(page, f"{READY} && document.querySelector(a[0]).innerText.includes('Hz')", role("row"))
+    whole, cut = tell(page, FIGURES_BESIDE_NAMES, role("row"))
+    assert cut == []
+    assert 0 < whole < 40  # there is no room beside the longest
 
 
 def test_peaks_stay_and_zero_is_what_is_felt_now(sleeve: Sleeve, address: str, open_page: OpenPage) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,13 @@ from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, arrange, codes_of, levels_of, marks_of
 from skinware.errors import StructureError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
+from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.hand import FINGERS
 from tests.cli.fake_skin import fake_structure
+
+FINGERTIPS = [
+    Patch("hand", [Module(taxels(1, first_uid=n), n, "1x1", f"{finger} tip") for n, finger in enumerate(FINGERS[:3])])
+]
 
 
 def skin_of(modules_per_patch: list[int], sensors_per_module: int) -> Structure:
@@ -128,6 +136,19 @@ def test_sensors_are_drawn_as_large_as_they_fit() -> None:
 def test_modules_have_their_names_within_the_patch_where_there_is_room() -> None:
     arranged = arrange(fake_structure(4, 2), [1], "pressure", 80, 13)
     assert [label.text for labels in arranged.labels.values() for label in labels] == ["triangle 0", "triangle 1"]
+
+
+def test_modules_are_as_far_apart_as_their_names_need() -> None:
+    structure = assemble([("bus", FINGERTIPS)], [PRESSURE], "u2").structure
+    arranged = arrange(structure, [0], "pressure", 80, 20)
+    [line] = arranged.labels.values()
+    assert [label.text for label in line] == ["thumb tip", "index tip", "middle tip"]
+    for before, after in pairwise(line):
+        assert before.column + len(before.text) < after.column
+    assert [arranged.sensor_at(2, label.column) for label in line] == [0, 1, 2]
+    narrow = arrange(structure, [0], "pressure", 10, 20)
+    assert narrow.columns <= 10
+    assert len(narrow.labels) == 3  # below each other
 
 
 def test_a_triangle_is_drawn_as_one_and_as_a_block_where_that_is_too_high() -> None:

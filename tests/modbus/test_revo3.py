@@ -103,6 +103,16 @@ def test_the_emulated_hand_answers_as_the_table_says(mapping: Any, read: str, be
 # A server of somebody else's making
 
 
+def registers(mapping: str = "pressure") -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Of a hand whose taxels tell 1, 2, 3 ..., from 4000 on."""
+    begins = BEGINS if mapping == "pressure" else range(5240, 5900, 60)
+    found, taxel = np.zeros(2000, np.int64), 1
+    for begin, n in zip(begins, POINTS, strict=True):
+        found[begin - 4000 :][:n] = range(taxel, taxel + n)
+        taxel += n
+    return found
+
+
 @pytest.mark.parametrize("mapping", ["pressure", "matrix"])
 def test_a_server_with_a_hand_to_which_nothing_is_written_unless_somebody_wants_it(mapping: str) -> None:
     writes = []
@@ -111,16 +121,10 @@ def test_a_server_with_a_hand_to_which_nothing_is_written_unless_somebody_wants_
         if function == 16:
             writes.append((address, values))
 
-    begins = BEGINS if mapping == "pressure" else range(5240, 5900, 60)
-    registers = np.zeros(2000, int)
     expected = np.arange(1, 417)
-    at = 0
-    for begin, n in zip(begins, POINTS, strict=True):
-        registers[begin - 4000 :][:n] = expected[at : at + n]
-        at += n
     switches, zero = (4000, 4011) if mapping == "pressure" else (5900, 5214)
     with (
-        rtu_server(device(127, 4000, registers.tolist(), note), baudrate=460_800) as name,
+        rtu_server(device(127, 4000, registers(mapping).tolist(), note), baudrate=460_800) as name,
         reading(name, mapping=mapping, period_ms=20) as reader,
     ):
         read_until(reader, lambda frame: not frame.status.any() and (frame.values == expected).all())

@@ -100,7 +100,8 @@ def test_a_reply_of_a_sensor() -> None:
     types = decoder.tables.structure.types
     assert [t.name for t in types] == ["force_x", "force_y", "force_z", "resultant_x", "resultant_y", "resultant_z"]
     assert {(t.unit, t.scale) for t in types} == {("N", 0.1)}
-    assert not decoder.state.status.any()  # its status of 1 says nothing
+    end = int(Status.OUT_OF_RANGE)
+    assert decoder.state.status.tolist() == [end, 0, end, 0, 0, 0]  # the board's status of 1 says nothing
 
 
 def test_what_is_streamed_is_divided_by_slots() -> None:

@@ -93,7 +93,7 @@ async def look(
 
     Raises:
         BusNotAvailable: one of ``buses`` is not there.
-        ConfigurationError: one of ``driver_names`` is not there.
+        ConfigurationError: one of ``driver_names`` is not there, or one of ``buses`` is no name of a bus.
     """
     from skinware.errors import BusNotAvailable
     from skinware_drivers.bus_names import is_only_asked
@@ -102,10 +102,14 @@ async def look(
     from skinware_drivers.finding.interfaces import can_interfaces
     from skinware_drivers.finding.looking import listen
     from skinware_drivers.finding.running import running_drivers
+    from skinware_drivers.registry import make_bus
 
     drivers = known_drivers("can", driver_names)
     running = running_drivers()
     interfaces, ports, others = _chosen(buses, can_interfaces())
+    networks = [name for name in others if is_only_asked(name)]
+    for name in networks:
+        make_bus(name)  # refuses what cannot be one, whether or not anybody asks
     buses_to_hear = [one.name for one in interfaces if one.up]
     buses_to_hear += [name for name in others if not is_only_asked(name)]
     searching = asyncio.to_thread(_no_adapters if buses else detect_adapters, _DETECTION_S)
@@ -115,7 +119,6 @@ async def look(
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
         raise BusNotAvailable(problems[0])
-    networks = [name for name in others if is_only_asked(name)]
     answers = await _ask(heard, ports, networks, running, force, driver_names) if probe else {}
     return {
         "can": _can_data(interfaces, heard, answers, running, whole=not buses),

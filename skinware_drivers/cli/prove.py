@@ -29,11 +29,15 @@ from skinware.cli._command import (
     run,
     seconds,
     version_option,
+    warn,
 )
-from skinware.errors import ConfigurationError, DriverError, SkinwareError
+from skinware.errors import DriverError, SkinwareError
 
 if TYPE_CHECKING:
+    from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
+    from skinware_drivers.cli.capturing import Capture
+    from skinware_drivers.proving.files import ProofFiles
     from skinware_drivers.proving.proof import Proof
     from skinware_drivers.proving.walk import Step
 
@@ -115,10 +119,7 @@ def command(
 
     Exit status: 0 proven, 1 something failed, differs, or nothing was pressed, 2 wrong usage.
     """
-    from skinware.cli._driver_frames import reader_of
     from skinware.memory.namespace import Namespace
-    from skinware_drivers.proving.proof import Proof
-    from skinware_drivers.proving.walk import Manner, walk
 
     if name is not None and name.startswith("-"):  # there was nothing before the --
         driver_arguments, name = (name, *driver_arguments), None
@@ -133,32 +134,56 @@ def command(
         return
     if save:
         raise click.UsageError("--save is for --captured")
-    place = Namespace(namespace)
+    from skinware_drivers.proving.files import ProofFiles
+    from skinware_drivers.proving.proof import Proof
+    from skinware_drivers.proving.walk import Manner, walk
+
     stem = stem or Path(time.strftime(f"prove-{name or 'driver'}-%Y%m%d-%H%M%S"))
-    capture = stem.with_name(f"{stem.name}.mcap")
+    files = ProofFiles(stem)
+    files.refuse_old()
+    proof = Proof(name or "driver", "", _facts())
+    manner = Manner(type_name, only, patience_s, rest_s, with_tare)
     person = _AtTerminal(as_json)
-    proof = Proof(name or "driver", "", _facts(bool(driver_arguments), capture))
+    trouble: Exception | None = None
     with _interrupted_once() as undisturbed:
         try:
-            with contextlib.suppress(KeyboardInterrupt), contextlib.ExitStack() as beside:
-                if driver_arguments:
-                    name = beside.enter_context(_started(driver_arguments, name, place, capture))
-                reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
-                if not driver_arguments:
-                    from skinware_drivers.cli.capturing import captured as capturing
-
-                    beside.enter_context(capturing(capture, reader.name, place.name, lambda _done: None))
+            with _captured(name, driver_arguments, Namespace(namespace), files) as reader:
                 proof.driver, proof.driver_type = reader.name, reader.driver_type
-                walk(reader, person, Manner(type_name, only, patience_s, rest_s, with_tare), proof)
+                walk(reader, person, manner, proof)
                 undisturbed()
-        except SkinwareError:
-            if proof.checks:
-                _write(proof, stem)
-            raise
-        _write(proof, stem)
-    _tell(proof, stem, as_json)
+        except KeyboardInterrupt:
+            proof.about["ended early"] = f"interrupted{person.meanwhile}"
+        except (SkinwareError, OSError) as error:  # OSError: there is no terminal any more
+            undisturbed()
+            if not proof.checks:
+                raise
+            trouble = error
+            proof.about["ended early"] = f"{error}{person.meanwhile}"
+        proof.about["capture"] = files.capture_text(is_whole=bool(driver_arguments))
+        trouble = files.write(proof) or trouble
+    _tell(proof, files, as_json)
+    if trouble is not None:
+        raise trouble
     if not proof.is_proven:
         context.exit(EXIT_FAILED)
+
+
+@contextlib.contextmanager
+def _captured(
+    name: str | None, driver_arguments: Sequence[str], place: Namespace, files: ProofFiles
+) -> Iterator[DriverReader]:
+    """A reader of a driver that is captured as long as the block: of one that runs, or of one that is started."""
+    from skinware.cli._driver_frames import reader_of
+    from skinware_drivers.cli.capturing import captured
+
+    with contextlib.ExitStack() as beside:
+        if driver_arguments:
+            name = beside.enter_context(_started(driver_arguments, name, place, files))
+        reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
+        if not driver_arguments:
+            tell: Callable[[Capture], None] = lambda done: files.captured.update(done.told)  # noqa: E731
+            beside.enter_context(captured(files.capture, reader.name, place.name, tell))
+        yield reader
 
 
 def _refuse_others(context: click.Context, allowed: set[str]) -> None:
@@ -169,25 +194,25 @@ def _refuse_others(context: click.Context, allowed: set[str]) -> None:
             raise click.UsageError(f"--captured goes without {parameter.opts[0]}")
 
 
-def _facts(is_whole: bool, capture: Path) -> dict[str, str]:
+def _facts() -> dict[str, str]:
     versions = {"skinware": version("skinware"), "python": platform.python_version(), "linux": platform.release()}
-    beginning = "from the first byte on" if is_whole else "without what was said before skin-prove began"
     return {
         "date": time.strftime("%Y-%m-%d"),
         "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
         "verified against": "a device in the hands of its owner, as this table says",
-        "capture": f"{capture.name}, {beginning}",
     }
 
 
 @contextlib.contextmanager
 def _interrupted_once() -> Iterator[Callable[[], None]]:
-    """Ctrl-C, or SIGTERM, ends what the block does, once: what comes after it is undisturbed.
+    """Ctrl-C, SIGTERM, or a closed terminal, ends what the block does, once: what comes after it is undisturbed.
 
     Yields:
         What to call where the block is to be undisturbed without having been interrupted.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        numbers.append(signal.SIGHUP)
 
     def undisturbed() -> None:
         for number in numbers:
@@ -206,13 +231,13 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def _started(arguments: Sequence[str], name: str | None, place: Namespace, capture: Path) -> Iterator[str]:
-    """A driver that runs as long as the block, and its name.
+def _started(arguments: Sequence[str], name: str | None, place: Namespace, files: ProofFiles) -> Iterator[str]:
+    """A driver that runs as long as the block and captures, and its name.
 
     Raises:
         DriverError: it does not start; it has said why.
     """
-    more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(capture), "--json"]
+    more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(files.capture), "--json"]
     process = subprocess.Popen(
         [sys.executable, "-c", _DRIVER, *arguments, *more],
         stdin=subprocess.DEVNULL,
@@ -226,17 +251,19 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, captu
     def listen() -> None:
         assert process.stdout is not None  # noqa: S101 - it is a pipe
         for line in process.stdout:
-            event = json.loads(line)
+            event = _event_of(line)
             if event.get("event") == "ready":
                 told.update(event)
                 is_ready.set()
+            elif event.get("event") == "captured":
+                files.captured.update(event)
         is_ready.set()
 
     thread = threading.Thread(target=listen, daemon=True)
     try:
         thread.start()
         if not is_ready.wait(_STARTS_WITHIN_S) or not told:
-            raise DriverError(f"skin-driver publishes nothing; {capture} has what went over its buses: attach it")
+            raise DriverError(_why_nothing(files.capture))
         yield str(told["name"])
     finally:
         process.send_signal(signal.SIGINT)
@@ -250,15 +277,37 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, captu
             process.stdout.close()
 
 
+def _event_of(line: str) -> dict[str, Any]:
+    """What a driver tells; empty: what its author prints."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return {}
+    return event if isinstance(event, dict) else {}
+
+
+def _why_nothing(capture: Path) -> str:
+    if capture.exists():
+        return f"skin-driver publishes nothing; {capture} has what went over its buses: attach it"
+    return "skin-driver did not start"
+
+
 class _AtTerminal:
     """A person, or a program, that reads what is asked for and writes ``skip``."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
         self._is_there = sys.stdin is not None and not sys.stdin.closed
+        self._asked: Step | None = None
+
+    @property
+    def meanwhile(self) -> str:
+        """What was asked for last, as the end of a sentence."""
+        return f", while it asked: {self._asked.text}" if self._asked else ""
 
     def ask(self, step: Step) -> None:
         """Print it."""
+        self._asked = step
         if self._as_json:
             print_json({"event": "step", "wanted": step.wanted, "module": step.module, "text": step.text})
         else:
@@ -274,28 +323,20 @@ class _AtTerminal:
         return is_skipped
 
 
-def _write(proof: Proof, stem: Path) -> None:
-    import msgspec
-
-    try:
-        stem.with_name(f"{stem.name}.md").write_text(proof.as_markdown(), encoding="utf-8")
-        data = msgspec.json.format(msgspec.json.encode(proof.as_data()))
-        stem.with_name(f"{stem.name}.json").write_bytes(data + b"\n")
-    except OSError as error:
-        raise ConfigurationError(f"{error.filename}: {error.strerror}") from None
-
-
-def _tell(proof: Proof, stem: Path, as_json: bool) -> None:
+def _tell(proof: Proof, files: ProofFiles, as_json: bool) -> None:
     if as_json:
-        print_json(
-            {"event": "done", "files": [f"{stem}.{ending}" for ending in ("md", "json", "mcap")], **proof.as_data()}
-        )
+        print_json({"event": "done", "files": files.written, **proof.as_data()})
         return
     for check in proof.checks:
         verdict = click.style(f"{check.verdict.value:>10}", fg=_COLOURS[check.verdict.value])
         click.echo(f"{verdict}  {check.what}{f', {check.where}' if check.where else ''}: {check.seen}")
+    if "ended early" in proof.about:
+        click.echo(f"ended early: {proof.about['ended early']}")
     click.echo(click.style("proven" if proof.is_proven else "not proven", bold=True))
-    click.echo(f"written to {stem}.md, {stem}.json and {stem}.mcap; read them before you give them to others")
+    if files.captured.get("problem"):
+        warn(f"{files.capture} ended early: {files.captured['problem']}")
+    if files.written:
+        click.echo(f"written to {', '.join(files.written)}; read them before you give them to others")
 
 
 def main() -> None:

@@ -213,7 +213,7 @@ def _links(machine: Machine, paths: set[Path]) -> dict[Path, tuple[str, ...]]:
 
 
 def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, ...]], bool]:
-    """Who has the paths open, and whether every process could be looked at."""
+    """Who uses the paths, and whether every process could be looked at."""
     found: dict[Path, list[User]] = {}
     all_seen = True
     for process in machine.proc.glob("[0-9]*"):
@@ -225,9 +225,16 @@ def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, .
         except OSError:  # it ended meanwhile
             continue
         for path in paths:
-            if str(path) in targets and int(process.name) != os.getpid():
+            if str(path) in targets and int(process.name) != os.getpid() and not _is_other_end(process, path):
                 found.setdefault(path, []).append(User(int(process.name), _text(process / "comm")))
     return {path: tuple(users) for path, users in found.items()}, all_seen
+
+
+def _is_other_end(process: Path, path: Path) -> bool:
+    """Whether a process has made a pseudo terminal: it keeps it open for programs that come and go."""
+    if path.parent.name != "pts":
+        return False
+    return any(f"tty-index:\t{path.name}" in _text(info).splitlines() for info in (process / "fdinfo").glob("*"))
 
 
 def _natural(name: str) -> tuple[str, int]:

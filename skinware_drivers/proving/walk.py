@@ -76,7 +76,11 @@ class Manner:
 
 
 class _Missed(Exception):
-    """Nobody did what was asked for in time."""
+    """Nobody did what was asked for in time: which check has no answer, and why."""
+
+    def __init__(self, what: str, why: str) -> None:
+        super().__init__(why)
+        self.what = what
 
 
 class _Skipped(Exception):
@@ -149,7 +153,7 @@ class _Walk:
         except _Skipped:
             self._proof.add("right module", name, Verdict.SKIPPED, "not wanted")
         except _Missed as missed:
-            self._proof.add("right module", name, False, f"{missed} within {self._manner.patience_s:g} s")
+            self._proof.add(missed.what, name, False, f"{missed} within {self._manner.patience_s:g} s")
 
     def _tare(self) -> None:
         try:
@@ -233,7 +237,7 @@ class _Walk:
         self._ask("press", name, f"press {name}, and hold")
         held: deque[int] = deque(maxlen=_HELD_FRAMES)
         most, signed, values, frame = 0, 0.0, self._rest, None
-        for frame, values in self._patiently("nothing was felt"):  # noqa: B007 - the last one counts
+        for frame, values in self._patiently("right module", "nothing was felt"):  # noqa: B007 - the last one counts
             change = values - self._rest
             most = int(np.nanargmax(np.abs(change)))
             held.append(self._module_of(most) if abs(change[most]) > self._threshold else -1)
@@ -246,7 +250,7 @@ class _Walk:
         self._proof.add("sign", name, signed > 0, "grows" if signed > 0 else "goes down when it is pressed")
         self._look_at_range(name, values[taxels], frame)
         self._ask("let go", name, f"let go of {name}")
-        for _, values in self._patiently("some taxels did not come back to rest"):
+        for _, values in self._patiently("comes to rest", "some taxels did not"):
             if np.nanmax(np.abs(values - self._rest)) <= self._threshold:
                 break
 
@@ -294,7 +298,7 @@ class _Walk:
         taxels = self._taxels[module]
         found: list[Values] = []
         lifted_ns: int | None = None
-        for frame, values in self._patiently("no stroke was felt"):
+        for frame, values in self._patiently("order of taxels", "no stroke was felt"):
             change = np.abs(values[taxels] - self._rest[taxels])
             if change.max() > self._threshold:
                 found.append(change)
@@ -307,15 +311,15 @@ class _Walk:
 
     # -- frames ---------------------------------------------------------------------------------------------------
 
-    def _patiently(self, else_: str) -> Iterator[tuple[DriverFrame, Values]]:
-        """Frames until whoever takes them has what he wants.
+    def _patiently(self, what: str, else_: str) -> Iterator[tuple[DriverFrame, Values]]:
+        """Frames until whoever takes them has what he wants; else a check fails, and says why.
 
         Raises:
             _Missed: it took too long.
             _Skipped: the person does not want it.
         """
         yield from self._frames(after(self._manner.patience_s))
-        raise _Missed(else_)
+        raise _Missed(what, else_)
 
     def _frames(self, is_over: Callable[[], bool], *, may_skip: bool = True) -> Iterator[tuple[DriverFrame, Values]]:
         """Frames with physical values of the type, (n,); of taxels without data, those at rest.

@@ -11,7 +11,9 @@ from msgspec import Meta
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.emulator import CanFrame, Device, Emulator, EmulatorOptions
 
-_HEARD = "heard"  # in the memory of a device: the beginning of a command whose end it did not hear yet
+_HEARD = "heard"  # in the memory of a device: the beginning of a command whose end it did not hear yet, and when
+_LONGEST_PAUSE_NS = 200_000_000
+"""Within a command. What was begun longer ago is forgotten: its host has gone, or it was meant for another device."""
 
 
 class SerialEmulatorOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -81,7 +83,9 @@ class SerialEmulator(Emulator[OptionsT]):
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002
         """Take what the host wrote, in whatever pieces it comes."""
-        commands, device.memory[_HEARD] = self.cut(device.memory.get(_HEARD, b"") + payload)
+        begun, heard_ns = device.memory.get(_HEARD, (b"", now_ns))
+        commands, rest = self.cut(payload if now_ns - heard_ns > _LONGEST_PAUSE_NS else begun + payload)
+        device.memory[_HEARD] = rest, now_ns
         obeyed = False
         for command in commands:
             said = self.answer(device, command, now_ns)

@@ -30,7 +30,9 @@ PATCH_COUNTERS = ("orphans", "updates")
 TAXELS, THERMAL = 10, 2
 
 
-def fake_structure(patches: int = 4, modules: int = 16, *, buses: int = 1, dtype: npt.DTypeLike = "u1") -> Structure:
+def fake_structure(
+    patches: int = 4, modules: int = 16, *, buses: int = 1, dtype: npt.DTypeLike = "u1", kind: str = "triangle"
+) -> Structure:
     """Patches of modules of ten pressure and two temperature sensors, spread over buses."""
     n_modules = patches * modules
     per_module = [PRESSURE.id] * TAXELS + [TEMPERATURE.id] * THERMAL
@@ -43,7 +45,7 @@ def fake_structure(patches: int = 4, modules: int = 16, *, buses: int = 1, dtype
         patch_name=[f"board {7 + patch}" for patch in range(patches)],
         patch_bus=[patch * buses // patches for patch in range(patches)],
         module_patch=np.repeat(np.arange(patches), modules),
-        module_kind=["triangle"] * n_modules,
+        module_kind=[kind] * n_modules,
         sensor_uid=np.arange(n_modules * len(per_module)) + 1000,
         sensor_type=per_module * n_modules,
         sensor_module=np.repeat(np.arange(n_modules), len(per_module)),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from skinware_drivers.finding.adapters import CanAdapterFound, Detection
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.carrying import emulated_on_a_pty
+from tests.commands import running
 from tests.finding.fakes import see_only
 from tests.sdk.driving import driving, emulated
 
@@ -185,6 +188,23 @@ def test_the_port_of_an_emulator_is_a_port(capsys: pytest.CaptureFixture[str], t
     assert "weiss_wts" in port["probe"]["asked"]
 
 
+def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """It keeps the port open for programs that come and go; one that uses it is told of."""
+    link = tmp_path / "port"
+    with running("skin-emulate", "--driver", "weiss_wts", "--bus", f"pty:{link}") as emulator:
+        emulator.wait_for("ready")
+        (port,) = found_data(capsys, str(link), "--probe", "--driver", "weiss_wts")["ports"]
+        assert (port["users"], port["probe"]["refused"]) == ([], "")
+        terminal = os.open(link, os.O_RDONLY | os.O_NOCTTY)
+        with subprocess.Popen(["sleep", "60"], stdin=terminal) as user:
+            os.close(terminal)
+            (port,) = found_data(capsys, str(link))["ports"]
+            user.kill()
+    assert [one["pid"] for one in port["users"]] == [user.pid]
+
+
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
@@ -199,6 +219,8 @@ def test_the_port_of_an_emulator_is_a_port(capsys: pytest.CaptureFixture[str], t
         (["--listen", "-1"], 2, "seconds"),
         (["--udev", "can0"], 2, "no serial port"),
         (["serial:?serial_number=A5"], 3, "there is no serial port"),
+        (["tcp://127.0.0.1", "--probe"], 2, "bus tcp://127.0.0.1: which port? Write tcp://HOST:PORT"),
+        (["modbus:tcp://:70000"], 2, "Port out of range"),
     ],
 )
 def test_mistakes_get_one_clear_line_and_the_right_exit_code(

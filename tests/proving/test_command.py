@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
+import select
 import signal
 import socket
 import subprocess
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +20,11 @@ import pytest
 import skinware.recording
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
-from tests.commands import BIN, run
+from tests.commands import BIN, refused, run
+from tests.proving.rig import EmulatedHand, PressingPerson, hand, straight
 
 STRUCTURE = fake_structure(1, 2)
+MATRICES = fake_structure(1, 2, kind="2x5")
 REST, PRESSED = 240, 150
 
 
@@ -96,12 +102,19 @@ def is_there(pid: int) -> bool:
 
 @pytest.mark.parametrize(
     ("interrupted", "number"),
-    [("start", signal.SIGINT), ("rest", signal.SIGINT), ("press", signal.SIGTERM), ("let go", signal.SIGINT)],
+    [
+        ("start", signal.SIGINT),
+        ("rest", signal.SIGINT),
+        ("press", signal.SIGTERM),
+        ("press", signal.SIGHUP),  # its terminal is closed
+        ("let go", signal.SIGINT),
+        ("stroke down", signal.SIGINT),
+    ],
 )
 def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted: str, number: int) -> None:
     """Twice, as an impatient person does. There is a report of what was seen, which counts, and nothing goes on."""
     stem = tmp_path / "proof"
-    with publishing(FakeSkin("hand", STRUCTURE)) as skin, contextlib.ExitStack() as beside:
+    with publishing(FakeSkin("hand", MATRICES)) as skin, contextlib.ExitStack() as beside:
         rest = skin.values = STRUCTURE.sensor_uid * 0 + REST
         own = ["--json", "--rest", "30" if interrupted == "rest" else "0.5", "--wait", "60", "-o", str(stem)]
         nobody = beside.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1]
@@ -113,12 +126,14 @@ def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted:
             text=True,
         )
         assert prove.stdout is not None
-        started: set[int] = set()
+        event: dict[str, Any] = {}
         for line in () if interrupted == "start" else prove.stdout:
             event = json.loads(line)
             if event["wanted"] == interrupted:
                 break
             skin.values = rest if event["wanted"] in ("rest", "let go") else pressed(rest, 2)
+        if interrupted == "stroke down":
+            skin.values = pressed(rest, 2)  # the finger is on its way
         wait_until(lambda: bool(children_of(prove.pid)))
         if interrupted == "start":
             wait_until(lambda: (tmp_path / "proof.mcap").exists())  # the driver has begun
@@ -132,15 +147,111 @@ def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted:
     done = json.loads(rest_of_it.splitlines()[-1])
     assert done["event"] == "done"
     failures = any(check["verdict"] == "failed" for check in done["checks"])  # of the rate: the machine was too busy
-    is_proven = interrupted == "let go" and not failures
+    was_pressed = interrupted in ("let go", "stroke down")
+    is_proven = was_pressed and not failures
     assert (done["is_proven"], status) == (is_proven, int(not is_proven))
     told = json.loads((tmp_path / "proof.json").read_text())
     assert told == {key: value for key, value in done.items() if key not in ("event", "files")}
     assert (tmp_path / "proof.md").read_text().startswith("# Driver ")
     verdicts = [check["verdict"] for check in told["checks"] if check["what"] == "right module"]
-    assert verdicts == (["passed"] if interrupted == "let go" else [])
+    assert verdicts == (["passed"] if was_pressed else [])
+    meanwhile = "" if interrupted == "start" else f", while it asked: {event['text']}"
+    assert told["about"]["ended early"] == f"interrupted{meanwhile}"
     with skinware.recording.open(tmp_path / "proof.mcap") as recording:
         assert recording.is_whole
+
+
+def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Path) -> None:
+    """The driver does not come to an end with taring; then the report goes into a pipe that nobody reads yet."""
+    report, is_taring, may_end = tmp_path / "proof.md", threading.Event(), threading.Event()
+
+    def tare(_hand: EmulatedHand) -> None:
+        is_taring.set()
+        may_end.wait(60)
+
+    with hand(PressingPerson(), straight(), (), tare):
+        own = ("--json", "--tare", "--rest", "0.5", "--wait", "0.1", "--only", "index", "-o", str(tmp_path / "proof"))
+        prove = subprocess.Popen(
+            [BIN / "skin-prove", "hand", *own], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert is_taring.wait(60)
+            os.mkfifo(report)
+            os.kill(prove.pid, signal.SIGINT)
+            wait_until(lambda: not children_of(prove.pid))  # the capture is complete: it writes now
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+                os.kill(prove.pid, number)
+            reading = os.open(report, os.O_RDONLY | os.O_NONBLOCK)
+            os.set_blocking(reading, True)
+            wait_until(lambda: bool(select.select([reading], [], [], 0.1)[0]) or prove.poll() is not None)
+            with os.fdopen(reading, encoding="utf-8") as text:
+                assert text.read().startswith("# Driver hand: not proven")
+            said, _ = prove.communicate(timeout=60)
+        finally:
+            may_end.set()
+    assert prove.returncode == 1
+    done = json.loads(said.splitlines()[-1])
+    assert done["about"]["ended early"] == "interrupted, while it asked: leave the device alone"
+    assert json.loads((tmp_path / "proof.json").read_text())["checks"] == done["checks"]
+    with skinware.recording.open(tmp_path / "proof.mcap") as recording:
+        assert recording.is_whole
+
+
+def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(tmp_path: Path) -> None:
+    """What was seen until then is shown, whatever became of the files."""
+    with publishing(FakeSkin("hand", STRUCTURE)) as skin:
+        skin.values = STRUCTURE.sensor_uid * 0 + REST
+        own = ("--json", "--rest", "0.5", "--wait", "60", "-o", str(tmp_path / "proof"))
+        prove = subprocess.Popen(
+            [BIN / "skin-prove", "hand", *own],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert prove.stdout is not None
+        while json.loads(prove.stdout.readline())["wanted"] != "press":
+            pass
+        (tmp_path / "proof.md").mkdir()
+        (capture,) = children_of(prove.pid)
+        resource.prlimit(capture, resource.RLIMIT_FSIZE, (1, 1))  # as a full disk
+        wait_until(lambda: not is_there(capture))
+    said, errors = prove.communicate(timeout=60)
+    done = json.loads(said.splitlines()[-1])
+    assert prove.returncode == 1
+    assert done["about"]["ended early"].startswith("no newer frame of 'hand': its writer")
+    assert "; ended early: File too large" in done["about"]["capture"]
+    assert f"{tmp_path / 'proof.md'}: Is a directory" in errors
+    assert str(tmp_path / "proof.json") in done["files"]
+    assert json.loads((tmp_path / "proof.json").read_text())["checks"] == done["checks"]
+
+
+def test_what_cannot_be_written_is_said_before_somebody_walks(tmp_path: Path) -> None:
+    missing = refused("skin-prove", "-o", str(tmp_path / "no" / "proof"))
+    assert (missing.returncode, missing.stderr) == (
+        2,
+        f"skin-prove: -o {tmp_path / 'no' / 'proof'}: there is no folder {tmp_path / 'no'}\n",
+    )
+    (tmp_path / "proof.json").touch()
+    there = refused("skin-prove", "-o", str(tmp_path / "proof"), "--", "--bus", "virtual")
+    assert there.returncode == 2
+    assert f"{tmp_path / 'proof.json'}: exists already" in there.stderr
+
+
+def test_a_driver_whose_author_prints_is_heard_nevertheless(tmp_path: Path, tcp_patch: Callable[..., str]) -> None:
+    (tmp_path / "noisy.py").write_text(
+        "from skinware_drivers.serial.weiss_wts import WeissWtsDriver\n\n\n"
+        "class Noisy(WeissWtsDriver):\n"
+        "    def __init__(self, options):\n"
+        "        print('here I am')\n"
+        "        print(4)\n"
+        "        super().__init__(options)\n"
+    )
+    own = ("--rest", "0.3", "--wait", "0.2", "--only", "palm", "-o", str(tmp_path / "proof"))
+    bus = f"tcp://{tcp_patch('weiss_wts')}"
+    missed = run("skin-prove", *own, "--", "--driver", str(tmp_path / "noisy.py"), "--bus", bus)
+    assert missed.returncode == 1
+    assert "no module of noisy is called so" in missed.stderr
 
 
 def pressed(rest: Any, taxel: int) -> Any:

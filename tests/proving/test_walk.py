@@ -46,7 +46,7 @@ def test_another_module_that_answers_is_named_and_one_that_is_not_wanted_is_skip
     wiring = np.roll(straight(), N)
     proof = proven(PressingPerson(skipped=[MIDDLE], ignored=["stroke down"]), wiring, patience_s=3.0)
     wrong = failed(proof)
-    assert wrong["right module", INDEX] == "no stroke was felt within 3 s"
+    assert wrong["order of taxels", INDEX] == "no stroke was felt within 3 s"
     (check,) = [
         one for one in proof.checks if (one.what, one.where, one.verdict) == ("right module", MIDDLE, "skipped")
     ]

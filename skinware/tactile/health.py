@@ -33,6 +33,7 @@ from skinware.tactile.between import Pairs
 from skinware.tactile.calm import Calm
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
+from skinware.tactile.noise import Noise
 
 _APART_S = 1.0
 """Touches of a taxel with less time between them are one."""
@@ -42,12 +43,8 @@ _KEPT = 0.95
 """Of what was seen before, with each touch: a taxel that was mended is good again after some."""
 _CLEAR = 8.0
 """Times the noise: a touch that is no flicker."""
-_ENOUGH_FRAMES = 100
-"""At least, away from touches, to tell a noise; with fewer its measurement goes on."""
 _HARD = 0.25
 """Of what a taxel usually shows at most: what stays for a while after a touch is no other touch."""
-_GROWTH = 1.2
-"""So many times a noise may grow from one measurement to the next."""
 _LEAST_NOISE = 0.5
 """Of a step: no taxel counts as quieter than that."""
 _MOST_AT_ONCE = 2048
@@ -138,12 +135,8 @@ class Health:
         self._hardest_due, self._hardest_shown = np.zeros(n), np.zeros(n)
         self._touches = np.zeros(n, np.int64)
         self._weighed_s = np.full(n, -math.inf)
-        self._noise: Floats = np.full(n, np.nan, np.float32)
-        self._clipped: Floats = np.full(n, np.nan, np.float32)
+        self._noise = Noise(n, self.settings.noise_s)
         self._clear = _CLEAR * self._least_noise
-        self._measured_s = 0.0
-        self._was_free = np.zeros(n, bool)
-        self._squares, self._counted, self._at_end = (np.zeros(n, np.float32) for _ in range(3))
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: HealthSettings | None = None) -> Self:
@@ -174,7 +167,7 @@ class Health:
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
         self._frames += 1
-        self._measure(given, calm.usable & ~calm.touched)
+        self._measure(given, calm)
         self._note_changes(given, calm.usable, self._now_s - before_s)
         touched = calm.touched & calm.usable
         self._note_touches(touched, calm.value)
@@ -187,19 +180,20 @@ class Health:
         shown = self._share_shown()
         shown_around = self._share_around(shown)
         typical = max(self._typical_noise(), self._least_noise)
-        noise_times = self._noise / np.float32(typical or math.nan)
+        noise = self._noise.deviation
+        noise_times = noise / np.float32(typical or math.nan)
         still_s = np.where(self._seen, self._now_s - self._changed_s, math.nan)
         weak, dead = shown < self.settings.weak * shown_around, shown < self.settings.dead
         is_end = self._is_at_end(self._value) & (not self._rests_at_end())
         stuck = self._stuck(still_s, dead)
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
-            (HealthKind.NEVER_TOUCHED, self._seen & (self._peak <= _CLEAR * np.fmax(self._noise, typical))),
+            (HealthKind.NEVER_TOUCHED, self._seen & (self._peak <= _CLEAR * np.fmax(noise, typical))),
             (HealthKind.WEAK, weak & (self._touches >= 2 * self.settings.touches)),
             (HealthKind.DEAD, dead),
             (HealthKind.NOISY, noise_times > self.settings.noisy),
             (HealthKind.STUCK, stuck),
-            (HealthKind.CLIPPED, is_end & (stuck | (self._clipped > self.settings.clipped))),
+            (HealthKind.CLIPPED, is_end & (stuck | (self._noise.at_end > self.settings.clipped))),
         ):
             kind[where] = name
         arrays: dict[str, npt.NDArray[np.generic]] = {
@@ -207,9 +201,9 @@ class Health:
             "value": self._value,
             "still_s": still_s,
             "peak": self._peak,
-            "noise": self._noise,
+            "noise": noise,
             "noise_times": noise_times,
-            "clipped": self._clipped,
+            "clipped": self._noise.at_end,
             "touches": self._touches,
             "shown": shown,
             "shown_around": shown_around,
@@ -264,33 +258,16 @@ class Health:
         self._touches[taxels] += due > 0
         self._hardest_due[taxels] = 0
 
-    def _measure(self, given: Floats, free: Flags) -> None:
-        """Noise, by the differences from frame to frame, and time at an end of the range; both while not touched.
-
-        What presses nearby makes differences too: the least of some measurements counts.
-        """
-        both = free & self._was_free
-        difference = np.where(both, given - self._value, np.float32(0))
-        self._squares += difference * difference
-        self._counted += both
-        self._at_end += both & self._is_at_end(given)
-        self._was_free = free
-        if self._now_s - self._measured_s < self.settings.noise_s:
-            return
-        self._measured_s = self._now_s
-        enough = self._counted >= _ENOUGH_FRAMES
-        count = self._counted[enough]
-        noise = np.sqrt(self._squares[enough] / (2 * count))
-        self._noise[enough] = np.fmin(noise, _GROWTH * self._noise[enough])
-        self._clipped[enough] = self._at_end[enough] / count
-        self._clear = _CLEAR * max(self._typical_noise(), self._least_noise)
-        for total in (self._squares, self._counted, self._at_end):
-            total[enough] = 0
+    def _measure(self, given: Floats, calm: Calm) -> None:
+        """Noise, and time at an end of the range; both while not touched."""
+        low = given < calm.baseline - np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
+        if self._noise.add(self._now_s, given - self._value, self._is_at_end(given), low, calm):
+            self._clear = _CLEAR * max(self._typical_noise(), self._least_noise)
 
     # -- judging ------------------------------------------------------------------------------------------------
 
     def _typical_noise(self) -> float:
-        known = self._noise[np.isfinite(self._noise)]
+        known = self._noise.deviation[np.isfinite(self._noise.deviation)]
         return float(np.median(known)) if len(known) else 0.0
 
     def _is_at_end(self, values: Floats) -> Flags:
@@ -300,7 +277,7 @@ class Health:
 
     def _rests_at_end(self) -> bool:
         """Whether an end of the range is where untouched taxels are, as with hardware that cuts off its own noise."""
-        known = self._clipped[np.isfinite(self._clipped)]
+        known = self._noise.at_end[np.isfinite(self._noise.at_end)]
         return bool(len(known)) and float(np.median(known)) > _USUAL
 
     def _stuck(self, still_s: npt.NDArray[np.float64], dead: Flags) -> Flags:

@@ -191,6 +191,43 @@ def test_what_was_mended_is_good_again() -> None:
     assert names(health.report().kind)[middle] == "good"
 
 
+@pytest.mark.parametrize(
+    ("touched", "tared_s"),
+    [((-5, 7.0), None), ((-5, 7.0), 3.0), ((-5, 9.4), 8.0), ((7, 9.5), 8.0), ((7, 19.3), 8.0), ((1, 15.0), 2.0)],
+)
+def test_a_finger_that_leaves_what_was_tared_under_it_makes_no_noise(
+    touched: tuple[float, float], tared_s: float | None
+) -> None:
+    """The last frames of some of these fingers stand at the end of a measurement."""
+    world = World(grid(5, 4, 4), seed=1, rate_hz=20)
+    world.push(world.surface.position_m[37], 120, *touched, radius_m=0.006)
+    baseline, health = Baseline(world.surface.module, world.surface.patch), Health(world.surface.module)
+    for number, sample in enumerate(world.frames(45)):
+        values = sample.values.astype(np.float32)
+        health.update(sample.time_ns, values, baseline.update(sample.time_ns, values))
+        if tared_s == number / 20:
+            baseline.tare()
+        report = health.report()
+        assert not report.faulty.any(), (number / 20, told(report, np.flatnonzero(report.faulty)))
+    assert np.isfinite(report.noise).all(), "all was judged"
+
+
+def test_taxels_that_stay_far_below_their_baselines_are_judged_as_well() -> None:
+    """While baselines are held by an operator nothing follows them down."""
+    world = World(grid(5, 4, 4), seed=1, rate_hz=20)
+    world.noisy([11], 8)
+    world.jump(range(8, 16), -12, at_s=7)
+    baseline, health = Baseline(world.surface.module, world.surface.patch), Health(world.surface.module)
+    for number, sample in enumerate(world.frames(45)):
+        values = sample.values.astype(np.float32)
+        health.update(sample.time_ns, values, baseline.update(sample.time_ns, values))
+        baseline.hold(number > 120)
+    report = health.report()
+    assert np.isfinite(report.noise).all()
+    assert np.flatnonzero(report.faulty).tolist() == [11]
+    assert names(report.kind[[11]]) == ["noisy"]
+
+
 def still(values: list[list[float]], settings: HealthSettings, **how: object) -> HealthReport:
     """Frames at 10 Hz, each row for a second, of one module, without noise."""
     n = len(values[0])

@@ -11,12 +11,15 @@ them that are always the same; here everything is different each time, unless ``
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import os
 import shutil
-import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS, CACHE = ROOT / "tests" / "serial" / "seeds", ROOT / ".cache" / "fuzz"
@@ -24,25 +27,15 @@ MOST_KEPT, LONGEST_KEPT = 16, 400
 sys.path.insert(0, str(ROOT))
 
 
-def fuzz_one(name: str, arguments: list[str]) -> None:
-    """Fuzz one framing in this process; does not come back."""
+def instrumented() -> dict[str, Callable[[bytes], None]]:
+    """What runs an input, by name of its framing; imported so that the fuzzer sees the ways through the framers."""
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"  # what forks has one thread
     import atheris
 
-    with atheris.instrument_imports(include=["skinware_drivers.serial"]):
-        from tests.serial.fuzzing import known_examples, run
-    example = known_examples()[name]
-
-    def one(data: bytes) -> None:
-        run(example, data)
-
-    atheris.Setup([f"fuzz {name}", *arguments], one)
-    atheris.Fuzz()
-
-
-def libfuzzer(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run this program on one framing."""
-    command = [sys.executable, __file__, "--one", name, *arguments]
-    return subprocess.run(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+    with contextlib.redirect_stderr(io.StringIO()):  # a line for every module
+        with atheris.instrument_imports(include=["skinware_drivers.serial"]):
+            from tests.serial.fuzzing import known_examples, run
+    return {name: partial(run, example) for name, example in known_examples().items()}
 
 
 def corpus_of(name: str, seed: int | None) -> Path:
@@ -50,8 +43,18 @@ def corpus_of(name: str, seed: int | None) -> Path:
     return CACHE / (name if seed is None else f"{name}.seed-{seed}")
 
 
-def fuzz(name: str, seconds: float, seed: int | None) -> bool:
-    """Fuzz one framing for a time; tells whether it held."""
+def log_of(name: str) -> Path:
+    """What the fuzzer said of a framing the last time."""
+    return CACHE / f"{name}.log"
+
+
+def fuzz_one(name: str, one: Callable[[bytes], None], seconds: float, seed: int | None) -> NoReturn:
+    """Fuzz one framing for a time, and end this process; what is said of it goes into its log."""
+    import atheris
+
+    with log_of(name).open("wb") as log:
+        os.dup2(log.fileno(), sys.stdout.fileno())
+        os.dup2(log.fileno(), sys.stderr.fileno())
     corpus = corpus_of(name, seed)
     if seed is not None:
         shutil.rmtree(corpus, ignore_errors=True)  # what earlier runs found would lead elsewhere
@@ -59,8 +62,7 @@ def fuzz(name: str, seconds: float, seed: int | None) -> bool:
     seeds = SEEDS / f"{name}.hex"
     for number, line in enumerate(seeds.read_text().split() if seeds.exists() else []):
         (corpus / f"seed-{number:03}").write_bytes(bytes.fromhex(line))
-    done = libfuzzer(
-        name,
+    options = [
         f"-max_total_time={max(1, round(seconds))}",
         "-rss_limit_mb=1024",
         "-timeout=10",
@@ -69,20 +71,41 @@ def fuzz(name: str, seconds: float, seed: int | None) -> bool:
         "-print_final_stats=1",
         f"-seed={seed or 0}",  # 0: another each time
         f"-artifact_prefix={CACHE}/{name}.",
-        str(corpus),
-    )
-    lines = done.stdout.splitlines()
+    ]
+    atheris.Setup([sys.argv[0], *options, str(corpus)], one)
+    atheris.Fuzz()
+    sys.exit("the fuzzer came back")
+
+
+def tell(name: str, seed: int | None, held: bool) -> None:
+    """A line for one framing, and the end of its log if it broke."""
+    lines = log_of(name).read_text(errors="replace").splitlines()
     figures = dict(line[6:].split(": ") for line in lines if line.startswith("stat::"))
     runs, memory = figures.get("number_of_executed_units", "?"), figures.get("peak_rss_mb", "?")
-    inputs = sum(1 for _ in corpus.iterdir())
-    held = done.returncode == 0
+    inputs = sum(1 for _ in corpus_of(name, seed).iterdir())
     print(
         f"{name:18} {'held' if held else 'BROKEN':7} {runs:>8} runs  {inputs:4} inputs  {memory.strip():>4} MB",
         flush=True,
     )
     if not held:
-        print("\n".join(lines[-60:]))
-    return held
+        print("\n".join(lines[-60:]), flush=True)
+
+
+def fuzz_all(ones: dict[str, Callable[[bytes], None]], seconds: float, seed: int | None) -> bool:
+    """Fuzz framings for a time that they share, as many at once as there are processors; whether all held."""
+    CACHE.mkdir(parents=True, exist_ok=True)
+    waiting, running, all_held = list(ones), dict[int, str](), True
+    while waiting or running:
+        if waiting and len(running) < (os.cpu_count() or 1):
+            name = waiting.pop(0)
+            if (process := os.fork()) == 0:  # it has imported everything
+                fuzz_one(name, ones[name], seconds / len(ones), seed)
+            running[process] = name
+        else:
+            process, status = os.wait()
+            tell(running.pop(process), seed, held=status == 0)
+            all_held &= status == 0
+    return all_held
 
 
 def keep(name: str, seed: int | None) -> None:
@@ -96,26 +119,21 @@ def keep(name: str, seed: int | None) -> None:
 
 def main() -> None:
     """Entry point."""
-    if sys.argv[1:2] == ["--one"]:
-        fuzz_one(sys.argv[2], sys.argv[3:])
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="framings; default: all")
     parser.add_argument("--seconds", type=float, default=60, help="of fuzzing, for all of them together")
     parser.add_argument("--seed", type=int, metavar="N", help="the same inputs each time, from 1 on")
     parser.add_argument("--keep", action="store_true", help="write the inputs worth keeping as seeds")
     arguments = parser.parse_args()
-    from tests.serial.fuzzing import known_examples
-
-    known = list(known_examples())
-    names = arguments.names or known
+    known = instrumented()
+    names = arguments.names or list(known)
     if unknown := sorted(set(names) - set(known)):
         parser.error(f"no framing {', '.join(unknown)}; there are: {', '.join(known)}")
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # they wait for processes
-        held = list(pool.map(lambda name: fuzz(name, arguments.seconds / len(names), arguments.seed), names))
+    all_held = fuzz_all({name: known[name] for name in names}, arguments.seconds, arguments.seed)
     if arguments.keep:
         for name in names:
             keep(name, arguments.seed)
-    sys.exit(not all(held))
+    sys.exit(not all_held)
 
 
 if __name__ == "__main__":

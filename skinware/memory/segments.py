@@ -29,6 +29,8 @@ from skinware.memory.schema import STATIC_NAME, Schema, from_file
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_LEAST = file_layout.COLUMN_OFFSET
 _COUNT = struct.Struct("<Q")
+_ORPHAN_S = 2.0
+"""How long a child that was forked just before its parent was killed may take to close the lock that it inherited."""
 _HEAD_BYTES = file_layout.COLUMN_OFFSET + file_layout.COLUMN.itemsize * file_layout.MAX_COLUMNS
 
 
@@ -117,7 +119,11 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
     except OSError as error:
         raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
     descriptor = Descriptor(fd)
-    if not try_lock(fd):
+    deadline = time.monotonic() + _ORPHAN_S
+    while not try_lock(fd):
+        if time.monotonic() < deadline and _maker_is_dead(namespace, name):
+            time.sleep(0.005)
+            continue
         descriptor.close()
         raise NameInUse(
             f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
@@ -129,6 +135,16 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
         descriptor.close()
         raise NamespaceError(f"cannot remove what a dead {name!r} left in {namespace.path}: {error.strerror}") from None
     return descriptor
+
+
+def _maker_is_dead(namespace: Namespace, name: str) -> bool:
+    """Whether the process that made the newest generation has ended, as far as that can be known here."""
+    try:
+        header = attach(namespace, name).header
+    except (ServiceNotFound, BadServiceFile):
+        return False
+    is_here = header["pid_namespace"] == os.stat("/proc/self/ns/pid").st_ino
+    return bool(is_here and _start_ticks(int(header["writer_pid"])) != header["writer_start_ticks"])
 
 
 def previous(namespace: Namespace, name: str) -> Segment | None:
@@ -397,7 +413,11 @@ def _header(
     return header
 
 
-def _start_ticks() -> int:
-    """When this process began, in clock ticks since boot: field 22 of proc(5) stat."""
-    with open("/proc/self/stat", encoding="ascii", errors="replace") as file:
-        return int(file.read().rpartition(")")[2].split()[19])
+def _start_ticks(process: int | str = "self") -> int:
+    """When a process began, in clock ticks since boot; 0: it has ended. Fields 22 and 3 of proc(5) stat."""
+    try:
+        with open(f"/proc/{process}/stat", encoding="ascii", errors="replace") as file:
+            fields = file.read().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    return int(fields[19]) if fields[0] not in "ZX" else 0

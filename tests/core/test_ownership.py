@@ -14,7 +14,7 @@ import pytest
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, NameInUse, NamespaceError, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
-from skinware.memory.locks import ForkGuard
+from skinware.memory.locks import Descriptor, ForkGuard
 from skinware.service import RequestServer
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
@@ -74,6 +74,28 @@ def test_a_forked_child_does_not_make_a_dead_driver_look_alive(tmp_path: Path, n
                 again.commit(1)
                 assert not reader.read(newer_than=frame).stale
         until.touch()
+
+
+def fork_and_die() -> None:
+    """The child has not yet given up what it inherited when its parent is dead."""
+
+    def abandon_slowly(descriptor: Descriptor) -> None:
+        time.sleep(0.1)
+        descriptor.close()
+
+    writer = ServiceWriter("x", COLUMNS)
+    Descriptor.abandon = abandon_slowly  # type: ignore[method-assign]
+    if os.fork() == 0:
+        os._exit(0)
+    assert not writer.closed
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_driver_that_was_killed_while_it_forked_can_be_started_again_at_once(namespace: Namespace) -> None:
+    with Crew() as crew:
+        crew.finish(crew.start(fork_and_die), -signal.SIGKILL)
+        with ServiceWriter("x", COLUMNS) as again:
+            assert not again.closed
 
 
 def make_namespace(lines: int) -> None:

@@ -171,7 +171,7 @@ def test_exceptions_are_counted_and_values_come_when_they_end(way: str) -> None:
         return ExcCodes.DEVICE_BUSY if is_busy else None
 
     with tcp_server(palm(act)) as name, driven(name, wait=False) as (driving, reader):
-        wait_until(lambda: driving.runner is not None and counted(driving)["errors"] > 5)
+        wait_until(lambda: driving.runner is not None and counted(driving).get("errors", 0) > 5)
         is_busy = False
         until_right(reader)
 

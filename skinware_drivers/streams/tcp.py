@@ -151,14 +151,8 @@ class ListeningPort(Port):
             self._caller = None
 
 
-class TcpServerBus(NetworkBus):
-    """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
-
-    ``note`` tells where it listens.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
-    """
+class _TcpEnd(NetworkBus):
+    """An end of a connection."""
 
     scheme: ClassVar[str] = "tcp"
 
@@ -168,11 +162,21 @@ class TcpServerBus(NetworkBus):
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
         self._options = options_from_strings(TcpOptions, options or {})
 
+
+class TcpServerBus(_TcpEnd):
+    """The device's end of a connection, for emulators: ``skin-emulate --bus tcp://HOST:PORT``.
+
+    ``note`` tells where it listens.
+
+    Raises:
+        ConfigurationError: no such address, or an option is unknown or has a bad value.
+    """
+
     def _open_port(self) -> Port:
         return ListeningPort(self._address, self._options.patience_s)
 
 
-class TcpBus(NetworkBus):
+class TcpBus(_TcpEnd):
     """A connection to a device, or to a converter of serial lines. Its name is ``tcp://HOST:PORT?key=value``.
 
     Args:
@@ -185,15 +189,8 @@ class TcpBus(NetworkBus):
         ConfigurationError: no such address, or an option is unknown or has a bad value.
     """
 
-    scheme: ClassVar[str] = "tcp"
     needs_host: ClassVar[bool] = True
     device_end: ClassVar[Callable[..., Bus] | None] = TcpServerBus
-
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options = options_from_strings(TcpOptions, options or {})
 
     def _open_port(self) -> Port:
         return TcpPort(f"tcp://{self._address}", connect(self._address), self._options.patience_s)

@@ -48,4 +48,4 @@ class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         check_options(self)
 
 
-__all__ = ["EmulatorOptions"]
+__all__ = ["Count", "EmulatorOptions", "Probability", "Seconds"]

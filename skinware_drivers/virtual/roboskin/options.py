@@ -9,10 +9,7 @@ from msgspec import Meta
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import check_options
-
-Probability = Annotated[float, Meta(ge=0, le=1)]
-Seconds = Annotated[float, Meta(ge=0)]
-Count = Annotated[int, Meta(ge=0)]
+from skinware_drivers.virtual.emulator_options import Count, Probability, Seconds
 
 _PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
 _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))

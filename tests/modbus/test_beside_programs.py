@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymodbus.client import ModbusSerialClient
+from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
 from skinware import DriverReader
 from skinware_drivers.modbus.adapter import ModbusAdapter
@@ -23,12 +23,13 @@ from skinware_drivers.testing.waiting import read_until
 from tests.modbus import test_inspire as inspire
 from tests.modbus import test_revo2 as revo2
 from tests.modbus import test_revo3 as revo3
-from tests.modbus.peers import device, line, rtu_server, rtu_server_on
+from tests.modbus.peers import device, line, rtu_server, rtu_server_on, tcp_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, counted, driven, with_options
+from tests.streams.peers import LOCAL
 
 pytestmark = PYMODBUS
 BAUDRATE = 460_800
-TARGET, ANGLE = 5, 1234
+MOVES, ANGLE = 5, 1234
 
 
 @dataclass(frozen=True)
@@ -105,11 +106,22 @@ def test_a_program_moves_the_hand_through_the_gateway(hand: Hand, tmp_path: Path
         with driven(gateway, hand.adapter()) as (_, reader):
             until_right(reader, hand)
             with ModbusSerialClient(str(port), baudrate=BAUDRATE, timeout=30, retries=0) as program:
-                for angle in range(ANGLE, ANGLE + TARGET):
+                for angle in range(ANGLE, ANGLE + MOVES):
                     program.write_register(hand.moves, angle, device_id=hand.unit)
                     told = program.read_holding_registers(hand.moves, count=1, device_id=hand.unit)
                     assert told.registers == [angle]
             until_right(reader, hand)
+
+
+def test_a_program_moves_the_hand_over_a_connection_of_its_own() -> None:
+    hand = HANDS["inspire"]
+    with tcp_server(hand.server()) as name, driven(with_options(name, PATIENTLY), hand.adapter()) as (driving, reader):
+        until_right(reader, hand)
+        with ModbusTcpClient(LOCAL, port=int(name.rpartition(":")[2]), timeout=30, retries=0) as program:
+            for angle in range(ANGLE, ANGLE + MOVES):
+                program.write_register(hand.moves, angle, device_id=hand.unit)
+                until_right(reader, hand)
+        assert counted(driving)["refused"] == 0
 
 
 def test_what_a_program_reads_is_overheard(hand: Hand) -> None:

@@ -174,6 +174,17 @@ def test_a_sensor_that_changes_is_described_anew(namespace: object) -> None:
         suite.over.set()
 
 
+def test_two_drivers_of_one_server(namespace: object) -> None:
+    suite, patient = Suite(), {"period_ms": 1000}  # of a busy machine
+    with web_server(suite) as there:
+        with emulated_skin("xela_server", bus=there.bus, name="one", driver_options=patient) as one:
+            with emulated_skin("xela_server", bus=there.bus, name="two", driver_options=patient) as two:
+                for skin in (one, two):
+                    newest = int(read_until(skin.reader, lambda f: not f.status.any()).module_time_ns.max())
+                    read_until(skin.reader, lambda f, then=newest: bool((f.module_time_ns > then).all()))  # type: ignore[misc]
+        suite.over.set()
+
+
 def send_some(connection: ServerConnection) -> None:
     """Messages for a second, about."""
     over = threading.Event()

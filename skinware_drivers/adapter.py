@@ -89,9 +89,11 @@ class Adapter(HasOptions[OptionsT], ABC):
         Raises:
             ConfigurationError: something is missing, or contradicts something else; the message says what.
         """
+        name = type(self).__name__
+        if not self.period_s > 0:
+            raise ConfigurationError(f"{name}: period_s = {self.period_s!r}: give the seconds between two updates")
         if type(self).describe is not Adapter.describe:
             return
-        name = type(self).__name__
         for needed in ("types", "layout", "patches"):
             if not getattr(self, needed, None):
                 raise ConfigurationError(f"{name} has no `{needed}`")

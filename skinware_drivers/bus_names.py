@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import NamedTuple
 from urllib.parse import parse_qsl
 
@@ -46,7 +47,7 @@ def parse_bus_name(name: str) -> BusName:
     python-can's interfaces of names that are ours are ``can+virtual:`` and ``can+serial:``.
 
     Raises:
-        ConfigurationError: empty, or options that are not ``key=value``.
+        ConfigurationError: empty, options that are not ``key=value``, or neither a connection nor a port for Modbus.
     """
     address, _, query = name.partition("?")
     if "=" in address and "/" not in address:
@@ -57,7 +58,10 @@ def parse_bus_name(name: str) -> BusName:
         options = dict(parse_qsl(query, keep_blank_values=True, strict_parsing=True)) if query else {}
     except ValueError:
         raise ConfigurationError(f"bus {name!r}: write options as ?key=value&key=value") from None
-    return BusName(*_split(address), options)
+    interface, channel = _split(address)
+    if interface == "modbus":
+        _check_modbus(channel, options)
+    return BusName(interface, channel, options)
 
 
 def is_only_asked(name: str) -> bool:
@@ -77,6 +81,18 @@ def place_of_bus(name: str) -> BusPlace:
     usual = dict.fromkeys(sorted(given), "") if interface == "virtual" else _PLACING.get(interface, {})
     options = tuple((key, given.get(key, value)) for key, value in usual.items())
     return BusPlace(interface, os.path.realpath(channel) if channel.startswith("/") else channel, options)
+
+
+def _check_modbus(channel: str, options: Mapping[str, str]) -> None:
+    """Refuse what looks like a device over TCP, or like nothing."""
+    is_by_what_it_is = not channel and options.keys() & {"serial_number", "vid_pid"}
+    if is_by_what_it_is or ("/" in channel and not channel.startswith("tcp:")) or channel.startswith("tcp://"):
+        return
+    host = channel.removeprefix("tcp:").strip("/") or "HOST"
+    raise ConfigurationError(
+        f"bus modbus:{channel}: over TCP that is modbus:tcp://{host}, and a serial port modbus:/dev/ttyUSB0, or"
+        f" modbus:./{channel or 'port'}"
+    )
 
 
 def _split(address: str) -> tuple[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast, get_args
 
 import msgspec
 import numpy as np
@@ -24,6 +24,14 @@ from skinware_drivers.options import OptionsT
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
 
 _MOST_BLOCKS = 200
+_LIMITS: dict[str, tuple[float, float]] = {
+    "address_step": (1, 0xFFFF),
+    "largest_gap": (0, 0xFFFF),
+    "most_registers": (1, wire.MOST_REGISTERS),
+    "timeout_s": (1e-6, 3600),
+    "period_s": (1e-6, 3600),
+}
+_WORDS = {"byte_order": get_args(Order), "word_order": get_args(Order)}
 _UNHURRIED = 1.25
 """Of the time that bytes take: devices take some before they answer."""
 
@@ -101,9 +109,15 @@ class ModbusAdapter(Adapter[OptionsT]):
         Raises:
             ConfigurationError: something is missing, or contradicts something else; the message says what.
         """
-        if type(self).describe is Adapter.describe and not self.registers:
-            raise ConfigurationError(f"{type(self).__name__} has no `registers`")
+        is_declared, name = type(self).describe is Adapter.describe, type(self).__name__
+        if is_declared and not self.registers:
+            raise ConfigurationError(f"{name} has no `registers`")
+        for what, words in _WORDS.items():
+            if getattr(self, what) not in words:
+                raise ConfigurationError(f"{name}: {what} = {getattr(self, what)!r}: give {' or '.join(words)}")
         super().check()
+        if is_declared:
+            self._check_keys()
 
     def fit(self, bus: Bus) -> None:
         """Tell the bus what to ask.
@@ -188,17 +202,35 @@ class ModbusAdapter(Adapter[OptionsT]):
             raise ModbusException(f"{link.bus_name}, unit {unit}: {wire.exception_text(code)}", code)
         return reply.payload
 
+    def _check_keys(self) -> None:
+        modules = {patch.key: [module.key for module in patch.modules] for patch in self.patches}
+        for block in self.registers:
+            if block.patch is not None and block.patch not in modules:
+                raise ConfigurationError(f"{block.name}: no patch has the key {block.patch}; there are: {[*modules]}")
+            patches = list(modules) if block.patch is None else [block.patch]
+            there = [key for patch in patches for key in modules[patch]]
+            if block.module is not None and block.module not in there:
+                raise ConfigurationError(f"{block.name}: no module has the key {block.module}; there are: {there}")
+
     def _layout(self) -> Layout:
+        name, declared = type(self).__name__, cast("object", self.registers)
+        if not isinstance(declared, Sequence) or not all(isinstance(each, Registers) for each in declared):
+            raise ConfigurationError(f"{name}: `registers` is a list of Registers(address, count, ...)")
         if len(self.registers) > _MOST_BLOCKS:
             raise ConfigurationError(f"{len(self.registers)} blocks of registers: give at most {_MOST_BLOCKS}")
-        return Layout([self._frame(number, block) for number, block in enumerate(self.registers)])
+        for what, (least, most) in _LIMITS.items():
+            number = getattr(self, what)
+            if not (isinstance(number, int | float) and least <= number <= most):
+                raise ConfigurationError(f"{name}: {what} = {number!r}: give {least:g} to {most:g}")
+        frames = [self._frame(number, block) for number, block in enumerate(self.registers)]
+        _refuse_twice(self.registers)
+        return Layout(frames)
 
     def _frame(self, number: int, block: Registers) -> Frame:
-        block.check()
+        block.check(self.address_step)
         values = Values(0, f">{block.dtype}", block.count // block.words, block.to)
-        name = f"registers {block.address} of unit {block.unit} ({number})"
         return Frame(
-            name,
+            f"{block.name} ({number})",
             [Identifier(number)],
             [2 * block.count],
             values,
@@ -206,6 +238,22 @@ class ModbusAdapter(Adapter[OptionsT]):
             module=block.module,
             flags=[*self.flags, *block.flags],
         )
+
+
+def _refuse_twice(registers: Sequence[Registers]) -> None:
+    """A value lies in one block."""
+    owners: dict[tuple[int | None, int | None, int], Registers] = {}
+    for block in registers:
+        channels = block.to if block.to is not None else range(block.count // max(1, block.words))
+        for channel in channels:
+            if channel is None:
+                continue
+            owner = owners.setdefault((block.patch, block.module, channel), block)
+            if owner is not block:
+                raise ConfigurationError(
+                    f"{owner.name} and {block.name} both have the value of channel {channel}: say which patch or module"
+                    " each is of, or with `to` which channels it has"
+                )
 
 
 __all__ = ["ModbusAdapter", "ModbusException"]

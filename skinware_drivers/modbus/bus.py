@@ -113,11 +113,11 @@ class ModbusBus(KernelBus):
         self._address: Address | None = None
         if channel.startswith(_TCP):
             self._address = parse_address("modbus:tcp", channel.removeprefix(_TCP), default_port=DEFAULT_PORT)
-            self._tcp_options = options_from_strings(TcpOptions, given)
+            self._tcp_options = options_from_strings(TcpOptions, given, ModbusOptions.__struct_fields__)
             if listens:
                 raise ConfigurationError(f"{self.name}: only a line can be tapped, not a connection: it needs a master")
         else:
-            self._serial_options = options_from_strings(SerialOptions, given)
+            self._serial_options = options_from_strings(SerialOptions, given, ModbusOptions.__struct_fields__)
         self._gateway: Gateway | None = None
         if self._modbus.gateway:
             if listens:
@@ -171,6 +171,8 @@ class ModbusBus(KernelBus):
         byte_order = self._modbus.byte_order or wanted.byte_order
         word_order = self._modbus.word_order or wanted.word_order
         self._wanted = replace(wanted, byte_order=byte_order, word_order=word_order)
+        if self._address is None and any(block.unit == 0 for block in wanted.blocks):
+            raise ConfigurationError(f"{self.name}: unit 0 is everybody on a line, and nobody answers: which unit?")
         if self._port is not None:
             self._begin_anew()
 

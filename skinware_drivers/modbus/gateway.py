@@ -15,7 +15,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guest, Guests
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.serial.ports import PtyPort
-from skinware_drivers.streams.address import Address, parse_address
+from skinware_drivers.streams.address import Address, parse_address, reason_of
 from skinware_drivers.streams.tcp import keep_alive
 
 _MOST_GUESTS, _MOST_WAITING = 16, 8
@@ -246,7 +246,7 @@ class Gateway:
         try:
             listener = socket.create_server(numbers, family=family, backlog=_MOST_GUESTS)
         except OSError as error:
-            raise BusNotAvailable(f"gateway: cannot listen on {address}: {error.strerror or error}") from None
+            raise BusNotAvailable(f"gateway: cannot listen on {address}: {reason_of(error)}") from None
         listener.setblocking(False)
         self._listeners[listener.fileno()] = listener
         if self._epoll is not None:
@@ -287,6 +287,8 @@ class Gateway:
 
 
 def _address(place: str, *, is_public: bool) -> Address:
+    if ":" not in place and not place.isdecimal():
+        raise ConfigurationError(f"gateway={place}: which port? Give PORT, HOST:PORT, or a path such as /tmp/hand")
     address = parse_address("gateway:tcp", f"{_HERE}:{place}" if place.isdecimal() else place)
     with contextlib.suppress(ValueError):
         if ipaddress.ip_address(address.host).is_loopback:

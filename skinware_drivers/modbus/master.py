@@ -15,7 +15,7 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.guests import Guests
-from skinware_drivers.modbus.registers import Image, Row, Wanted
+from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
 from skinware_drivers.modbus.trouble import Trouble
 from skinware_drivers.modbus.wire import Message
 
@@ -28,6 +28,7 @@ _MOST_TRIES = 3
 _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
 """In the place of a read: a question of the driver's own, and one of another program."""
+_MANUALS_COUNT_FROM = 30_001
 _OVERHEARD_NS = NS_PER_S
 """Registers that another master has read longer ago are not joined with newer ones."""
 
@@ -255,7 +256,7 @@ class Master(Talk):
         if not trouble.times:
             read = self._reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
-            log.warning("%s: %s: %s", self._name, what, wire.exception_text(code))
+            log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), _advice(code, read))
         trouble.again(time_ns)
 
     def _give_up(self, asked: Open, time_ns: int) -> None:
@@ -377,6 +378,16 @@ class Listener(Talk):
                 self._counters.errors += 1
             elif asked.data[0] in wire.READS:
                 self.rows += self._overheard.take(asked, message.data[2:], time_ns)
+
+
+def _advice(code: int, read: Read) -> str:
+    """What to try, where a mistake is usual."""
+    if code == wire.NO_FUNCTION:
+        other = wire.READ_INPUT if read.function == wire.READ_HOLDING else wire.READ_HOLDING
+        return f"; it was asked with function {read.function}: try {other}"
+    if code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
+        return "; addresses count from 0: a manual's 30001 or 40001 is 0"
+    return ""
 
 
 __all__ = ["ANSWERS", "Listener", "Master", "Open", "Overheard", "Talk", "Timing"]

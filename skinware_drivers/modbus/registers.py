@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from skinware_drivers.layout import AnyFlag
 from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
 
 Order = Literal["big", "little"]
+_LAST_ADDRESS = 0xFFFF
 
 
 @dataclass(frozen=True)
@@ -53,19 +55,41 @@ class Registers:
         """Registers of a value."""
         return np.dtype(self.dtype).itemsize // 2
 
-    def check(self) -> None:
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"registers {self.address} of unit {self.unit}"
+
+    def check(self, step: int = 1) -> None:
         """Refuse what cannot be.
+
+        Args:
+            step: by how much the address grows from one register to the next.
 
         Raises:
             ConfigurationError: what is wrong.
         """
-        name = f"registers {self.address} of unit {self.unit}"
+        name = self.name
+        for what in ("address", "count", "unit", "function", "every"):
+            if not isinstance(getattr(self, what), Integral):
+                raise ConfigurationError(f"{name}: {what} = {getattr(self, what)!r} is no whole number")
         if self.dtype not in ("u2", "i2", "u4", "i4", "f4"):
             raise ConfigurationError(f"{name}: dtype {self.dtype!r}: give u2, i2, u4, i4 or f4")
         if self.function not in READS:
             raise ConfigurationError(f"{name}: function {self.function}: registers are read with 3 or 4")
-        if self.count < 1 or self.count % self.words or self.every < 1 or not 0 <= self.unit <= 255:
-            raise ConfigurationError(f"{name}: {self.count} registers of {self.dtype}, every {self.every}: cannot be")
+        if not 0 <= self.unit <= 255:
+            raise ConfigurationError(f"{name}: units have numbers from 1 to 247, over TCP from 0 to 255")
+        if self.count < 1 or self.count % self.words:
+            each = f", {self.words} for each {self.dtype}" if self.words > 1 else ""
+            raise ConfigurationError(f"{name}: count = {self.count}: how many registers are there{each}?")
+        if self.every < 1:
+            raise ConfigurationError(f"{name}: every = {self.every}: 1 is in each cycle, 2 in every second one")
+        last = self.address + step * (self.count - 1)
+        if self.address < 0 or last > _LAST_ADDRESS:
+            raise ConfigurationError(
+                f"{name}: the last of {self.count} is {last}, and addresses go from 0 to {_LAST_ADDRESS}; a manual's"
+                " 40001, or 400001, is 0"
+            )
 
 
 @dataclass(frozen=True)

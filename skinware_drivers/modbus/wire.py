@@ -27,10 +27,10 @@ _COUNTING = (*_READ_BITS, *READS, _EXCHANGE)
 LONGEST_MESSAGE = 253
 FAILED = 0x80
 """Bit of the function in a reply that is an exception."""
-ACKNOWLEDGE, BUSY = 5, 6
+NO_FUNCTION, NO_REGISTERS, ACKNOWLEDGE, BUSY = 1, 2, 5, 6
 EXCEPTIONS = {
-    1: "it does not know this function",
-    2: "it has no such registers",
+    NO_FUNCTION: "it does not know this function",
+    NO_REGISTERS: "it has no such registers",
     3: "it does not take this value, or so many registers",
     4: "it failed",
     ACKNOWLEDGE: "it needs more time",

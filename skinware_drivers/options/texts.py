@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import re
 import types
-from collections.abc import Mapping
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import msgspec.structs
@@ -24,12 +24,15 @@ _LONGEST_RANGE = 1 << 16
 _ASKED = {"bool": "yes or no", "int": "a whole number", "float": "a number", "str": "a text"}
 
 
-def options_from_strings(options_class: type[OptionsT], strings: Mapping[str, str]) -> OptionsT:
+def options_from_strings(
+    options_class: type[OptionsT], strings: Mapping[str, str], beside: Collection[str] = ()
+) -> OptionsT:
     """Make options from ``key=value`` texts.
 
     Args:
         options_class: the struct to make.
         strings: texts by option name. A yes/no option with an empty text is on.
+        beside: names of options that others take, for the message.
 
     Raises:
         ConfigurationError: an option is unknown (the message gives the nearest right name), missing, or its
@@ -40,12 +43,12 @@ def options_from_strings(options_class: type[OptionsT], strings: Mapping[str, st
     values: dict[str, Any] = {}
     for name, text in strings.items():
         if name not in fields:
-            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, fields)}")
+            raise ConfigurationError(f"unknown option {name!r}{nearest_name(name, [*fields, *beside])}")
         hint = hints[fields[name].name]
         try:
             values[fields[name].name] = msgspec.convert(_split(text, plain_type(hint)), hint, strict=False)
         except (msgspec.ValidationError, ValueError) as error:
-            raise ConfigurationError(f"option {name}={text}: {_reason(error)}") from None
+            raise ConfigurationError(f"option {name}={text}: {_reason(error, hint)}") from None
     for name, field in fields.items():
         if field.required and field.name not in values:
             raise ConfigurationError(f"option {name!r} must be given")
@@ -64,7 +67,7 @@ def check_options(options: msgspec.Struct) -> None:
         try:
             msgspec.convert(value, hints[field.name])
         except msgspec.ValidationError as error:
-            message = f"option {field.encode_name}={option_text(value)}: {_reason(error)}"
+            message = f"option {field.encode_name}={option_text(value)}: {_reason(error, hints[field.name])}"
             raise ConfigurationError(message) from None
 
 
@@ -119,8 +122,14 @@ def _number(text: str) -> str | int:
     return int(text, 16) if _HEXADECIMAL.fullmatch(text) else text
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, hint: Any) -> str:
     """What msgspec says, in words for people, without its path to a value that the message already names."""
     text = re.sub(r" - at `\$\[(\d+)\]`", lambda item: f" (number {int(item[1]) + 1} of the list)", str(error))
+    text = re.sub(r" \| null(?=`)", "", text)
+    plain = plain_type(hint)
+    one = plain_type(get_args(plain)[0]) if get_origin(plain) in (list, tuple) else plain
+    if get_origin(one) is Literal:
+        words = ", ".join(map(str, get_args(one)))
+        return re.sub(r"Invalid enum value [^ ]+|Expected `.*?`(?:, got `\w+`)?", f"give one of {words}", text)
     asked = re.compile(r"Expected `(\w+)(.*?)`(?:, got `\w+`)?")
     return asked.sub(lambda match: f"give {_ASKED.get(match[1], match[1])}{match[2]}", text).replace("`", "")

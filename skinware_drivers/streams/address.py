@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -59,7 +60,9 @@ def parse_address(scheme: str, channel: str, *, default_port: int | None = None,
         if parts.path or parts.query or parts.username is not None:
             raise ValueError("more than host and port")
     except ValueError as error:
-        raise ConfigurationError(f"bus {scheme}://{channel}: {error}; write {scheme}://HOST:PORT") from None
+        raise ConfigurationError(
+            f"bus {scheme}://{channel}: {_mistake(channel) or error}; write {scheme}://HOST:PORT"
+        ) from None
     port = default_port if port is None else port
     if port is None or (needs_host and not host):
         raise ConfigurationError(
@@ -74,8 +77,27 @@ def unknown_name(address: Address, error: socket.gaierror) -> BusNotAvailable:
     return BusNotAvailable(f"the name {address.host!r} of a host is not known ({error.strerror or error})")
 
 
+def reason_of(error: OSError) -> str:
+    """Why, without what Python adds to it."""
+    return os.strerror(error.errno) if error.errno else str(error)
+
+
+def _mistake(channel: str) -> str:
+    """Those that are usual, in words; empty: another one."""
+    port = channel.rpartition(":")[2]
+    if "&" in channel or "=" in channel:
+        return "options begin with a question mark"
+    if channel.count(":") > 1 and "[" not in channel:
+        return "an IPv6 address stands in brackets"
+    if "]" in channel and port.endswith("]"):
+        return ""
+    if not port.isdecimal() and "/" not in port:
+        return f"{port!r} is no number of a port"
+    return "ports have numbers up to 65535" if port.isdecimal() and int(port) > 65535 else ""
+
+
 def _flags(host: str) -> int:
     return 0 if host else socket.AI_PASSIVE
 
 
-__all__ = ["Address", "Resolved", "parse_address", "unknown_name"]
+__all__ = ["Address", "Resolved", "parse_address", "reason_of", "unknown_name"]

@@ -21,7 +21,7 @@ from skinware.errors import BusNotAvailable
 from skinware_drivers.bus import Bus
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.ports import DescriptorPort, Port
-from skinware_drivers.streams.address import Address, unknown_name
+from skinware_drivers.streams.address import Address, reason_of, unknown_name
 from skinware_drivers.streams.bus import NetworkBus
 
 _CONNECTING_S = 5.0
@@ -74,7 +74,7 @@ class ListeningPort(Port):
         try:
             self._listener = socket.create_server(numbers, family=family, backlog=_WAITING_CALLERS)
         except OSError as error:
-            raise BusNotAvailable(f"cannot listen on {address}: {error.strerror or error}") from None
+            raise BusNotAvailable(f"cannot listen on {address}: {reason_of(error)}") from None
         self._listener.setblocking(False)
         self._epoll = select.epoll()
         self._epoll.register(self._listener, select.EPOLLIN)

@@ -220,7 +220,7 @@ def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
         (["--udev", "can0"], 2, "no serial port"),
         (["serial:?serial_number=A5"], 3, "there is no serial port"),
         (["tcp://127.0.0.1", "--probe"], 2, "bus tcp://127.0.0.1: which port? Write tcp://HOST:PORT"),
-        (["modbus:tcp://:70000"], 2, "Port out of range"),
+        (["modbus:tcp://:70000"], 2, "ports have numbers up to 65535"),
     ],
 )
 def test_mistakes_get_one_clear_line_and_the_right_exit_code(

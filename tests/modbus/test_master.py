@@ -262,6 +262,23 @@ def test_registers_that_are_not_there_are_told_once_and_asked_for_rarely(caplog:
     assert "4 registers from 100" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("block", "code", "told"),
+    [
+        (Registers(100, 4), 1, "it was asked with function 3: try 4"),
+        (Registers(100, 4, function=4), 1, "it was asked with function 4: try 3"),
+        (Registers(40001, 4), 2, "a manual's 30001 or 40001 is 0"),
+    ],
+)
+def test_what_is_usually_the_reason_of_an_exception_is_told(
+    caplog: pytest.LogCaptureFixture, block: Registers, code: int, told: str
+) -> None:
+    talk = Conversation(block)
+    question = talk.next_question()
+    talk.answer(question, bytes([question.data[0] | 0x80, code]))
+    assert told in caplog.text
+
+
 def test_a_dead_unit_is_asked_more_and_more_rarely_and_comes_back() -> None:
     talk = Conversation(*UNITS)
     begun, asked = talk.now, {1: 0, 2: 0}

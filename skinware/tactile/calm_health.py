@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ from skinware.errors import NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.tactile.chain import Chain
+from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.health_service import RATE_HZ, HealthWriter
 
@@ -48,7 +49,7 @@ class CalmHealth:
         return "" if self._writer is None else self._name
 
     def follow(self, chain: Chain) -> None:
-        """Go on with another chain, of other sensors: of which nothing is known yet.
+        """Go on with another chain, of other sensors: of which nothing is known yet, unless it is restored.
 
         Args:
             chain: whose values come from now on.
@@ -66,6 +67,19 @@ class CalmHealth:
                 )
         except NameInUse as error:
             self._give_up(error)
+
+    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """What is known, by type: arrays by name, and ``uid``."""
+        return {} if self._health is None else self._health.state()
+
+    def restore(self, state: ChainState) -> None:
+        """Go on with what was known of the sensors of this chain, if its baselines saw the same values then.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        if self._health is not None:
+            self._health.restore(state)
 
     def step(self, status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
         """Take in what the chain made of the next frame; mark sensors with a fault as ``UNHEALTHY``.

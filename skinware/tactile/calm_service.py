@@ -97,7 +97,7 @@ class CalmService:
         self.health: CalmHealth | None = CalmHealth(health, name, self.into, group) if health else None
         self._settings = settings or ChainSettings.calm()
         self._group, self._on_ready = group, on_ready
-        self._learned = LearnedState(state_path)
+        self._learned = LearnedState(state_path, self.health)
         self._reader: DriverReader | None = None
         self._writer: DriverWriter | None = None
         self._chain: Chain | None = None
@@ -310,10 +310,7 @@ class CalmService:
         if known is not None and frame.structure == known:
             return
         chain = self._settings.chain(frame.structure)
-        if before is not None:
-            chain.restore(before.state())
-        else:
-            self.restored = self._learned.restore(chain)
+        learned = None if before is None else self._learned.state(before)
         static = self._reader.static()
         counters = tuple(
             static[f"{what}_counter_name"].tolist() if f"{what}_counter_name" in static else []
@@ -343,6 +340,8 @@ class CalmService:
             self.contacts.follow(chain, rate_hz)
         if self.health is not None:
             self.health.follow(chain)
+        restored = self._learned.restore(chain, learned)
+        self.restored = restored if before is None else self.restored
         self._copied = sorted(own & set(self._reader.schema.columns))
         self._not_told = sorted(own - set(self._copied))
         self._chain, self._counters, self._is_ready = chain, counters, False

@@ -29,7 +29,7 @@ The file is TOML; every key of a stage but ``stage`` may be left out::
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -246,10 +246,12 @@ class ChainState:
     Attributes:
         fingerprint: of what its baselines saw.
         arrays: by type, what the baseline has learned by name, and ``uid``: arrays of as many taxels as it had.
+        health: likewise, what is known of the health of the taxels.
     """
 
     fingerprint: str
     arrays: dict[str, dict[str, npt.NDArray[Any]]]
+    health: dict[str, dict[str, npt.NDArray[Any]]] = field(default_factory=dict)
 
 
 class Chain:
@@ -289,15 +291,24 @@ class Chain:
         Raises:
             ConfigurationError: that is no such state.
         """
-        if state.fingerprint != self._fingerprint:
+        if not self.fits(state):
             return 0
         restored = 0
         for name, baseline in self.baselines.items():
             if name in state.arrays:
-                uid, learned = self.structure.sensor_uid[self.structure.index(name)], state.arrays[name]
-                row_of = {one: row for row, one in enumerate(learned["uid"].tolist())}
-                restored += baseline.restore(learned, np.array([row_of.get(one, -1) for one in uid.tolist()]))
+                learned = state.arrays[name]
+                restored += baseline.restore(learned, self.rows_of(name, learned["uid"]))
         return restored
+
+    def fits(self, state: ChainState) -> bool:
+        """Whether its baselines see the same values as those of a state did."""
+        return state.fingerprint == self._fingerprint
+
+    def rows_of(self, type_name: str, uid: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
+        """(n,) where each taxel of a type stands among these uids; -1: nowhere."""
+        row_of = {one: row for row, one in enumerate(uid.tolist())}
+        mine = self.structure.sensor_uid[self.structure.index(type_name)]
+        return np.array([row_of.get(one, -1) for one in mine.tolist()], np.intp)
 
     @property
     def _fingerprint(self) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.baseline import SIGNED_TYPES
-from skinware.tactile.chain import BaselineStage, Chain
+from skinware.tactile.chain import BaselineStage, Chain, ChainState
 from skinware.tactile.health import Health
 from skinware.tactile.health_report import HealthReport
 
@@ -49,6 +50,26 @@ class ChainHealth:
     def reports(self) -> dict[str, HealthReport]:
         """What is known now of the sensors of each type, in the order of ``structure.index``."""
         return {name: health.report() for name, (_, health) in self._watched.items()}
+
+    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
+        """What is known, by type: arrays by name, and ``uid``."""
+        structure = self._chain.structure
+        return {
+            name: {"uid": structure.sensor_uid[structure.index(name)], **health.state()}
+            for name, (_, health) in self._watched.items()
+        }
+
+    def restore(self, state: ChainState) -> None:
+        """Go on with what was known of these sensors, if the baselines of then saw the same values.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        if self._chain.fits(state):
+            for name, (_, health) in self._watched.items():
+                if name in state.health:
+                    known = state.health[name]
+                    health.restore(known, self._chain.rows_of(name, known["uid"]))
 
     def faulty(self, reports: dict[str, HealthReport]) -> npt.NDArray[np.bool_]:
         """(n_sensors,) bool: which sensors of the driver have a fault, as ``reports`` said."""

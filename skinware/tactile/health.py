@@ -19,7 +19,8 @@ at a corner lie between no two others; only a wipe test finds out whether they f
 from __future__ import annotations
 
 import math
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -209,6 +210,40 @@ class Health:
             "shown_around": shown_around,
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """What is known, by name: arrays (n, ...), copies; times are how long ago, s."""
+        return {name: array.copy() for name, array in self._known().items()} | {
+            "still_s": self._now_s - self._changed_s,
+            "module_touched_s": (self._now_s - self._module_touched_s)[self._module],
+        }
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> None:
+        """Go on with what was known of taxels before.
+
+        Args:
+            state: of ``state``, of m taxels.
+            rows: (n,) where each taxel stands there; -1: nowhere.
+
+        Raises:
+            ConfigurationError: that is no such state.
+        """
+        here, m = rows >= 0, int(rows.max(initial=-1)) + 1
+        for name, own in self.state().items():
+            given = state.get(name)
+            if given is None or given.dtype != own.dtype or given.shape[1:] != own.shape[1:] or len(given) < m:
+                raise ConfigurationError(f"no state of health: {name} is missing or has a wrong shape or dtype")
+        then = rows[here]
+        for name, array in self._known().items():
+            array[here] = state[name][then]
+        self._changed_s[here] = self._now_s - state["still_s"][then]
+        np.maximum.at(self._module_touched_s, self._module[here], self._now_s - state["module_touched_s"][then])
+        self._clear = _CLEAR * max(self._typical_noise(), self._least_noise)
+
+    def _known(self) -> dict[str, npt.NDArray[Any]]:
+        of_touches = {"due": self._due, "shown": self._shown, "touches": self._touches}
+        of_values = {"value": self._value, "peak": self._peak, "usual": self._usual}
+        return of_touches | of_values | {"noise": self._noise.deviation, "at_end": self._noise.at_end}
 
     # -- steps of one frame -------------------------------------------------------------------------------------
 

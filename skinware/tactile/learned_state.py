@@ -1,14 +1,16 @@
-"""What a chain has learned, kept in a file while it runs: saved now and then in a thread, and read once."""
+"""What a chain and its health have learned, kept in a file while they run: saved now and then, and read once."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.tactile.chain import Chain
+from skinware.tactile.calm_health import CalmHealth
+from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.chain_state import read_state, save_state
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -17,29 +19,41 @@ _SAVE_EVERY_NS = 20 * NS_PER_S
 
 
 class LearnedState:
-    """The file of what one chain has learned.
+    """The file of what one chain has learned, and what is known of the health of its sensors.
 
     Args:
         path: of the file; None: nothing is kept.
+        health: of the chain; None: nobody looks after it.
     """
 
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
+    def __init__(self, path: Path | None, health: CalmHealth | None) -> None:
+        self._path, self._health = path, health
         self._saving: threading.Thread | None = None
         self._next_save_ns = now_ns() + _SAVE_EVERY_NS
 
-    def restore(self, chain: Chain) -> int:
-        """Let a chain go on with what the file has, if it is young and of the same sensors; else say why not.
+    def state(self, chain: Chain) -> ChainState:
+        """What a chain has learned, and what is known of the health of its sensors."""
+        state = chain.state()
+        return state if self._health is None else replace(state, health=self._health.state())
+
+    def restore(self, chain: Chain, state: ChainState | None = None) -> int:
+        """Let a chain, which its health follows already, go on with what was learned; else say why not.
+
+        Args:
+            chain: a new one.
+            state: what was learned; None: what the file has, if it is of the same sensors.
 
         Returns:
-            How many sensors go on.
+            How many sensors have their baselines again.
         """
-        if self._path is None:
-            return 0
-        restored = 0
-        state, why = read_state(self._path)
+        restored, why = 0, ""
+        if state is None and self._path is not None:
+            state, why = read_state(self._path)
         try:
-            restored = 0 if state is None else chain.restore(state)
+            if state is not None:
+                restored = chain.restore(state)
+                if self._health is not None:
+                    self._health.restore(state)
         except ConfigurationError as error:
             why = f"{self._path}: {error}"
         if why:
@@ -68,7 +82,7 @@ class LearnedState:
             return
         if not any(baseline.ready.any() for baseline in chain.baselines.values()):
             return  # a file from before says more
-        state = chain.state()
+        state = self.state(chain)
 
         def save() -> None:
             try:

@@ -193,6 +193,7 @@ class NativeStream(Stream):
             too_long=counters.refused,
             **{there: getattr(counters.framing, here) for here, there in _COUNTED.items()},
         )
+        self._too_long = counters.refused
         self._batch: FrameBatch | None = None
         self._rows = structs.Batch()
 
@@ -246,7 +247,9 @@ class NativeStream(Stream):
     def count(self) -> None:
         """Take over what C has counted."""
         counters, stream = self.counters, self._stream
-        counters.frames, counters.refused = stream.frames, stream.too_long
+        counters.frames = stream.frames
+        counters.refused += stream.too_long - self._too_long  # the bus itself may refuse something, too
+        self._too_long = stream.too_long
         for here, there in _COUNTED.items():
             setattr(counters.framing, here, getattr(stream, there))
         counters.errors = stream.checksum_errors + stream.bad_form

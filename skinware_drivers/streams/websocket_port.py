@@ -25,6 +25,7 @@ LONGEST = CHUNK - 1
 _MOST = 1 << 20
 """Bytes of a message at which the connection is given up."""
 _GREETING_S = 5.0
+_HELD_UP = "; it failed, or this computer was held up and answered its pings too late"
 
 
 class WebSocketPort(Port):
@@ -159,7 +160,8 @@ class WebSocketPort(Port):
         self._parts = []
         received, sent = self._protocol.close_rcvd, self._protocol.close_sent
         if received is not None:
-            return BusNotAvailable(f"{self._url}: the server has closed the connection: {received}")
+            why = _HELD_UP if received.code == CloseCode.INTERNAL_ERROR else ""
+            return BusNotAvailable(f"{self._url}: the server has closed the connection: {received}{why}")
         if sent is not None:
             self.unusable += sent.code == CloseCode.MESSAGE_TOO_BIG
             return BusNotAvailable(f"{self._url}: gave the connection up: {sent}", reason=BusReason.FAILED)

@@ -58,6 +58,8 @@ class RecordedWire:
         self._first_ns = first_ns
         self._begun_ns = self._given_ns = self._looked_ns = 0
         self._has_begun = self._is_over = False
+        self._asked_ns = self._met_ns = 0
+        self._is_unanswered = False
         self._asked: dict[int, deque[tuple[int, bytes]]] = {}
         self._answered: dict[int, bytes] = {}
         self._unasked: set[int] = set()
@@ -66,6 +68,7 @@ class RecordedWire:
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """Take a question."""
         self._counts["commands"] += 1
+        self._asked_ns = now_ns
         self._asked.setdefault(identifier, deque(maxlen=1000)).append((now_ns, payload))
         self._unasked.discard(identifier)
 
@@ -76,7 +79,7 @@ class RecordedWire:
             return None
         due_ns = self._due_ns(item)
         if not self._is_waited_for(item):
-            return due_ns
+            return min(due_ns, self._asked_ns) if self._is_missed(item) else due_ns
         asked = self._asked.get(_kind(item))
         if not asked:
             return due_ns + _PATIENCE_NS
@@ -95,6 +98,7 @@ class RecordedWire:
                     found.append(self._given(item, SENT))
             elif item.identifier is None or not item.identifier & (ERROR_FLAG | REMOTE_FLAG):
                 found.append(self._given(item, item.identifier or 0))
+                self._is_unanswered = False
             self._take_next()
         self._counts["frames"] += len(found)
         return found
@@ -136,6 +140,7 @@ class RecordedWire:
         if asked:
             asked_ns, self._answered[_kind(item)] = asked.popleft()
             self._begun_ns += max(0, asked_ns - due_ns)
+            self._met_ns, self._is_unanswered = now_ns, True
             return True
         if now_ns < due_ns + _PATIENCE_NS:
             return False
@@ -144,10 +149,14 @@ class RecordedWire:
         return True
 
     def _is_hurried(self, item: WireItem, now_ns: int) -> bool:
-        """Whether this very question was asked before its time, by a driver that was held up when it was recorded.
+        """Whether it has to come before its time; all that follows is earlier then.
 
-        Its answer must not be late: all that follows is earlier then.
+        A driver that was held up when it was recorded asked late, and read an answer late that was there in time. This
+        driver asks when it should, and would give up an answer that came as late as it was read.
         """
+        if self._is_missed(item):
+            self._begun_ns -= max(0, self._due_ns(item) - self._asked_ns)
+            return True
         asked = self._asked.get(_kind(item))
         if not (self._is_waited_for(item) and asked and asked[0][1] == item.data):
             return False
@@ -156,6 +165,10 @@ class RecordedWire:
             return False
         self._begun_ns -= self._due_ns(item) - asked_ns
         return True
+
+    def _is_missed(self, item: WireItem) -> bool:
+        """Whether it is the answer to a question after which this driver has asked again already."""
+        return not item.is_sent and self._is_unanswered and self._asked_ns > self._met_ns
 
     def _is_repeated(self, item: WireItem, question: bytes) -> bool:
         """Whether it was asked again before its answer came, and this is not where it was so when it was recorded."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from skinware_drivers.proving.captures import check_capture
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.streams.tcp import TcpBus
 from skinware_drivers.testing.carrying import emulated_on, emulated_on_a_pty
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.recording.test_wire_replay import record, require_equal
@@ -60,3 +63,28 @@ def test_a_wire_that_was_captured_is_decoded_to_the_same_values(
             record(file, adapter, make_bus(name, payload_size=adapter.payload_size), FRAMES)
 
     require_equal(tmp_path, capture, kind, options)
+
+
+class HeldUp(TcpBus):
+    """Of a machine that is too busy: now and then it goes on when the answer to its question is long there."""
+
+    asked = 0
+
+    def send(self, identifier: int, payload: bytes) -> None:
+        super().send(identifier, payload)
+        self.asked += 1
+        if self.asked % 10 == 0:
+            time.sleep((0.06, 0.15, 0.4)[self.asked // 10 % 3])
+
+
+def test_a_driver_that_is_held_up_captures_what_is_decoded_to_the_same_values(tmp_path: Path) -> None:
+    """It reads answers when it would have given them up; a replay that gave them as late would lose them."""
+    kind, file = load_driver("tesollo"), tmp_path / "held.mcap"
+    with devices("tesollo", "tcp") as name:
+        adapter = kind(kind.Options())
+        bus = HeldUp(name.removeprefix("tcp://"), payload_size=adapter.payload_size)
+        record(file, adapter, bus, 80)
+    assert bus.asked > 60
+    compared, _ = check_capture(file, kind)
+    assert compared.difference is None
+    assert compared.compared >= 5 * 60

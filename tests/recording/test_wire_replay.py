@@ -93,8 +93,7 @@ def require_equal(
 ) -> None:
     """Have something captured, and decode it again; it is captured anew, twice at most, if there is a difference.
 
-    For a machine that is held up reads answers after their time, takes them all the same, and is told by the replay
-    that they were late.
+    Seen once in some 200 captures at a load of 16 on two processors, of a device that is asked: an update less.
     """
     for number in range(3):
         file = folder / f"{number}.mcap"
@@ -225,6 +224,31 @@ def test_a_question_that_comes_earlier_than_it_did_is_answered_at_once() -> None
     assert wire.emit(6 * MS) == []
     assert wire.next_due_ns() == 8 * MS
     assert [(frame.time_ns, frame.identifier) for frame in wire.emit(8 * MS)] == [(8 * MS, 2)]
+
+
+def test_an_answer_that_was_read_late_comes_before_the_next_question() -> None:
+    """Whoever was held up read it late, and took it. Whoever is not would have given it up by then."""
+    items = [item(0, 0x10, b"a", is_sent=True), item(300, 1), item(301, 2), item(310, 0x10, b"a", is_sent=True)]
+    wire = RecordedWire(iter([*items, item(311, 3)]), 7_000 * MS)
+    wire.skip(0)
+    wire.receive(0x10, b"a", 0)
+    assert emitted(wire, 29) == []
+    wire.receive(0x10, b"a", 30 * MS)
+    assert wire.next_due_ns() == 30 * MS
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(30 * MS)] == [(30 * MS, 1)]
+    assert wire.next_due_ns() == 31 * MS, "the rest of it has its own delay, and so has the next answer"
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(31 * MS)] == [(31 * MS, 2), (31 * MS, 3)]
+
+
+def test_what_comes_by_itself_comes_at_its_time_whatever_is_asked() -> None:
+    items = [item(0, 0x10, is_sent=True), item(2, 1), item(50, 2), item(100, 3)]
+    wire = RecordedWire(iter(items), 7_000 * MS)
+    wire.skip(0)
+    wire.receive(0x10, b"", 0)
+    assert emitted(wire, 10) == [(2, 1)]
+    wire.receive(0x10, b"", 10 * MS)
+    wire.receive(0x11, b"", 20 * MS)
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(200 * MS)] == [(50 * MS, 2), (100 * MS, 3)]
 
 
 def test_who_only_listens_is_not_waited_for() -> None:

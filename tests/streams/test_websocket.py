@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from websockets.protocol import State
 from websockets.sync.server import ServerConnection
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
@@ -92,9 +93,18 @@ def test_more_messages_than_a_batch_holds_stay_and_keep_the_bus_readable() -> No
 
 
 def test_a_message_that_is_too_long_is_left_out_and_counted() -> None:
-    with heard(says("x" * 70_000, "short", "y" * 65_535, "z" * 150)) as (bus, batch, _):
+    counted = threading.Event()
+
+    def handle(connection: ServerConnection) -> None:
+        connection.send("x" * 70_000)
+        counted.wait(30)
+        says("short", "y" * 65_535, "z" * 150)(connection)
+
+    with heard(handle) as (bus, batch, _):
+        wait_until(lambda: bus.receive(batch, 0) == 0 and bus.counters.refused == 1)
+        counted.set()
         assert take(bus, batch, 2) == [b"short", b"z" * 150]
-        assert bus.counters.refused >= 1
+        assert (bus.counters.refused, bus.counters.framing.refused) == (1, 1), "the second was no frame"
 
 
 def test_one_that_is_far_too_long_ends_the_connection_with_its_code() -> None:
@@ -117,6 +127,22 @@ def test_a_server_that_closes_is_quoted(code: int, reason: str) -> None:
         bus.close()
         bus.open()
         wait_until(lambda: there.callers == 2)
+
+
+def test_pings_that_were_answered_too_late_are_told() -> None:
+    """By a driver that is held up: the server gives it up."""
+    connections: list[ServerConnection] = []
+
+    def handle(connection: ServerConnection) -> None:
+        connections.append(connection)
+        says("only this")(connection)
+
+    with web_server(handle, ping_interval=0.01, ping_timeout=0.05) as there, opened(there.bus) as (bus, batch):
+        wait_until(lambda: bool(connections) and connections[0].state is not State.OPEN)
+        why = until_lost(bus, batch)
+        assert "the server has closed the connection: 1011 (internal error) keepalive ping timeout" in why
+        assert "answered its pings too late" in why
+        assert lines(batch) == [b"only this"]
 
 
 def test_half_a_message_is_none_and_counted() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +18,11 @@ from skinware.errors import BadServiceFile
 from skinware.sensor_types import SHEAR_X, TEMPERATURE
 from skinware.tactile.calm_health import CalmHealth
 from skinware.tactile.chain import Chain, ChainSettings
+from skinware.tactile.chain_state import save_state
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader, HealthWriter
+from skinware.tactile.learned_state import LearnedState
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.tactile.test_calm_contacts import calming, press
 
@@ -95,6 +99,47 @@ def test_another_skin_begins_anew(into: Namespace) -> None:
         assert skin.health.faulty == 0
         reader.reattach()
         assert len(reader.source.uid) == 24
+
+
+@pytest.mark.parametrize("age_s", [0, 100_000])
+def test_what_is_known_is_there_after_a_restart(into: Namespace, tmp_path: Path, age_s: int) -> None:
+    """Baselines are worth nothing after 10 minutes; what is broken is broken on the next day."""
+    path = tmp_path / "fake.npz"
+    with calmed(into) as skin, HealthReader(namespace=into) as reader:
+        skin.go_on(SETTLED_NS)
+        before = reader.read().report
+        LearnedState(path, skin.health).close(skin.chain)
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, allow_pickle=False, **arrays | {"time_s": arrays["time_s"] - age_s})
+    with calmed(into) as skin, HealthReader(namespace=into) as reader:
+        assert LearnedState(path, skin.health).restore(skin.chain) == (0 if age_s else 640)
+        skin.go_on(PERIOD_NS)
+        report = reader.read().report
+        assert report.kind[[AT_END, RUSTLING]].tolist() == [HealthKind.CLIPPED, HealthKind.NOISY]
+        assert np.flatnonzero(skin.status & Status.UNHEALTHY).tolist() == [AT_END, RUSTLING]
+        np.testing.assert_array_equal(report.noise, before.noise)
+
+
+@pytest.mark.parametrize("damage", ["missing", "shape", "of another scale"])
+def test_health_that_does_not_fit_is_begun_anew(
+    into: Namespace, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "fake.npz"
+    with calmed(into) as skin:
+        skin.go_on(SETTLED_NS)
+        state = LearnedState(path, skin.health).state(skin.chain)
+        known = state.health["pressure"]
+        if damage == "missing":
+            del known["noise"]
+        elif damage == "shape":
+            known["noise"] = np.zeros((640, 2), np.float32)
+        save_state(path, replace(state, fingerprint="another") if damage == "of another scale" else state)
+    with calmed(into) as skin:
+        LearnedState(path, skin.health).restore(skin.chain)
+        skin.go_on(PERIOD_NS)
+        assert skin.health.faulty == 0
+    assert ("begun anew" in caplog.text) == (damage != "of another scale")
 
 
 def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace) -> None:

@@ -174,6 +174,51 @@ def test_a_dead_taxel_is_found_under_a_hand_that_covers_thousands() -> None:
     assert report.shown[31 * 60 + 20] == pytest.approx(1)
 
 
+def test_what_is_known_goes_with_the_taxels() -> None:
+    """To another health of the same ones, in another order, and of one that is new."""
+    surface = grid(1, 10, 10)
+    dead, stuck, away = 44, 77, 12
+    baseline = Baseline(np.arange(100) // 25, surface.patch)
+    settings = HealthSettings(stuck_s=30)
+    health = Health(np.arange(100) // 25, placed(surface.position_m), settings)
+    rustle = np.random.default_rng(1)
+    baseline.update(0, np.full(100, 10.0))
+    baseline.tare()
+
+    def next_frame(tenth: int) -> npt.NDArray[np.float64]:
+        values = rustle.integers(0, 2, 100).astype(np.float64) + (60 if tenth % 70 > 60 else 10)
+        values[dead] = 10 + tenth % 2
+        values[stuck] = 15
+        return values
+
+    for tenth in range(1, 500):
+        values = next_frame(tenth)
+        health.update(tenth * 100_000_000, values, baseline.update(tenth * 100_000_000, values))
+    before = health.report()
+    assert names(before.kind[[dead, stuck]]) == ["dead", "stuck"]
+
+    order = rustle.permutation(np.delete(np.arange(100), away))
+    rows = np.append(order, -1)
+    place = np.append(order, away)
+    other = Health((np.arange(100) // 25)[place], placed(surface.position_m[place]), settings)
+    other.restore(health.state(), rows)
+    values = next_frame(500)
+    calm, again = baseline.update(50_000_000_000, values), Baseline((np.arange(100) // 25)[place], surface.patch)
+    again.restore(baseline.state(), place)
+    health.update(50_000_000_000, values, calm)
+    other.update(7, values[place], again.update(7, values[place]))
+    one, two = health.report(), other.report()
+    known = np.arange(99)
+    assert two.kind[known].tolist() == one.kind[order].tolist()
+    assert two.touches[known].tolist() == one.touches[order].tolist()
+    for name in ("shown", "peak", "noise", "clipped", "still_s"):
+        np.testing.assert_allclose(getattr(two, name)[known], getattr(one, name)[order], atol=0.2, err_msg=name)
+    assert (np.isnan(two.noise[99]), two.touches[99]) == (True, 0)
+    for wrong in ({}, health.state() | {"noise": np.zeros(100)}, health.state() | {"due": np.zeros(50)}):
+        with pytest.raises(ConfigurationError, match="no state of health"):
+            other.restore(wrong, rows)
+
+
 def test_what_was_mended_is_good_again() -> None:
     world = plates(4)
     middle = 3 * SIDE + 3

@@ -9,7 +9,8 @@ import sysconfig
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -56,7 +57,7 @@ def load(kind: Kind, name: str) -> type[Any]:
     """
     if is_file(name):
         return _class_in(name, kind)
-    known = {entry.name: entry for entry in entry_points(group=kind.group)}
+    known = registered(kind.group)
     if name not in known:
         raise ConfigurationError(
             f"there is no {kind.word} {name!r}{nearest_name(name, known)}. One of yours: give its file, as"
@@ -68,6 +69,17 @@ def load(kind: Kind, name: str) -> type[Any]:
     if not (isinstance(loaded, type) and kind.fits(loaded)):
         raise ConfigurationError(f"{kind.word} {name!r}: {entry.value} is no subclass of {kind.base} or its like")
     return loaded
+
+
+def registered(group: str) -> dict[str, EntryPoint]:
+    """What installed packages have registered in a group of entry points, by name."""
+    return {entry.name: entry for entry in _selection(tuple(sys.path))(group=group)}
+
+
+@cache
+def _selection(_path: tuple[str, ...]) -> Callable[..., EntryPoints]:
+    """Selects from the entry points of all packages on Python's path: a file of each is read, once."""
+    return entry_points().select
 
 
 def short_name(name: str) -> str:
@@ -133,4 +145,4 @@ def _blamed(what: str, is_theirs: Callable[[str], bool]) -> Iterator[None]:
         raise ConfigurationError(f"{what} cannot be loaded: {type(error).__name__}: {text}{where}") from error
 
 
-__all__ = ["Kind", "load", "short_name"]
+__all__ = ["Kind", "load", "registered", "short_name"]

@@ -11,13 +11,13 @@ import os
 import re
 import shutil
 import sys
-from importlib.metadata import entry_points
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
 from skinware.errors import ConfigurationError, SkinwareError
+from skinware_drivers.loading import registered
 from skinware_drivers.registry import DRIVERS
 from skinware_drivers.virtual.hardware import EMULATORS
 
@@ -57,7 +57,7 @@ def check_name(name: str) -> None:
     if keyword.iskeyword(name):
         raise ConfigurationError(f"{name!r} is a word of Python and cannot name a package")
     for group, what in ((DRIVERS, "driver"), (EMULATORS, "emulator")):
-        for taken in entry_points(group=group, name=name):
+        if (taken := registered(group).get(name)) is not None:
             raise ConfigurationError(f"there is {what} {name!r} already ({taken.value}): choose another name")
     if name in sys.stdlib_module_names or find_spec(name) is not None:
         raise ConfigurationError(f"there is a Python package {name!r} already, which yours would hide: choose another")

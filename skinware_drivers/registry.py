@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_names import parse_bus_name
-from skinware_drivers.loading import Kind, load
+from skinware_drivers.loading import Kind, load, registered
 from skinware_drivers.options import nearest_name
 
 DRIVERS = "skinware.drivers"
@@ -41,7 +39,7 @@ def make_bus(
     interface, channel, options = parse_bus_name(name)
     if interface == "virtual":
         channel = channel or driver
-    transports = {entry.name: entry for entry in entry_points(group=TRANSPORTS)}
+    transports = registered(TRANSPORTS)
     if interface in transports:
         bus_class = transports[interface].load()
         if for_devices:

@@ -7,7 +7,6 @@ import contextlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.finding.traffic import Traffic
 from skinware_drivers.layout import Bits, Expand, Frame, Identifier, Layout
 from skinware_drivers.link import Heard, Link
-from skinware_drivers.loading import short_name
+from skinware_drivers.loading import registered, short_name
 from skinware_drivers.registry import DRIVERS, load_driver
 
 _NAMING_S = 0.5
@@ -65,7 +64,7 @@ def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[Any
         ConfigurationError: one of ``only`` is not there, or cannot be loaded.
     """
     found = {short_name(name): load_driver(name) for name in only}
-    for name in () if only else sorted(entry_points(group=DRIVERS).names):
+    for name in () if only else sorted(registered(DRIVERS)):
         with contextlib.suppress(ConfigurationError):
             found[name] = load_driver(name)
     return {name: driver for name, driver in found.items() if driver.medium == medium}

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import msgspec
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.loading import Kind, load
+from skinware_drivers.loading import Kind, load, registered
 
 if TYPE_CHECKING:  # needs numpy: commands show the options of emulators fast
     from skinware.geometry import Geometry
@@ -171,7 +170,7 @@ def next_read(hardware: EmulatedHardware, waiting: list[bytes], size: int) -> by
 def emulators_instead(medium: str) -> str:
     """The emulators that drivers of a medium can use instead, for people; empty if there are none."""
     fitting = []
-    for name in sorted(entry_points(group=EMULATORS).names):
+    for name in sorted(registered(EMULATORS)):
         with contextlib.suppress(ConfigurationError):  # one that cannot be loaded is no help
             if medium_of(load_emulator(name)) == medium:
                 fitting.append(f"virtual:{name}")

@@ -139,7 +139,7 @@ def test_pings_that_were_answered_too_late_are_told() -> None:
 
     with web_server(handle, ping_interval=0.01, ping_timeout=0.05) as there, opened(there.bus) as (bus, batch):
         wait_until(lambda: bool(connections) and connections[0].state is not State.OPEN)
-        why = until_lost(bus, batch)
+        why = why_lost(bus, batch)
         assert "the server has closed the connection: 1011 (internal error) keepalive ping timeout" in why
         assert "answered its pings too late" in why
         assert lines(batch) == [b"only this"]

@@ -79,9 +79,9 @@ def test_a_forked_child_does_not_make_a_dead_driver_look_alive(tmp_path: Path, n
 def fork_and_die() -> None:
     """The child has not yet given up what it inherited when its parent is dead."""
 
-    def abandon_slowly(descriptor: Descriptor) -> None:
+    def abandon_slowly(self: Descriptor) -> None:
         time.sleep(0.1)
-        descriptor.close()
+        self.close()
 
     writer = ServiceWriter("x", COLUMNS)
     Descriptor.abandon = abandon_slowly  # type: ignore[method-assign]

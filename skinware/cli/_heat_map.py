@@ -37,6 +37,7 @@ _SIZES = (
     (4, 0),
     (2, _LABEL_ROOM),
     (2, 0),
+    (1, _LABEL_ROOM),
     (1, 0),
 )
 """Zooms, and room in pixels above a block for the name of its module; the first that fits is taken."""
@@ -256,8 +257,9 @@ class _Grid:
 
     @property
     def pitch(self) -> int:
-        """From the top of a block to that of the one below."""
-        return self.head + self.rows * self.zoom + self.gap
+        """From the top of a block to that of the one below; names need whole lines."""
+        pitch = self.head + self.rows * self.zoom + self.gap
+        return pitch + pitch % 2 if self.head else pitch
 
     def group_lines(self, count: int) -> int:
         """Lines of the terminal for ``count`` blocks of one patch, with the gap below."""

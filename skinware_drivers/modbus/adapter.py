@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import struct
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, cast, get_args
 
@@ -23,6 +25,8 @@ from skinware_drivers.modbus.registers import Order, Registers, Wanted
 from skinware_drivers.options import OptionsT
 from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 _MOST_BLOCKS = 200
 _LIMITS: dict[str, tuple[float, float]] = {
     "address_step": (1, 0xFFFF),
@@ -34,6 +38,8 @@ _LIMITS: dict[str, tuple[float, float]] = {
 _WORDS = {"byte_order": get_args(Order), "word_order": get_args(Order)}
 _UNHURRIED = 1.25
 """Of the time that bytes take: devices take some before they answer."""
+_LISTEN_S, _PERIODS, _LONGEST_LISTEN_S = 0.3, 4, 2.0
+_ENOUGH_CYCLES, _TOO_SLOW = 4, 1.5
 
 
 class ModbusException(BusError):
@@ -64,7 +70,8 @@ class ModbusAdapter(Adapter[OptionsT]):
         address_step: by how much the address grows from one register to the next: 2 where addresses count bytes.
         largest_gap: registers that nobody wants, but that are read along rather than ask twice.
         most_registers: of a read.
-        follows_line: on a serial line that is too slow for ``period_s``, take as long as it needs.
+        follows_line: on a serial line that is too slow for ``period_s``, take as long as it needs; and see
+            :meth:`learn_period`.
     """
 
     medium: ClassVar[str] = "modbus"
@@ -192,6 +199,27 @@ class ModbusAdapter(Adapter[OptionsT]):
     def _register(self) -> np.dtype[np.uint16]:
         order = self.byte_order if self._line is None else self._line.byte_order
         return np.dtype(">u2" if order == "big" else "<u2")
+
+    async def learn_period(self, link: Link) -> None:
+        """With ``follows_line``, listen how long a cycle takes: for ``describe`` of devices that need several reads.
+
+        One that is asked faster than it answers never has all its values of one cycle, and some are always stale.
+        """
+        if not self.follows_line:
+            return
+        times: Counter[int] = Counter()
+        passed_s, cycles = 0.0, 0
+        while cycles < _ENOUGH_CYCLES and passed_s < _LONGEST_LISTEN_S:
+            step_s = max(_LISTEN_S, _PERIODS * self.period_s)
+            for one, n in (await link.listen(step_s)).items():
+                times[one.identifier] += n
+            passed_s += step_s
+            if not (cycles := max(times.values(), default=0)):
+                return
+        if (cycle_s := passed_s / cycles) > _TOO_SLOW * self.period_s:
+            log.info("%s: a cycle takes about %.0f ms", link.bus_name, 1e3 * cycle_s)
+            self.period_s = _UNHURRIED * cycle_s
+            self.use_registers(self.registers)
 
     async def _ask(self, link: Link, unit: int, question: bytes) -> bytes:
         timeout_s = 4 * self.timeout_s + 1  # it waits for the read before, and for what is written beside it

@@ -24,6 +24,7 @@ from skinware.status import Status
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Above, AnyFlag, Sentinel
+from skinware_drivers.link import Link
 from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.order_watch import OrderWatch
 from skinware_drivers.modbus.registers import Registers
@@ -74,7 +75,7 @@ class InspireOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand; over TCP, the manual says 255")] = 1
     period_ms: Annotated[
         Annotated[float, Meta(ge=1, le=10_000)] | None,
-        Meta(description="time between two readings of the whole hand; default: 20, or what a serial line needs"),
+        Meta(description="time between two readings of the whole hand; default: 20, or what line and hand need"),
     ] = None
     by_matrix: Annotated[
         bool, Meta(description="read each matrix by itself: 17 questions instead of 9, right whatever addresses count")
@@ -100,6 +101,11 @@ class InspireDriver(ModbusAdapter[InspireOptions]):
         self.patches = [Patch(f"{options.side} hand", [_module(number) for number in range(len(_MATRICES))])]
         self.geometry = _places(Hand(options.side))
         super().__init__(options)
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """The hand; how long it takes for all its registers is learnt first."""
+        await self.learn_period(link)
+        return self.patches
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:

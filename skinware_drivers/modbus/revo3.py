@@ -72,7 +72,7 @@ class Revo3Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = _POINTS
     period_ms: Annotated[
         Annotated[float, Meta(ge=1, le=10_000)] | None,
-        Meta(description="time between two readings; default: 20, or what the line needs"),
+        Meta(description="time between two readings; default: 20, or what line and hand need"),
     ] = None
 
     def __post_init__(self) -> None:
@@ -109,6 +109,11 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         self.patches = [Patch(f"{options.side} hand", modules)]
         self.geometry = _places(Hand(options.side), modules)
         super().__init__(options)
+
+    async def describe(self, link: Link) -> Sequence[Patch]:
+        """The hand; how long it takes for all its registers is learnt first."""
+        await self.learn_period(link)
+        return self.patches
 
     @classmethod
     def watch(cls, tables: SkinTables) -> Watch:

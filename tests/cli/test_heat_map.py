@@ -151,6 +151,19 @@ def test_modules_are_as_far_apart_as_their_names_need() -> None:
     assert len(narrow.labels) == 3  # below each other
 
 
+def test_the_smallest_sensors_have_names_too() -> None:
+    modules = [Module(taxels(n, first_uid=100 * n), n, "", f"{n} taxels") for n in (9, 15, 25, 40)]
+    structure = assemble([("bus", [Patch("hand", modules)])], [PRESSURE], "u2").structure
+    arranged = arrange(structure, [0], "pressure", 24, 9)
+    assert arranged.zoom == 1
+    assert [label.text for line in sorted(arranged.labels) for label in arranged.labels[line]] == [
+        "9 taxels",
+        "15 taxels",
+        "25 taxels",
+        "40 taxels",
+    ]
+
+
 def test_a_triangle_is_drawn_as_one_and_as_a_block_where_that_is_too_high() -> None:
     (one,) = (arrange(fake_structure(1, 1), [0], "pressure", 8, 4).pixels >= 0,)
     assert [row.sum() for row in one] == [2, 2, 4, 4, 6, 6, 8, 8]
@@ -178,7 +191,7 @@ def test_modules_have_their_numbers_and_patches_their_names() -> None:
         (6, "board 9"),
         (9, "board 10"),
     ]
-    assert arrange(structure, [0, 1], "pressure", 40, 12).labels == {}  # no room for names
+    assert arrange(structure, [0, 1], "pressure", 40, 7).labels == {}  # no room for names
 
 
 def test_what_does_not_fit_is_higher() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -194,6 +195,31 @@ async def count_bytes(
 def test_a_server_whose_addresses_count_bytes(over: Any) -> None:
     with over(device(1, 3000, [0] * 3000, count_bytes)) as name, reading(name) as reader:
         read_until(reader, lambda frame: not frame.status.any() and (frame.values == right()).all())
+
+
+def test_a_hand_that_takes_its_time_is_asked_as_fast_as_it_answers() -> None:
+    """Asked faster, no frame would have all matrices of one cycle."""
+    answer_s = 0.01
+
+    async def slowly(*question: Any) -> None:
+        await asyncio.sleep(answer_s)
+        await count_bytes(*question)
+
+    driver, whole = adapter(), 0
+    with (
+        tcp_server(device(1, 3000, [0] * 3000, slowly)) as name,
+        driven(with_options(name, PATIENTLY), driver) as (_, reader),
+    ):
+        assert driver.period_s >= 9 * answer_s
+
+        def whole_in_a_row() -> bool:
+            nonlocal whole
+            frame = read_until(reader, lambda frame: not frame.status.any())
+            following = read_until(reader, lambda other: other.sequence > frame.sequence)
+            whole = 0 if following.status.any() else whole + 1
+            return whole == 3
+
+        wait_until(whole_in_a_row)
 
 
 def test_matrix_by_matrix_it_does_not_matter_what_addresses_count() -> None:

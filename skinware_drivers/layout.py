@@ -8,7 +8,7 @@ count together.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import InitVar, dataclass
 from typing import Any, Literal
 
@@ -178,6 +178,9 @@ class Frame:
     stamp: InitVar[SequenceNumber | None] = None
 
     def __post_init__(self, stamp: SequenceNumber | None) -> None:
+        for what in ("when", "length"):
+            if not isinstance(getattr(self, what), Collection):
+                raise ConfigurationError(f"frame {self.name!r}: `{what}` is a list: write {what}=[...]")
         if stamp is not None:
             warnings.warn("Frame(stamp=...) is now Frame(sequence=...)", DeprecationWarning, stacklevel=3)
             object.__setattr__(self, "sequence", stamp)

@@ -122,7 +122,10 @@ class Link:
         Raises:
             BusSendError: still full after ``timeout_s``, the bus is down, or it is opened to listen only.
             ConfigurationError: a CAN identifier of more than 11 bits lacks the ``EXTENDED_FLAG``.
+            TypeError: the payload is no bytes.
         """
+        if not isinstance(payload, bytes | bytearray | memoryview):
+            raise TypeError(f"the payload {payload!r} is no bytes: write b'...', or bytes([...])")
         if self._data_question.locked():
             async with self._data_question:
                 pass

@@ -51,7 +51,8 @@ def make_bus(
     python_can = interface.removeprefix("can+")
     if python_can not in can.VALID_INTERFACES:
         known = sorted({*transports, *can.VALID_INTERFACES})
-        raise ConfigurationError(f"bus {name!r}: no interface {interface!r}{nearest_name(interface, known)}")
+        host = f"; of a device behind a network, tcp://{name}" if channel.partition("?")[0].isdecimal() else ""
+        raise ConfigurationError(f"bus {name!r}: no interface {interface!r}{nearest_name(interface, known)}{host}")
     from skinware_drivers.can.pythoncan import PythonCanBus
 
     return PythonCanBus(python_can, channel, options, payload_size=payload_size, listen_only=listen_only)

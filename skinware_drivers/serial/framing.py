@@ -22,6 +22,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from skinware.errors import ConfigurationError
 from skinware_drivers.counters import FramerCounters
 
 
@@ -34,12 +35,21 @@ class Field:
         size: 1, 2 or 4 bytes.
         order: byte order.
         mask: bits of it that count.
+
+    Raises:
+        ConfigurationError: another size or order.
     """
 
     offset: int
     size: Literal[1, 2, 4] = 1
     order: Literal["little", "big"] = "little"
     mask: int = 0xFFFF_FFFF
+
+    def __post_init__(self) -> None:
+        if self.size not in (1, 2, 4):
+            raise ConfigurationError(f"Field at {self.offset}: size = {self.size!r}: give 1, 2 or 4 bytes")
+        if self.order not in ("little", "big"):
+            raise ConfigurationError(f"Field at {self.offset}: order = {self.order!r}: give little or big")
 
     @property
     def end(self) -> int:

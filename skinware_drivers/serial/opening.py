@@ -103,7 +103,8 @@ def open_port(path: str, options: SerialOptions, baudrate: int) -> Port:
             write_timeout=None if path.startswith("rfc2217:") else _WRITE_TIMEOUT_S,  # which knows none
         )
     except (serial.SerialException, ValueError) as error:
-        raise ConfigurationError(f"{path}: {error}") from None
+        networks = "; over a network: tcp://HOST:PORT, udp://HOST:PORT or websocket:ws://HOST:PORT"
+        raise ConfigurationError(f"{path}: {error}{networks if 'protocol' in str(error) else ''}") from None
     line.dtr, line.rts = options.dtr, options.rts
     try:
         line.open()

@@ -91,6 +91,9 @@ class Packet(Framing):
     maximum_body: int = field(init=False)
 
     def __post_init__(self) -> None:
+        for what in (self.sync, self.trailer):
+            if isinstance(what, str):
+                raise ConfigurationError(f"sync and trailer are bytes: write b{what!r}, not {what!r}")
         object.__setattr__(self, "maximum_body", self.longest - self.body_start - self.behind)
         if not self.sync and not self.trailer and self.checksum is None:
             raise ConfigurationError("frames without sync, trailer and checksum cannot be told from anything else")

@@ -26,6 +26,8 @@ _PATIENCE_NS = 2_000_000_000
 """So long a question is waited for that was asked when it was recorded; the next one of its kind is not, after that."""
 _EARLIEST_NS = 250_000_000
 """A question may come so long before its time."""
+_ANSWERED_WITHIN_NS = 20_000_000
+"""An answer comes so soon after its question, or sooner: one that came later was read late, or this device is slow."""
 
 
 class RecordedWire:
@@ -80,7 +82,7 @@ class RecordedWire:
         due_ns = self._due_ns(item)
         if not self._is_waited_for(item):
             return min(due_ns, self._asked_ns) if self._is_missed(item) else due_ns
-        asked = self._asked.get(_kind(item))
+        asked = self._questions(item)
         if not asked:
             return due_ns + _PATIENCE_NS
         is_early = asked[0][1] == item.data and asked[0][0] > self._looked_ns - _EARLIEST_NS
@@ -100,6 +102,8 @@ class RecordedWire:
                 found.append(self._given(item, item.identifier or 0))
                 self._is_unanswered = False
             self._take_next()
+            if item.is_sent:
+                self._hasten(item)
         self._counts["frames"] += len(found)
         return found
 
@@ -134,9 +138,10 @@ class RecordedWire:
 
     def _is_asked(self, item: WireItem, now_ns: int) -> bool:
         """Whether the question was asked, or is waited for no more; if it was asked late, all that follows is late."""
-        due_ns, asked = self._due_ns(item), self._asked.get(_kind(item), deque())
-        while asked and (asked[0][0] < due_ns - _EARLIEST_NS or self._is_repeated(item, asked[0][1])):
+        due_ns, asked = self._due_ns(item), self._questions(item)
+        while asked and asked[0][0] < due_ns - _EARLIEST_NS:
             asked.popleft()
+            asked = self._questions(item)
         if asked:
             asked_ns, self._answered[_kind(item)] = asked.popleft()
             self._begun_ns += max(0, asked_ns - due_ns)
@@ -157,8 +162,8 @@ class RecordedWire:
         if self._is_missed(item):
             self._begun_ns -= max(0, self._due_ns(item) - self._asked_ns)
             return True
-        asked = self._asked.get(_kind(item))
-        if not (self._is_waited_for(item) and asked and asked[0][1] == item.data):
+        asked = self._questions(item) if self._is_waited_for(item) else deque()
+        if not asked or asked[0][1] != item.data:
             return False
         asked_ns = asked[0][0]
         if asked_ns < now_ns - _EARLIEST_NS:
@@ -170,9 +175,24 @@ class RecordedWire:
         """Whether it is the answer to a question after which this driver has asked again already."""
         return not item.is_sent and self._is_unanswered and self._asked_ns > self._met_ns
 
-    def _is_repeated(self, item: WireItem, question: bytes) -> bool:
-        """Whether it was asked again before its answer came, and this is not where it was so when it was recorded."""
-        return question == self._answered.get(_kind(item)) and question != item.data
+    def _hasten(self, question: WireItem) -> None:
+        """Where nothing was asked between a question and its answer, the driver of then had not given it up.
+
+        However late the answer was read, by a driver that was held up: this one has not to wait for it for so long.
+        """
+        if self._is_unanswered and self._next is not None and not self._next.is_sent:
+            later_ns = self._due_ns(self._next) - self._due_ns(question)
+            self._begun_ns -= max(0, later_ns - _ANSWERED_WITHIN_NS)
+
+    def _questions(self, item: WireItem) -> deque[tuple[int, bytes]]:
+        """What was asked of its kind, when.
+
+        One that was asked again before its answer came is none, unless this is where it was so when it was recorded.
+        """
+        asked, answered = self._asked.setdefault(_kind(item), deque(maxlen=1000)), self._answered.get(_kind(item))
+        while asked and asked[0][1] == answered != item.data:
+            asked.popleft()
+        return asked
 
     def _take_next(self) -> None:
         self._next = next(self._items, None)

@@ -93,7 +93,7 @@ def require_equal(
 ) -> None:
     """Have something captured, and decode it again; it is captured anew, twice at most, if there is a difference.
 
-    Seen once in some 200 captures at a load of 16 on two processors, of a device that is asked: an update less.
+    A driver that was held up for long may have asked what it does not ask in the replay, which waits for that.
     """
     for number in range(3):
         file = folder / f"{number}.mcap"
@@ -226,18 +226,29 @@ def test_a_question_that_comes_earlier_than_it_did_is_answered_at_once() -> None
     assert [(frame.time_ns, frame.identifier) for frame in wire.emit(8 * MS)] == [(8 * MS, 2)]
 
 
-def test_an_answer_that_was_read_late_comes_before_the_next_question() -> None:
+def test_an_answer_that_was_read_late_comes_soon_after_its_question() -> None:
     """Whoever was held up read it late, and took it. Whoever is not would have given it up by then."""
-    items = [item(0, 0x10, b"a", is_sent=True), item(300, 1), item(301, 2), item(310, 0x10, b"a", is_sent=True)]
-    wire = RecordedWire(iter([*items, item(311, 3)]), 7_000 * MS)
+    items = [item(0, 0x10, b"a", is_sent=True), item(300, 1), item(301, 2), item(310, 0x10, b"b", is_sent=True)]
+    wire = RecordedWire(iter([*items, item(315, 0x10, b"c", is_sent=True), item(329, 3)]), 7_000 * MS)
     wire.skip(0)
     wire.receive(0x10, b"a", 0)
-    assert emitted(wire, 29) == []
-    wire.receive(0x10, b"a", 30 * MS)
-    assert wire.next_due_ns() == 30 * MS
-    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(30 * MS)] == [(30 * MS, 1)]
-    assert wire.next_due_ns() == 31 * MS, "the rest of it has its own delay, and so has the next answer"
-    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(31 * MS)] == [(31 * MS, 2), (31 * MS, 3)]
+    assert emitted(wire, 60) == [(20, 1), (21, 2)]
+    wire.receive(0x10, b"b", 60 * MS)
+    wire.receive(0x10, b"c", 70 * MS)  # the one before had no answer then, either
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(90 * MS)] == [(84 * MS, 3)]
+
+
+def test_an_answer_comes_at_once_to_who_asks_again() -> None:
+    items = [item(0, 0x10, b"a", is_sent=True), item(15, 1), item(16, 2), item(20, 0x10, b"a", is_sent=True)]
+    wire = RecordedWire(iter([*items, item(21, 3)]), 7_000 * MS)
+    wire.skip(0)
+    wire.receive(0x10, b"a", 0)
+    assert emitted(wire, 9) == []
+    wire.receive(0x10, b"a", 10 * MS)
+    assert wire.next_due_ns() == 10 * MS
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(10 * MS)] == [(10 * MS, 1)]
+    assert wire.next_due_ns() == 11 * MS, "the rest of it has its own delay, and so has the next answer"
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(11 * MS)] == [(11 * MS, 2), (11 * MS, 3)]
 
 
 def test_what_comes_by_itself_comes_at_its_time_whatever_is_asked() -> None:

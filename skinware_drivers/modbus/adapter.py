@@ -205,7 +205,7 @@ class ModbusAdapter(Adapter[OptionsT]):
 
         One that is asked faster than it answers never has all its values of one cycle, and some are always stale.
         """
-        if not self.follows_line:
+        if not self.follows_line or self._line is None or self._line.is_recorded:
             return
         times: Counter[int] = Counter()
         passed_s, cycles = 0.0, 0

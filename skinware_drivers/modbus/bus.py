@@ -94,6 +94,8 @@ class ModbusBus(KernelBus):
 
     medium: ClassVar[str] = "modbus"
     opens_slowly: ClassVar[bool] = True
+    is_recorded: ClassVar[bool] = False
+    """Whoever listens to a recording misses what it says meanwhile."""
     device_end: ClassVar[Callable[..., Bus] | None] = staticmethod(device_end)
 
     def __init__(

@@ -100,6 +100,7 @@ class ReplayedModbusBus(ModbusBus):
     """
 
     opens_slowly = False
+    is_recorded = True
 
     def __init__(
         self,

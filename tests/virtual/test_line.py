@@ -15,8 +15,9 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual import line
+from skinware_drivers.virtual import emulated_line, line
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.emulated_line import VirtualSerialBus
 from skinware_drivers.virtual.emulator import CanFrame, Device, on_a_grid
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions, cut_packets
@@ -55,16 +56,17 @@ class Long(Strip):
         return [(5, struct.pack("<100f", *range(100)))]
 
 
-def received(bus: line.VirtualSerialBus | VirtualCanBus, payload_size: int) -> list[tuple[int, bytes]]:
+def received(bus: VirtualSerialBus | VirtualCanBus, payload_size: int) -> list[tuple[int, bytes]]:
     batch = FrameBatch(100, payload_size)
     wait_until(lambda: bus.receive(batch, 0) > 0)
     return [(int(row["identifier"]), row["payload"][: row["length"]].tobytes()) for row in batch.wire[: batch.stop]]
 
 
 def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
+    for module in (line, emulated_line):
+        monkeypatch.setattr(module, "load_emulator", lambda _name: Strip)
     bus = line.virtual_bus("strip", {"seed": "1"}, payload_size=8)
-    assert isinstance(bus, line.VirtualSerialBus)
+    assert isinstance(bus, VirtualSerialBus)
     bus.use(Packet(sync=(0xAA,), length=3), Packet(length=1, sync=(ord("?"),)))
     assert bus.name == "bus virtual:strip"
     bus.open()
@@ -78,7 +80,8 @@ def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.M
 
 
 def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
+    for module in (line, emulated_line):
+        monkeypatch.setattr(module, "load_emulator", lambda _name: Strip)
     with pytest.raises(ConfigurationError, match="unknown option 'sed'; did you mean 'seed'"):
         line.virtual_bus("strip", {"sed": "1"})
 

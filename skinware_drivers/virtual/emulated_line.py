@@ -1,0 +1,108 @@
+"""The bus ``virtual`` of serial and of Modbus devices: an emulated line in the driver's own process.
+
+The payloads of the emulator's frames are the bytes on the line, framing and all; their identifier is 0.
+"""
+
+from __future__ import annotations
+
+import time
+
+from skinware_drivers.bus import Bus
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.registers import Wanted
+from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
+from skinware_drivers.virtual.hardware import EmulatedHardware, emulators_instead, load_emulator, next_read
+from skinware_drivers.virtual.timer import MonotonicTimer
+
+_LONGEST_BACKLOG_NS = 1_000_000_000
+"""What nobody fetched for longer is lost, as in a kernel's buffer that is full."""
+
+
+class _EmulatedLine(Bus):
+    """What emulated devices on a line make of a bus of that kind of line.
+
+    Args:
+        channel: name of the emulator.
+        options: of the emulator, as texts.
+        payload_size: longest body that fits into a batch.
+        listen_only: refuse every ``send``.
+
+    Raises:
+        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        options: dict[str, str] | None = None,
+        *,
+        payload_size: int = 8,
+        listen_only: bool = False,
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        emulator = load_emulator(channel)
+        self.hardware: EmulatedHardware = emulator(options_from_strings(emulator.Options, options or {}))
+
+    @property
+    def name(self) -> str:
+        """As a user writes it."""
+        return f"bus virtual:{self.channel}"
+
+    def instead(self, medium: str) -> str:
+        """Emulators of devices on that medium."""
+        return emulators_instead(medium) or super().instead(medium)
+
+    def _open_port(self) -> Port:
+        return _EmulatedPort(self.hardware)
+
+
+class VirtualSerialBus(_EmulatedLine, SerialBus):
+    """Emulated serial devices as a bus. Its name is ``virtual:NAME?key=value``, as that of ``VirtualCanBus``."""
+
+
+class VirtualModbusBus(_EmulatedLine, ModbusBus):
+    """Emulated Modbus devices as a bus; its name is as that of :class:`VirtualSerialBus`."""
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
+        """No time: it has no baud rate."""
+        return 0.0
+
+
+class _EmulatedPort(Port):
+    """The host's end of a line with emulated devices at the other."""
+
+    def __init__(self, hardware: EmulatedHardware) -> None:
+        self._hardware = hardware
+        self._timer = MonotonicTimer()
+        self._unread: list[bytes] = []
+        hardware.skip(time.monotonic_ns())
+        self._wake_when_due()
+
+    def fileno(self) -> int:
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:
+        now_ns = time.monotonic_ns()
+        due_ns = self._hardware.next_due_ns()
+        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        self._unread += [frame.payload for frame in self._hardware.emit(now_ns)]
+        data = next_read(self._hardware, self._unread, size)
+        self._wake_when_due()
+        return data
+
+    def write(self, data: bytes) -> int:
+        self._hardware.receive(0, data, time.monotonic_ns())
+        self._wake_when_due()
+        return len(data)
+
+    def close(self) -> None:
+        self._timer.close()
+
+    def _wake_when_due(self) -> None:
+        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
+
+
+__all__ = ["VirtualModbusBus", "VirtualSerialBus"]

@@ -10,8 +10,9 @@ On CAN, 1 Mbit/s, little-endian, identifier = number of the message << 2:
   them 050 and 052: both are known here. The manual has 0 at the pressure of the air; a published program has that
   pressure itself, 101,325. The option ``zero_pa`` says which.
 * Sense: message 054: palm, thumb 1, 2 and tip, index finger 1, 2, 3 and tip; 055: middle and ring finger likewise. A
-  byte each, in 0.4 kPa; FF: no value. (The maker's program for CAN does not divide the palm's by ten, the one for UDP
-  does; here they are all alike. [INF]) Messages 056 and 057 of older firmware are not read.
+  byte each, in 0.4 kPa; FF: no value. The maker's program for CAN does not divide the palm's by ten, the one for UDP
+  does: the option ``palm`` says whether its unit is that of the others. Messages 056 and 057 of older firmware are not
+  read.
 
 Sense over UDP, from its port 7000 to port 8000, every 3 ms, little-endian: ``56 35 42 32``, version 1, type, length
 u16, number u32, ms u32; of type 2 follow 164 bytes: number of the sample u32, position and current of 16 joints
@@ -24,6 +25,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
@@ -38,7 +41,7 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can.adapter import CanAdapter
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Byte, Frame, Identifier, Layout, Sentinel, Values
+from skinware_drivers.layout import Byte, Expand, Frame, Identifier, Layout, Sentinel, Values
 from skinware_drivers.link import Link, Match, Reply
 from skinware_drivers.numbering import SequenceNumber
 from skinware_drivers.options import check_options
@@ -64,6 +67,8 @@ _PAD_FLAGS = (Sentinel(Status.NO_ACK, _NONE), Sentinel(Status.OUT_OF_RANGE, _MOS
 _PAD_FRAMES = [
     Frame(name, [Identifier(one)], [8], Values(0, "u1", 8), module=one, flags=_PAD_FLAGS) for name, one in PADS.items()
 ]
+_ENDS = 0xFF00
+"""That is added to the two ends of a byte where values are more than a byte."""
 _PA_IN_A_BYTE, _PA_OVER_UDP = 400.0, 100.0
 _AIR_PA = range(60_000, 150_000)
 """From the highest towns to the sea, where somebody presses."""
@@ -82,6 +87,12 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         int, msgspec.Meta(description="what an untouched fingertip sends, Pa: 0, or 101325 for the pressure of the air")
     ] = 0
     side: Annotated[Literal["right", "left"], msgspec.Meta(description="which hand it is, for the places")] = "right"
+    palm: Annotated[
+        Literal["alike", "tenfold"],
+        msgspec.Meta(
+            description="on CAN, the unit of a Sense's palm: that of its other pads, or ten times that"
+        ),
+    ] = "alike"
     period_ms: Annotated[
         Annotated[int, msgspec.Meta(ge=1)] | None,
         msgspec.Meta(description="nominal time between two messages, ms; default: 10 on CAN, 3 over UDP"),
@@ -186,8 +197,15 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
         self.geometry = _places_of_tips(self.options.side)
 
     def _take_pads(self) -> None:
-        self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=_MOST * _PA_IN_A_BYTE),)
+        factor = 10 if self.options.palm == "tenfold" else 1
+        self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=factor * _MOST * _PA_IN_A_BYTE),)
         self.dtype, self.layout = np.uint8, Layout(_PAD_FRAMES)
+        if factor > 1:
+            flags = [Sentinel(one.status, one.value + _ENDS) for one in _PAD_FLAGS]
+            values = (Expand(partial(_expand, factor=factor)), Expand(partial(_expand, factor=1)))
+            frames = zip(_PAD_FRAMES, values, strict=True)
+            self.layout = Layout([replace(frame, values=one, flags=flags) for frame, one in frames])
+            self.dtype = np.uint16
         modules = [
             Module(taxels(8, first_uid=8 * at), one, "pads", name) for at, (name, one) in enumerate(PADS.items())
         ]
@@ -204,6 +222,16 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
                 " touches them",
                 *(2 * [float(np.median(told))]),
             )
+
+
+def _expand(
+    payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8], factor: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint16]]:
+    """Eight pads, the first with a unit of its own."""
+    told = payload[:, :8].astype(np.uint16)
+    value = told * np.array([factor] + 7 * [1], np.uint16)
+    row, channel = np.divmod(np.arange(8 * len(length)), 8)
+    return row, channel, np.where(told >= _MOST, told + np.uint16(_ENDS), value).ravel()
 
 
 def _places_of_tips(side: Literal["right", "left"]) -> Geometry:

@@ -48,6 +48,7 @@ FUZZED: Mapping[str, Callable[[], AnyAdapter]] = {
     "linkerhand-hand_23x9": lambda: LinkerHandDriver(LinkerHandOptions(touch="hand_23x9")),
     "allegro_v5-tips": lambda: allegro("tips"),
     "allegro_v5-sense": lambda: allegro("sense"),
+    "allegro_v5-palm": lambda: allegro("sense", palm="tenfold"),
     "allegro_v5-udp": lambda: AllegroV5UdpDriver(AllegroV5Options()),
     "paxini-converter": lambda: paxini("converter", {1: 31, 8: 9}),
     "paxini-high_speed": lambda: paxini("high_speed", {2: 31, 19: 0, 27: 9}),

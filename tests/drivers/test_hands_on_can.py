@@ -411,6 +411,15 @@ def test_pads_are_two_frames_of_eight_bytes() -> None:
     assert decoder.state.status.tolist() == [0, 0, end, *[0] * 12, none]
 
 
+def test_the_unit_of_a_palm_can_be_ten_times_that_of_the_others() -> None:
+    frames = ((0x150, "7B00000000000000"), (0x154, "7B00000000000000"))
+    assert pascals(shown(allegro("sense", palm="tenfold"), *frames))[0:9:4] == [492_000, 0, 49_200]
+    assert pascals(shown(allegro("sense"), *frames))[0:9:4] == [49_200, 0, 49_200]
+    ends = shown(allegro("sense", palm="tenfold"), (0x150, "FEFFFD0000000000"), (0x154, "FFFE000000000000"))
+    end, none = int(Status.OUT_OF_RANGE), int(Status.NO_ACK)
+    assert ends.state.status[[0, 1, 2, 8, 9]].tolist() == [end, none, 0, none, end]
+
+
 @pytest.mark.parametrize("frame", [(0x158, "00" * 8), (0x3C0, "00" * 7), (0x3C4, "00" * 8)])
 def test_what_is_no_skin_of_an_allegro_is_not_shown(frame: tuple[int, str]) -> None:
     assert seen(shown(allegro("tips"), frame)) == []

@@ -1,6 +1,6 @@
 """A hand of 1062 taxels behind a pymodbus server: our driver, pymodbus' own client, and a bare loop, in turns.
 
-    tools/bench modbus [tcp] [rtu] [--turnaround-us US] [--seconds 3] [--rounds 3] [--awake]     default: both
+    tools/bench modbus [tcp] [rtu] [--turnaround-us US] [--seconds 3] [--rounds 3] [--one-processor]
 
 The taxels are read in 9 reads of at most 125 registers, as fast as the server answers. The bare loop sends a question
 and waits for as many bytes as its reply has, without looking at them: what the server's turnaround allows. ``rtu`` is a
@@ -10,9 +10,8 @@ terminal knows no baud rate. On it, the driver and the bare loop are silent for 
 way: hands a second and processor time per read, medians of the rounds, and what they are of the bare loop and of
 pymodbus' client. Processor time of our driver includes decoding and publishing; it runs as with ``--realtime normal``.
 
-Who sends to a process on a sleeping processor wakes that processor, in its own processor time; in a virtual machine
-that takes longer than the rest of a question. With ``--awake``, no processor sleeps: each has a busy process meanwhile,
-at SCHED_IDLE, which gives way at once.
+Who sends to a process that sleeps on another processor wakes that processor, in its own processor time; in a virtual
+machine that takes longer than all else. With ``--one-processor``, all have one, and nobody wakes another.
 """
 
 from __future__ import annotations
@@ -261,14 +260,6 @@ def hand(part: str) -> Iterator[str]:
         yield where
 
 
-def stay_awake(processor: int) -> None:
-    """Use what nobody else wants of a processor, until it is killed."""
-    os.sched_setaffinity(0, [processor])
-    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    while True:
-        pass
-
-
 @contextlib.contextmanager
 def _process(work: Callable[..., None], *arguments: Any) -> Iterator[None]:
     process = _FORK.Process(target=work, args=arguments)
@@ -306,13 +297,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of each way in each round")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--turnaround-us", type=float, default=SILENCE_US, help="silence before a question on a line")
-    parser.add_argument("--awake", action="store_true", help="no processor sleeps meanwhile")
+    parser.add_argument("--one-processor", action="store_true", help="server, wire and clients share one")
     given = parser.parse_args()
+    if given.one_processor:
+        os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     for part in given.parts or PARTS:
-        with contextlib.ExitStack() as stack:
-            for processor in os.sched_getaffinity(0) if given.awake else ():
-                stack.enter_context(_process(stay_awake, processor))
-            where = stack.enter_context(hand(part))
+        with hand(part) as where:
             found: dict[str, list[Result]] = {way: [] for way in WAYS}
             for _ in range(given.rounds):
                 for way, results in found.items():

@@ -26,7 +26,7 @@ from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.doctor.rig import nothing_found
-from tests.recording.damaging import damaged
+from tests.recording.damaging import damaged, with_a_bad_chunk
 from tests.recording.rig import has, publish, recording
 
 
@@ -156,10 +156,7 @@ def test_one_that_was_cut_or_damaged(tmp_path: Path) -> None:
     cut.write_bytes(data[:-400])
     _, findings = seen(cut)
     assert findings["the recording was cut off"].commands == ("skin-recover cut.mcap",)
-    broken = bytearray(data)
-    middle = len(data) // 2
-    broken[middle : middle + 64] = bytes(64)
-    cut.write_bytes(broken[:-400])
+    cut.write_bytes(with_a_bad_chunk(file)[:-400])
     _, findings = seen(cut)
     assert "1 chunk damaged and left out" in findings["the recording is damaged"].evidence
 

@@ -33,13 +33,14 @@ class PatientStream(io.TextIOBase):
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._fd = stream.fileno()
-        self._own_fd = _reopened(self._fd)
+        self._own_fd: int | None = None  # first: Python also closes one that could not be made
         self._waiting: deque[bytes] = deque()
         self._size = 0
         self._lock = threading.RLock()
         self.left_out: int = 0
+        self._stream = stream
+        self._fd = stream.fileno()
+        self._own_fd = _reopened(self._fd)
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
@@ -105,9 +106,18 @@ class PatientStream(io.TextIOBase):
             while self._waiting and (left_s := until_s - time.monotonic()) > 0:
                 self._until_writable(left_s)
                 self.flush()
-        if self._own_fd is not None:
-            os.close(self._own_fd)
-            self._own_fd = None
+        self._give_back()
+
+    def close(self) -> None:
+        """What still waits is lost: Python closes what nobody has any more, and tells errors to who may not read."""
+        self._waiting.clear()
+        self._give_back()
+        super().close()
+
+    def _give_back(self) -> None:
+        fd, self._own_fd = self._own_fd, None
+        if fd is not None:
+            os.close(fd)
 
     def _write(self, data: bytes) -> int:
         """How much could be written without a wait."""

@@ -89,9 +89,7 @@ class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     side: Annotated[Literal["right", "left"], msgspec.Meta(description="which hand it is, for the places")] = "right"
     palm: Annotated[
         Literal["alike", "tenfold"],
-        msgspec.Meta(
-            description="on CAN, the unit of a Sense's palm: that of its other pads, or ten times that"
-        ),
+        msgspec.Meta(description="on CAN, the unit of a Sense's palm: that of its other pads, or ten times that"),
     ] = "alike"
     period_ms: Annotated[
         Annotated[int, msgspec.Meta(ge=1)] | None,

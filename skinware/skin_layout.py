@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import texts
-from skinware._matrices import Matrices
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
+from skinware.matrices import Matrices
 from skinware.structure import Index, Structure
 
 

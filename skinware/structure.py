@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from skinware import _names
 from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
-from skinware._matrices import Matrices
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
+from skinware.matrices import Matrices
 from skinware.sensor_types import SensorType
 
 __all__ = ["VALUE_DTYPES", "Index", "Structure"]

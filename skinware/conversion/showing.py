@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Schema
 
-from skinware._matrices import rows_and_columns
 from skinware._names import distinct
 from skinware.conversion import definitions
 from skinware.conversion.cdr import Cdr
 from skinware.conversion.skin_messages import acquired_ns
 from skinware.driver_frame import DriverFrame
+from skinware.matrices import rows_and_columns
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import BusState, PatchState

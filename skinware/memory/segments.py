@@ -107,7 +107,8 @@ class Segment:
 def take_name(namespace: Namespace, name: str) -> Descriptor:
     """Become the owner of a service's name, for as long as the returned descriptor is open.
 
-    What the owner before left half made or cannot take back (it was killed) is removed.
+    What the owner before left half made or cannot take back (it was killed) is removed. Of one that was killed while it
+    forked, the child may still have the lock: that moment is waited for.
 
     Raises:
         NameInUse: a living process owns it.

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
-from skinware._matrices import rows_and_columns
+from skinware.matrices import filled_by
 
 Cell = tuple[int, int]
 """Row, and column in halves of a sensor: rows of a triangle are shifted by half a sensor."""
@@ -48,8 +48,8 @@ def shape_of(kind: str, count: int) -> Shape:
     known = _BY_KIND.get((kind, count))
     if known is not None:
         return Shape(known, 1 + max(row for row, _ in known), 2 + max(half for _, half in known))
-    grid = rows_and_columns(kind)
-    if grid is not None and grid[0] * grid[1] == count:
+    grid = filled_by(kind, count)
+    if grid is not None:
         return rows_of(count, grid[1])
     return rows_of(count, block_columns(count))
 

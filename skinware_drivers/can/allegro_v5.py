@@ -197,13 +197,14 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     def _take_pads(self) -> None:
         factor = 10 if self.options.palm == "tenfold" else 1
         self.types = (PRESSURE.measured(scale=_PA_IN_A_BYTE, minimum=0, maximum=factor * _MOST * _PA_IN_A_BYTE),)
-        self.dtype, self.layout = np.uint8, Layout(_PAD_FRAMES)
-        if factor > 1:
+        if factor == 1:
+            self.dtype, self.layout = np.uint8, Layout(_PAD_FRAMES)
+        else:
             flags = [Sentinel(one.status, one.value + _ENDS) for one in _PAD_FLAGS]
             values = (Expand(partial(_expand, factor=factor)), Expand(partial(_expand, factor=1)))
             frames = zip(_PAD_FRAMES, values, strict=True)
-            self.layout = Layout([replace(frame, values=one, flags=flags) for frame, one in frames])
             self.dtype = np.uint16
+            self.layout = Layout([replace(frame, values=one, flags=flags) for frame, one in frames])
         modules = [
             Module(taxels(8, first_uid=8 * at), one, "pads", name) for at, (name, one) in enumerate(PADS.items())
         ]

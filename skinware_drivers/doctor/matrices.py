@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import numpy.typing as npt
 
+from skinware.matrices import filled_by
 from skinware.structure import Structure
-
-_MATRIX = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 
 
 def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, ...]:
@@ -21,15 +18,13 @@ def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, 
     """
     found: list[str] = []
     for module, name in enumerate(structure.module_names):
-        shape = _MATRIX.fullmatch(structure.module_kind[module].decode())
-        if shape is None:
-            continue
-        rows, columns = int(shape[1]), int(shape[2])
+        kind = structure.module_kind[module].decode()
         index = np.arange(structure.n_sensors)[structure.module_index(module)]
         for type_id in np.unique(structure.sensor_type[index]).tolist():
             of_type = bad[index[structure.sensor_type[index] == type_id]]
-            if len(of_type) == rows * columns:
-                found += [f"{line} of {name}" for line in _lines(of_type.reshape(rows, columns))]
+            shape = filled_by(kind, len(of_type))
+            if shape is not None:
+                found += [f"{line} of {name}" for line in _lines(of_type.reshape(shape))]
     return tuple(dict.fromkeys(found))
 
 

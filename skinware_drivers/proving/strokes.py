@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from skinware.matrices import filled_by
+
 Floats = npt.NDArray[np.float64]
 Places = npt.NDArray[np.int64]
 """(n, 2): row and column of each taxel."""
@@ -34,11 +36,8 @@ class Matrix(NamedTuple):
     @classmethod
     def of_kind(cls, kind: str, count: int) -> Matrix | None:
         """The matrix of a module's kind (``4x6``), if so many taxels fill it."""
-        rows, times, columns = kind.partition("x")
-        if not (times and rows.isdigit() and columns.isdigit()):
-            return None
-        found = cls(int(rows), int(columns))
-        return found if found.rows * found.columns == count and count > 1 else None
+        shape = filled_by(kind, count)
+        return cls(*shape) if shape is not None and count > 1 else None
 
     @property
     def places(self) -> Places:

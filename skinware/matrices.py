@@ -23,6 +23,12 @@ def rows_and_columns(kind: str) -> tuple[int, int] | None:
     return (int(said[1]), int(said[2])) if said else None
 
 
+def filled_by(kind: str, count: int) -> tuple[int, int] | None:
+    """Rows and columns of a module of this kind, if so many sensors fill them; else None."""
+    shape = rows_and_columns(kind)
+    return shape if shape is not None and shape[0] * shape[1] == count else None
+
+
 class Matrices(dict[str, npt.NDArray[np.int64]]):
     """Where the sensors of a type are in each module that is a matrix of them, by the module's name.
 
@@ -43,8 +49,8 @@ class Matrices(dict[str, npt.NDArray[np.int64]]):
         self._type_name, self._kind_of = type_name, dict(zip(names, kinds, strict=True))
         positions = np.arange(len(module_of))
         for name, kind, index in zip(names, kinds, group(module_of.astype(np.uint32), len(names)), strict=True):
-            shape = rows_and_columns(kind)
-            if shape is not None and len(positions[index]) == shape[0] * shape[1]:
+            shape = filled_by(kind, len(positions[index]))
+            if shape is not None:
                 self[name] = frozen(positions[index].reshape(shape))
 
     def __missing__(self, name: str) -> Never:
@@ -56,3 +62,6 @@ class Matrices(dict[str, npt.NDArray[np.int64]]):
         if rows_and_columns(kind) is None:
             raise StructureError(f"module {name!r} is no matrix but {kind!r}; its geometry tells where its sensors are")
         raise StructureError(f"module {name!r} is {kind}, but does not have a {self._type_name} sensor at each place")
+
+
+__all__ = ["Matrices", "filled_by", "rows_and_columns"]

@@ -416,11 +416,28 @@ class TestRevo3(DriverConformance):
     emulator = EmulatedRevo3
 
 
+class TestRevo3Sums(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedRevo3
+    emulator_options: ClassVar[Mapping[str, Any]] = {"sums": True, "side": "left"}
+
+
 class TestRevo3Matrix(DriverConformance):
     driver = Revo3Driver
     emulator = EmulatedRevo3
     driver_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
-    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix", "values": "force"}
+
+
+class EmulatedPackedRevo3(EmulatedRevo3):
+    full_scale = 0xFF
+
+
+class TestRevo3Packed(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedPackedRevo3
+    driver_options: ClassVar[Mapping[str, Any]] = {"mapping": "packed"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "packed", "values": "force", "adc_pads": (1, 4)}
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -43,6 +43,7 @@ FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
     "revo2": lambda: Revo2Driver(Revo2Options()),
     "revo3": lambda: Revo3Driver(Revo3Options()),
     "revo3-matrix": lambda: Revo3Driver(Revo3Options(mapping="matrix")),
+    "revo3-packed": lambda: Revo3Driver(Revo3Options(mapping="packed")),
 }
 _ROWS = 64
 

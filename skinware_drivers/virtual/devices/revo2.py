@@ -6,7 +6,7 @@ Source: BrainCoTech/unitree-g1-brainco-hand, pull request 1; the vectors in test
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +28,9 @@ class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fi
 class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
     """One hand. Values: force, tangential force and direction of each finger from the thumb on; then proximities."""
 
-    full_scale: ClassVar[Sequence[int]] = [0xFFFE] * 15 + [0xFFFF_FFFE] * 5
-    rest: ClassVar[Sequence[int]] = [30, 5, 90] * 5 + [70_000] * 5
-    swing: ClassVar[Sequence[int]] = [2500, 300, 0] * 5 + [90_000] * 5
+    full_scale: int | Sequence[int] = [0xFFFE] * 15 + [0xFFFF_FFFE] * 5
+    rest: int | Sequence[int] = [30, 5, 90] * 5 + [70_000] * 5
+    swing: int | Sequence[int] = [2500, 300, 0] * 5 + [90_000] * 5
     function = 4
 
     def __init__(self, options: EmulatedRevo2Options, **more: object) -> None:

@@ -20,6 +20,7 @@ from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import SensorType
 from skinware.status import Status
+from skinware_drivers.bus import Bus
 from skinware_drivers.description import Module, Patch, SkinTables, taxels
 from skinware_drivers.hand import FINGERS, Grid, Hand
 from skinware_drivers.layout import Sentinel, Values
@@ -120,6 +121,12 @@ class Revo3Driver(ModbusAdapter[Revo3Options]):
         self._said: _Said | None = None
         self._declare(_unasked(options.mapping), options.side or "right", options.points)
         super().__init__(options)
+
+    def fit(self, bus: Bus) -> None:
+        """Ask for no registers before the hand has said which it has."""
+        super().fit(bus)
+        if not bus.listen_only:
+            self.use_registers(())
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the hand which pads it has and what it sends of them; how long it takes for all is learnt then.

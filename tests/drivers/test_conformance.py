@@ -406,6 +406,32 @@ class TestRevo2(DriverConformance):
         return [float(np.float32(value)) for value in felt]
 
 
+class EmulatedPressureRevo2(EmulatedRevo2):
+    full_scale = 0xFFFF
+
+
+class TestRevo2Pressure(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedPressureRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "pressure"}
+
+
+class EmulatedForce3dRevo2(EmulatedRevo2):
+    full_scale = 127
+
+
+class TestRevo2Force3d(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedForce3dRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "force3d"}
+
+
+class TestRevo2ArrayPressure(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedPressureRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "array_pressure"}
+
+
 class TestRevo2ThatIsSwitchedOn(TestRevo2):
     driver_options: ClassVar[Mapping[str, Any]] = {"enable": True}
     emulator_options: ClassVar[Mapping[str, Any]] = {"enabled": False}

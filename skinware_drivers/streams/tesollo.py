@@ -8,6 +8,8 @@ Wire format: the maker's program dg_tcp_comm (github.com/tesollodelto/dg_tcp_com
 * ``length 01 | what ...`` with what = 1 joints, 2 currents, 3 temperatures, 4 velocities, 5 fingertips, 6 GPIO ->
   ``length 01 | 8 bytes for each motor | each finger's sensor | GPIO``. The program always asks for 1 to 4, or 1 to 5.
 * ``00 03 0B``: the force sensors take what they feel as zero; the program waits for no answer.
+* Force sensors of three axes send (x, y, z, nc, nc, nc), of four axes (x, y, z, nc, nc, tz): commit 116a684
+  (2026-03-26).
 
 Where it contradicts itself: one commit (8c85809) expects bytes of all fingers, another (0ea90ef) only of those that
 have a sensor. The length tells which, so both are read.
@@ -58,7 +60,6 @@ _TORQUE = tuple(
     SensorType(f"torque_{axis}", _VENDOR << 12 | number, "N m", scale=1e-3) for number, axis in enumerate("xyz", 1)
 )
 _AXES = (*(force.measured(scale=0.1) for force in FORCE), *_TORQUE)
-Axis = Literal["force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z"]
 
 
 class _Model(NamedTuple):
@@ -104,7 +105,9 @@ _TIPS = {
     4: _Tip("four axes", ">i2", 6),
     5: _Tip("TACTILE_S", ">u2", 18, Grid(3, 6)),
 }
-_THREE_AXES, _FOUR_AXES = 2, 4
+_FORCES = ["force_x", "force_y", "force_z"]
+_MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
+"""What sensors of fewer than six axes measure; what they send of the others is not connected."""
 
 
 class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,9 +130,6 @@ class TesolloOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cells: Annotated[
         Literal["by_row", "by_column"], Meta(description="order in which a grid's cells are sent: not documented")
     ] = "by_row"
-    four_axes: Annotated[
-        tuple[Axis, ...], Meta(description="what four-axis sensors measure: not documented; the others are left out")
-    ] = ()
 
     def __post_init__(self) -> None:
         check_options(self)
@@ -248,15 +248,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         if tip.grid is not None:
             most = np.iinfo(np.dtype(tip.dtype)).max
             return (PRESSURE.measured(unit="counts", minimum=0, maximum=most),), ["pressure"] * tip.values
-        names: Sequence[str] = [axis.name for axis in _AXES]
-        if sensors == _THREE_AXES:
-            names = names[:3]
-        elif sensors == _FOUR_AXES:
-            if not self.options.four_axes:
-                raise BusError(
-                    "which four axes its sensors have is not documented: look which values stay 0, and say four_axes"
-                )
-            names = self.options.four_axes
+        names = _MEASURED.get(sensors, [axis.name for axis in _AXES])
         types = [axis for axis in _AXES if axis.name in names]
         return types, [axis.name if axis.name in names else None for axis in _AXES]
 

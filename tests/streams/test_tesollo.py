@@ -71,7 +71,12 @@ def test_the_emulated_hand_byte_for_byte() -> None:
 
 @pytest.mark.parametrize(
     ("tips", "dtype", "kind", "count"),
-    [("tactile_m", np.uint8, "3x5", 75), ("tactile_s", np.uint16, "3x6", 90), ("six_axes", np.int16, "force", 30)],
+    [
+        ("tactile_m", np.uint8, "3x5", 75),
+        ("tactile_s", np.uint16, "3x6", 90),
+        ("six_axes", np.int16, "force", 30),
+        ("four_axes", np.int16, "force", 20),
+    ],
 )
 def test_a_hand_behind_tcp(tips: str, dtype: type, kind: str, count: int, namespace: object) -> None:
     port = free_port()
@@ -90,7 +95,7 @@ def test_a_hand_behind_tcp(tips: str, dtype: type, kind: str, count: int, namesp
             if kind == "force":
                 assert [(t.name, t.unit, t.scale) for t in structure.types][2:4] == [
                     ("force_z", "N", 0.1),
-                    ("torque_x", "N m", 0.001),
+                    ("torque_x" if tips == "six_axes" else "torque_z", "N m", 0.001),
                 ]
                 skin.reader.call("tare")
             else:
@@ -149,15 +154,23 @@ def test_hands_that_are_refused(answer: str, words: str) -> None:
         asyncio.run(TesolloDriver(TesolloOptions())._ask_version(cast("Link", Says(answer))))
 
 
-def test_what_four_axes_measure_must_be_said() -> None:
-    with pytest.raises(BusError, match="not documented"):
-        TesolloDriver(TesolloOptions())._channels(4)
-    types, names = TesolloDriver(TesolloOptions(four_axes=("force_x", "force_z", "torque_y")))._channels(4)
-    assert [kind.name for kind in types] == ["force_x", "force_z", "torque_y"]
-    assert names == ["force_x", None, "force_z", None, "torque_y", None]
+def test_sensors_of_fewer_axes_measure_what_the_makers_program_says() -> None:
+    types, names = TesolloDriver(TesolloOptions())._channels(4)
+    assert [(kind.name, kind.unit, kind.scale) for kind in types][2:] == [
+        ("force_z", "N", 0.1),
+        ("torque_z", "N m", 0.001),
+    ]
+    assert names == ["force_x", "force_y", "force_z", None, None, "torque_z"]
     assert TesolloDriver(TesolloOptions())._channels(2)[1] == ["force_x", "force_y", "force_z", None, None, None]
     with pytest.raises(ConfigurationError, match="sensors"):
         TesolloOptions(sensors=9)  # type: ignore[arg-type]
+
+
+def test_the_fourth_of_four_axes_is_the_last_of_six_places() -> None:
+    hand = Spoken(EmulatedTesollo(EmulatedTesolloOptions(hand="3f", tips="four_axes", fitted=1, pattern="cycle")))
+    assert hand.answers(VERSION) == [bytes.fromhex("0009 08 3F02 0105 04 01")]
+    hand.answers(EVERYTHING)
+    assert hand.answers(bytes.fromhex("00040105")) == [bytes.fromhex("000f01 0001 0001 0001 0000 0000 0001")]
 
 
 def test_an_old_hand_tells_nothing_of_its_sensors(namespace: object) -> None:

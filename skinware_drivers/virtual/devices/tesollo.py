@@ -24,7 +24,9 @@ class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_
     """What the hand is."""
 
     hand: Annotated[Literal["1f", "2f", "3f", "4f", "5f", "5f15"], Meta(description="model")] = "5f"
-    tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes"], Meta(description="kind of sensors")] = "tactile_m"
+    tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes", "four_axes"], Meta(description="kind of sensors")] = (
+        "tactile_m"
+    )
     fitted: Annotated[int, Meta(ge=1, le=31, description="fingers that have one, as bits")] = 31
     pads: Annotated[bool, Meta(description="send zeros for fingers that have none")] = False
     old: Annotated[bool, Meta(description="firmware that does not tell which sensors there are")] = False
@@ -82,14 +84,17 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
 
     @property
     def _each_has(self) -> int:
-        return {"tactile_m": 15, "tactile_s": 18, "six_axes": 6}[self.options.tips]
+        return {"tactile_m": 15, "tactile_s": 18, "six_axes": 6, "four_axes": 4}[self.options.tips]
 
     @property
     def _form(self) -> str:
-        return {"tactile_m": ">15B", "tactile_s": ">18H", "six_axes": ">6h"}[self.options.tips]
+        return {"tactile_m": ">15B", "tactile_s": ">18H", "six_axes": ">6h", "four_axes": ">3h4xh"}[self.options.tips]
 
     def _version(self) -> bytes:
-        model, kind = _MODEL[self.options.hand], {"tactile_m": 3, "tactile_s": 5, "six_axes": 1}[self.options.tips]
+        model, kind = (
+            _MODEL[self.options.hand],
+            {"tactile_m": 3, "tactile_s": 5, "six_axes": 1, "four_axes": 4}[self.options.tips],
+        )
         if self.options.old:
             return struct.pack(">HBHBB", 7, 8, model, 1, 5)
         return struct.pack(">HBHBBBB", 9, 8, model, 1, 5, kind, self.options.fitted)

@@ -128,3 +128,10 @@ def test_odd_serial_numbers_can_break_no_rule(fake: FakeMachine) -> None:
 def test_there_is_no_rule_for_what_is_not_on_usb(fake: FakeMachine) -> None:
     fake.add_uart("ttyS0", kind=4)
     assert rules_for(serial_ports(fake.machine)) == ""
+
+
+def test_converters_of_every_hand_on_a_serial_port_are_known() -> None:
+    """1A86:55D3, Paxini's converter board: riverfog7/paxini-utils, commit b381e6a."""
+    [wch] = [rule for rule in parse(shipped_rules()) if ("ENV", "ID_VENDOR_ID", "==", "1a86") in rule]
+    [models] = [value for key, name, _, value in wch if (key, name) == ("ENV", "ID_MODEL_ID")]
+    assert {"7523", "55d3", "55d4"} <= set(models.split("|"))

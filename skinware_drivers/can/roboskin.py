@@ -39,14 +39,14 @@ from skinware_drivers.can.roboskin_options import (
     FIRST_BOARD,
     LAST_BOARD,
     NON_TACTILE,
-    TRIANGLE_SKIN_TYPES,
     TRIANGLES,
     Kind,
     RoboskinOptions,
     SpecialBoards,
     runs_text,
+    usual_kind,
 )
-from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp, tell_what_fits
+from skinware_drivers.can.roboskin_setup import START, STOP, BoardSetUp, tell_of_chips, tell_what_fits
 from skinware_drivers.can.roboskin_watch import BaselineWatch
 from skinware_drivers.description import Module, Patch, SkinTables
 from skinware_drivers.layout import Layout
@@ -111,6 +111,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
         if not self._told:
             self._tell_what_is_odd(link)
             tell_what_fits(link.bus_name, self._set_ups(self._boards))
+            tell_of_chips(link.bus_name, self._set_ups(self._boards))
         self._told = bool(self._boards)
         self._fit_boards()
         return self.patches_set_up(self._boards)
@@ -341,7 +342,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     def _module(self, set_up: BoardSetUp, triangle: int) -> Module:
         options = self.options
-        kind = options.kind or ("triangle" if set_up.skin_type in TRIANGLE_SKIN_TYPES else "fingertip")
+        kind = options.kind or usual_kind(set_up.skin_type, triangle)
         thermal = NON_TACTILE[kind]
         for special in options.modules:
             if special.board != set_up.board or triangle not in special.triangles:

@@ -14,8 +14,10 @@ TRIANGLES = 16
 CHANNELS = 12
 NON_TACTILE: dict[str, tuple[int, ...]] = {"triangle": (6, 10), "fingertip": (), "palm": (11,)}
 """Channels of each kind of module that feel no touch."""
-TRIANGLE_SKIN_TYPES = (0, 2, 8)
-"""Types of skin whose modules are triangles, as long as nobody says otherwise."""
+_TRIANGLE_SKIN_TYPES = (0, 2, 8)
+ERGO_HAND = 3
+"""Type of skin of the ergoCub's hand."""
+_FINGERTIPS_OF_ERGO_HAND = 5
 LONGEST_OLD_PERIOD_MS = 209
 """What the timer of the old set-up can count to: 65535 ticks of 3.2 us."""
 
@@ -25,6 +27,17 @@ InertialSensor = Literal[
 """An inertial sensor of a board; those of an ``imu`` come in other messages (MTB4 only)."""
 
 Inertial = tuple[InertialSensor, ...]
+
+
+def usual_kind(skin_type: int, triangle: int) -> str:
+    """The kind of a module, as long as no option says otherwise.
+
+    The ergoCub's hand has fingertips as its modules 0 to 4 and triangles with thermal pads as 5 to 15:
+    robotology/icub-firmware b42992119 (2026-06-17), embot_app_application_theSkin.cpp, computedrift.
+    """
+    if skin_type == ERGO_HAND:
+        return "fingertip" if triangle < _FINGERTIPS_OF_ERGO_HAND else "triangle"
+    return "triangle" if skin_type in _TRIANGLE_SKIN_TYPES else "fingertip"
 
 
 class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -15,7 +15,15 @@ import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
 
-from skinware_drivers.can.roboskin_options import TRIANGLES, Inertial, Kind, RoboskinOptions, SpecialBoards, runs
+from skinware_drivers.can.roboskin_options import (
+    ERGO_HAND,
+    TRIANGLES,
+    Inertial,
+    Kind,
+    RoboskinOptions,
+    SpecialBoards,
+    runs,
+)
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -107,6 +115,11 @@ class BoardSetUp:
         self.skin_type = self.skin_type if special.skin_type is None else special.skin_type
         self._no_load = self._no_load if special.no_load is None else special.no_load
 
+    @property
+    def is_uneven(self) -> bool:
+        """Whether its triangles have different shifts or converter offsets."""
+        return len({*zip(self._shift, self._cdc_offset, strict=True)}) > 1
+
     # The new way
 
     def _set_up_new(self, options: RoboskinOptions, modules: Iterable[Kind]) -> set[int]:
@@ -182,6 +195,23 @@ class BoardSetUp:
         if is_mtb4:
             self._on.update(range(TRIANGLES))
             self.period_ms = OLD_MTB4_PERIOD_MS
+
+
+def tell_of_chips(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:
+    """Warn where a second set-up can land on other triangles.
+
+    With the type of the ergoCub's hand, the firmware stores shifts and offsets by triangle at first, and by chip after
+    its first data: what a set-up without a power cycle says of triangles 1 to 15 goes to others (trianglesOrder in
+    embot_app_application_theSkin.cpp, robotology/icub-firmware b42992119, 2026-06-17).
+    """
+    uneven = [str(board.board) for board in set_ups if board.skin_type == ERGO_HAND and board.is_uneven]
+    if uneven:
+        log.warning(
+            "%s: triangles of board %s have different shifts or offsets: a hand of skin type 3 takes them as meant at"
+            " its first set-up only; cut its power before each further one, or give all triangles the same",
+            bus_name,
+            ", ".join(uneven),
+        )
 
 
 def tell_what_fits(bus_name: str, set_ups: Sequence[BoardSetUp]) -> None:

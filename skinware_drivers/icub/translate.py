@@ -13,12 +13,12 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import (
     NON_TACTILE,
-    TRIANGLE_SKIN_TYPES,
     TRIANGLES,
     Kind,
     RoboskinOptions,
     SpecialBoards,
     runs_text,
+    usual_kind,
 )
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.icub.body import Body, Place, places_text
@@ -193,8 +193,8 @@ def _with_kinds(options: RoboskinOptions, patch: int, body: Body) -> RoboskinOpt
     kinds: dict[tuple[int, str, tuple[int, ...]], list[int]] = {}
     for board in options.boards:
         set_up = BoardSetUp(options, board)
-        usual = "triangle" if set_up.skin_type in TRIANGLE_SKIN_TYPES else "fingertip"
         for triangle in sorted(set_up.enabled):
+            usual = usual_kind(set_up.skin_type, triangle)
             shape = body.shapes.get((patch, board, triangle))
             if shape is not None and shape != (usual, NON_TACTILE[usual]):
                 kinds.setdefault((board, *shape), []).append(triangle)
@@ -228,8 +228,7 @@ def _check_set_up(part: Part, patch: int, options: RoboskinOptions, body: Body, 
             f" without it, skin type {options.skin_type} decides"
         )
         _note(notes, "todo", part, text)
-    elif {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}:
-        special = {p for p in unknown if BoardSetUp(options, p[1]).skin_type not in TRIANGLE_SKIN_TYPES}
+    elif special := {p for p in unknown if usual_kind(BoardSetUp(options, p[1]).skin_type, p[2]) != "triangle"}:
         text = f"fingertips or palms? No position file says, so they are taken to be fingertips: {places_text(special)}"
         _note(notes, "todo", part, text)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from skinware import Structure
-from skinware_drivers.can.roboskin import Kind
+from skinware_drivers.can.roboskin import Kind, RoboskinOptions
+from skinware_drivers.can.roboskin_setup import BoardSetUp, tell_of_chips
 from tests.sdk.test_roboskin_wire import Rig
 
 
@@ -26,7 +29,6 @@ def non_tactile(structure: Structure) -> set[int]:
         (2, b"triangle", {6, 10}),
         (8, b"triangle", {6, 10}),
         (1, b"fingertip", set()),
-        (3, b"fingertip", set()),
         (7, b"fingertip", set()),
     ],
 )
@@ -34,6 +36,25 @@ def test_the_type_of_skin_tells_what_the_modules_are(skin_type: int, kind: bytes
     structure = structure_of(skin_type=skin_type)
     assert set(structure.module_kind.tolist()) == {kind}
     assert non_tactile(structure) == channels
+
+
+def test_the_ergocub_hand_has_five_fingertips_and_triangles_with_thermal_pads() -> None:
+    structure = structure_of(skin_type=3)
+    assert structure.module_kind.tolist() == [b"fingertip"] * 5 + [b"triangle"] * 11
+    thermal = structure.sensor_uid[structure.index("temperature")]
+    assert {(int(uid) >> 8 & 0xFF, int(uid) & 0xFF) for uid in thermal} == {
+        (t, k) for t in range(5, 16) for k in (6, 10)
+    }
+
+
+@pytest.mark.parametrize(("uneven", "warned"), [({}, False), ({"shift": 3}, True), ({"cdc_offset": 0x2300}, True)])
+def test_different_shifts_on_a_hand_of_type_3_are_warned_of(uneven: Any, warned: bool, caplog: Any) -> None:
+    modules = (Kind(board=7, triangles=(8,), **uneven),) if uneven else ()
+    for skin_type in (0, 3):
+        options = RoboskinOptions(boards=(7,), skin_type=skin_type, modules=modules)
+        tell_of_chips("can0", [BoardSetUp(options, 7)])
+    assert ("skin type 3 takes them as meant at its first set-up only" in caplog.text) == warned
+    assert caplog.text.count("board 7") == int(warned)
 
 
 @pytest.mark.parametrize(("kind", "channels"), [("triangle", {6, 10}), ("fingertip", set()), ("palm", {11})])

@@ -16,9 +16,9 @@ On CAN, 1 Mbit/s, little-endian, identifier = number of the message << 2:
 
 Sense over UDP, from its port 7000 to port 8000, every 3 ms, little-endian: ``56 35 42 32``, version 1, type, length
 u16, number u32, ms u32; of type 2 follow 164 bytes: number of the sample u32, position and current of 16 joints
-(int16), the sixteen pads (u16, 0.1 kPa), velocity of the joints (int32). What the length counts is not known [INF]:
-datagrams of type 2 have 180 bytes, others are not shown. Which value means that there is none is not known either:
-65535, which is no pressure of a pad, is suspect.
+(int16), the sixteen pads (u16, 0.1 kPa), velocity of the joints (int32). The length counts the bytes behind the header
+(tcpdef.h in Wonikrobotics-git/allegro_hand_ros2_V5_Sense db81588, 2026-05-27); datagrams of type 2 that have not 180
+bytes are not shown. No source says which value means that there is none: 65535, which is no pressure, is suspect.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ def _places_of_tips(side: Literal["right", "left"]) -> Geometry:
 
 
 def _places_of_pads(side: Literal["right", "left"]) -> Geometry:
-    """Nominal; the number of a pad grows from the palm to the tip [INF]."""
+    """Nominal; pads are numbered from the root of a finger to its tip (allegro_node.cpp:266, same commit)."""
     pad, uids = Grid(1, 1, _FROM_PAD_TO_PAD_M), iter(range(N_PADS))
     counts = {"palm": 1, "thumb": 3, "index": 4, "middle": 4, "ring": 4}
     return Geometry.joined(

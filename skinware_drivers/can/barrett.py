@@ -1,20 +1,20 @@
 """Barrett hand BH280 on CAN: 24 tactile cells on each of three fingers and the palm, read on request.
 
-Wire format: owd ``openwam/CANbus.cc`` (github.com/personalrobotics/owd), which drives real hands. 1 Mbit/s. [INF]
-Identifiers: bit 10: to a group, bits 9 to 5: sender, bits 4 to 0: receiver or group; the host is 0, the hand's pucks
-are nodes 11 to 14, and all of them are group 5. Set a property: ``80 | property, 00, value`` (four bytes,
-little-endian) to the node; ask for one: ``property`` to the node or group. A set or a question about TACT is answered
-with data.
+Wire format: owd ``openwam/CANbus.cc`` (github.com/personalrobotics/owd, 126b940, 2015-11-13), which drives real hands.
+1 Mbit/s (CANbus.cc:240). Identifiers: bit 10: to a group, bits 9 to 5: sender, bits 4 to 0: receiver or group; the host
+is 0, the hand's pucks are nodes 11 to 14, and all of them are group 5. Set a property: ``80 | property, 00, value``
+(four bytes, little-endian) to the node; ask for one: ``property`` to the node or group. A set or a question about TACT
+is answered with data.
 
 * TACT = 2, full: five frames to group 9 (``identifier & 0x41F == 0x409``), each with its number 0 to 4 in the first
-  four bits and then five values of 12 bits (the last of frame 4 is unused), in 1/256 N/cm2. They come in this order
-  [INF]; in any other, or with one lost, they are not shown.
+  four bits and then five values of 12 bits (the last of frame 4 is unused), in 1/256 N/cm2. CANbus.cc stores
+  each by its number, whatever the order; here they are shown if they come from 0 to 4, and not with one lost.
 * TACT = 1, top 10: one frame to group 8 (``== 0x408``): a map of 24 bits (the first bit is cell 0) of which ten are
   set, and the values of these ten cells in ascending order, four bits each, in N/cm2. Of the other cells the device
   says nothing but that they are weaker: they are shown as 0.
 
 The number of TACT depends on the firmware; 106 is counted from the list in CANbus.cc for the firmware that has it.
-[INF] It answers a question about another property with that property's bit 7 set. [INF: how CANbus.cc reads it]
+It answers a question about another property with that property's bit 7 set, as CANbus.cc reads answers.
 """
 
 from __future__ import annotations

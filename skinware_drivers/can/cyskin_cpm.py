@@ -6,7 +6,8 @@ value of a set belongs to taxel ``ORDER[i]``. (Other programs of that author use
 script of his uses it the other way round.) A set is complete with 0x40B.
 
 Nothing numbers the sets and nothing is checked above CAN, so one lost frame loses the set: it is not shown, and sets
-are told apart by time alone. There is no command: the finger sends by itself. [INF]
+are told apart by time alone. No program of that author sends a command: the finger sends by
+itself.
 """
 
 from __future__ import annotations

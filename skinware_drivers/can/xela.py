@@ -11,7 +11,7 @@ Which identifier means which taxel differs from model to model; both published s
 * row_column (4x6 model): ``first_id | row << 4 | column``, first 0x100; taxel = column * rows + row.
 
 A message is not always a new sample: in a recording of 506 messages a second, taxels keep their values over many
-messages. [INF] Nothing on the wire tells the one from the other. There is no checksum, no sequence number, and no
+messages. Nothing on the wire tells the one from the other. There is no checksum, no sequence number, and no
 answer to any command.
 """
 

@@ -5,8 +5,9 @@ order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | 
 CRC u16 LE`` over everything before it, with a CRC that is in no catalogue. A response has the number of its command and
 begins with a status, u16 LE. Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
 
-What is not known, and what is done about it: the payload of tare is not published; it is sent empty [INF], and the
-option ``tare_payload`` changes it. System information is not taken apart, the operation ``system`` shows its bytes.
+What is not known, and what is done about it: the payload of tare; it is sent empty, and the option
+``tare_payload`` changes it. ksatyaki/wts_driver 82c46ac (2016-09-01) declares tare and untare as one command with a
+truth value, and implements neither. System information is not taken apart, the operation ``system`` shows its bytes.
 Data that are run-length coded are documented for another device only, by two programs that disagree on where they
 begin.
 """

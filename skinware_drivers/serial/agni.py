@@ -4,15 +4,16 @@ Wire format: agni_serial_protocol, ``serial_protocol_defines.h`` and ``serial_pr
 ``F0 C4 | id | ... | exclusive or of all bytes before``.
 
 * Commands to the device (id 0): number, and for C0 (configuration), F1 (start), 00 (stop), F0 (alive?) nothing more;
-  for D0 (period): count u16 LE, then sensor u8 and period u16 LE for each. Only C0 and F0 are answered.
+  for D0 (period): count u16 LE, then sensor u8 and period u16 LE, in 0.1 ms, for each (service_set_period_cb in
+  ubi-agni/agni_serial_protocol 18b224d, 2024-06-25). Only C0 and F0 are answered.
 * Configuration (id 0): version 01, device u8, count n, n descriptors: type u16, payload length u16. Little-endian in
   the newer program, big-endian in an older one: option ``descriptors``. Sensor k of them (from 1) sends under id k.
 * Data (id 1 to C9): time u32, payload. Their length is known only from the configuration.
 * Alive (id F0): nothing more. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; other lengths of
-  errors are not public [INF], those are skipped as noise.
+  errors are not in that program: they are skipped as noise.
 
 What the values of a sensor type are stands in files of that program, not on the wire: the option ``values`` says it for
-all sensors of a line. The unit of the time [INF: option ``time_unit_us``] and of the period [INF: ms] are not public.
+all sensors of a line. The unit of the device's time no file of that program says: option ``time_unit_us``.
 """
 
 from __future__ import annotations
@@ -43,6 +44,8 @@ from skinware_drivers.serial.packets import LengthTable, Packet
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _BEGIN = b"\xf0\xc4"
+_IN_A_MS = 10
+_LONGEST_MS = 0xFFFF // _IN_A_MS
 _CONFIGURATION, _START, _STOP, _PERIOD, _ALIVE, _ERROR = 0xC0, 0xF1, 0x00, 0xD0, 0xF0, 0xFE
 _MOST_SENSORS = 0xC9
 _MOST_BYTES = 4096  # of a sensor's payload
@@ -59,7 +62,7 @@ class AgniOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     period_ms: Annotated[
-        int, Meta(ge=0, le=0xFFFF, description="time between two messages; 0: as the device has it")
+        int, Meta(ge=0, le=_LONGEST_MS, description="time between two messages; 0: as the device has it")
     ] = 0
     usual_period_ms: Annotated[int, Meta(ge=1, description="what that is, if period_ms is 0")] = 10
     descriptors: Annotated[Literal["little", "big"], Meta(description="byte order of the sensor descriptors")] = (
@@ -157,7 +160,9 @@ class AgniDriver(SerialAdapter[AgniOptions]):
     async def configure(self, link: Link) -> None:
         """Set the period of all sensors, if the options want one."""
         if self._period_ms:
-            each = b"".join(struct.pack("<BH", sensor, self._period_ms) for sensor in range(1, self._n_sensors + 1))
+            each = b"".join(
+                struct.pack("<BH", sensor, _IN_A_MS * self._period_ms) for sensor in range(1, self._n_sensors + 1)
+            )
             await link.send(0, command(_PERIOD, struct.pack("<H", self._n_sensors) + each))
 
     async def start(self, link: Link) -> None:
@@ -191,8 +196,8 @@ class AgniDriver(SerialAdapter[AgniOptions]):
     @operation()
     async def period(self, link: Link, patches: Sequence[Patch], ms: int) -> None:  # noqa: ARG002
         """Set the time between two messages of every sensor; the device does not say whether it can."""
-        if not 1 <= ms <= 0xFFFF:
-            raise ValueError(f"{ms} ms: give 1 to 65535")
+        if not 1 <= ms <= _LONGEST_MS:
+            raise ValueError(f"{ms} ms: give 1 to {_LONGEST_MS}")
         self._period_ms = ms
         self.period_s = ms / 1e3
         await self.configure(link)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 import pytest
 
 from skinware import PatchState
 from skinware.errors import RequestFailed
-from skinware_drivers.serial.agni import AgniDriver, command
+from skinware_drivers.link import Link
+from skinware_drivers.registry import make_bus
+from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual.devices.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
@@ -25,13 +28,25 @@ def test_bytes_of_commands_are_those_of_the_vectors() -> None:
     assert period == message(0, bytes.fromhex("D0 0200 01 0A00 02 0A00"))
 
 
+def test_a_period_is_sent_in_tenths_of_a_millisecond(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver, sent = AgniDriver(AgniOptions(period_ms=20)), list[bytes]()
+
+    async def send(_link: object, _identifier: int, payload: bytes) -> None:
+        sent.append(payload)
+
+    monkeypatch.setattr(Link, "send", send)
+    driver._n_sensors = 2
+    asyncio.run(driver.configure(Link(make_bus("/dev/null"))))
+    assert sent == [command(0xD0, bytes.fromhex("0200 01 C800 02 C800"))]
+
+
 def test_the_emulated_device_byte_for_byte() -> None:
     device = Spoken(EmulatedAgni(EmulatedAgniOptions(sensors=(1, 2), pattern="cycle")))
     assert device.answers(b"noise" + CONFIGURATION) == [message(0, bytes.fromhex("01 07 02 0302 0200 0302 0400"))]
     assert device.answers(CONFIGURATION[:-1] + b"\0") == [bytes.fromhex("F0 C4 FE F0 3A")]
     assert device.answers(command(0x99)) == [bytes.fromhex("F0 C4 FE F1 3B")]
     assert device.answers(command(0xF0)) == [bytes.fromhex("F0 C4 F0 C4")]
-    assert device.answers(command(0xD0, bytes.fromhex("0200 01 1400 02 1400"))) == []
+    assert device.answers(command(0xD0, bytes.fromhex("0200 01 C800 02 C800"))) == []
     frames = device.answers(START, 65)
     assert len(frames) in (6, 8)
     for at, frame in enumerate(frames):
@@ -53,7 +68,7 @@ def test_a_device_that_streams_already_and_describes_itself() -> None:
         frame = read_until(reader, lambda f: len(set(f.values.tolist())) == 1)
         assert frame.module_time_ns[0] == frame.module_time_ns[1]
         assert reader.call("alive") == {"bus0": True}
-        with pytest.raises(RequestFailed, match="give 1 to 65535"):
+        with pytest.raises(RequestFailed, match="give 1 to 6553"):
             reader.call("period", ms=0)
         reader.call("period", ms=10)
         read_until(reader, lambda f: int(f.values[0]) > int(frame.values[0]) + 3)

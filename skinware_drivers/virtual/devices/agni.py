@@ -75,10 +75,10 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         if number == 0x00:
             self.stop(device)
         elif number == 0xF1:
-            self.start(device, now_ns, device.memory.get("ms", self.options.period_ms) / 1e3)
+            self.start(device, now_ns, device.memory.get("period_s", self.options.period_ms / 1e3))
         elif number == 0xD0:
-            device.memory["ms"] = max(1, int.from_bytes(command[7:9], "little"))
-            self.change_period(device, now_ns, device.memory["ms"] / 1e3)
+            device.memory["period_s"] = max(1, int.from_bytes(command[7:9], "little")) * 1e-4
+            self.change_period(device, now_ns, device.memory["period_s"])
         else:
             return message(0xFE, bytes([_UNKNOWN]))
         return b""

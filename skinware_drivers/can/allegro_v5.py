@@ -24,6 +24,7 @@ bytes are not shown. No source says which value means that there is none: 65535,
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -33,7 +34,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import HandshakeTimeout
+from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.status import Status
@@ -74,6 +75,8 @@ _AIR_PA = range(60_000, 150_000)
 """From the highest towns to the sea, where somebody presses."""
 _FROM_PAD_TO_PAD_M = 0.02
 _LONGEST_DATAGRAM = 1472
+_TWICE = 1.5
+"""Times a period's messages that are taken for those of two hands."""
 
 
 class AllegroV5Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -154,12 +157,16 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
             BusError: none is heard.
         """
         model = self.options.model
+        of_tips = [Match(one) for ids in TIPS.values() for one in ids]
+        with link.follow(*of_tips) as frames:
+            counted = Counter[int]()
+            for one, times in (await link.listen(self.options.learn_s)).items():
+                counted[one.identifier] += times
+        heard = set(counted)
+        self._refuse_two(link, counted)
         if model == "sense":
             self._take_pads()
             return self.patches
-        of_tips = [Match(one) for ids in TIPS.values() for one in ids]
-        with link.follow(*of_tips) as frames:
-            heard = {one.identifier for one in await link.listen(self.options.learn_s)}
         if model == "tips" or not heard.isdisjoint(match.value for match in of_tips):
             self._take_tips()
             self._judge_zero([frames.get_nowait() for _ in range(frames.qsize())])
@@ -184,6 +191,30 @@ class AllegroV5Driver(CanAdapter[AllegroV5Options]):
     def watch(cls, tables: SkinTables) -> Watch:
         """Modules that tell nothing but 0."""
         return ZeroWatch(tables)
+
+    def _refuse_two(self, link: Link, counted: Counter[int]) -> None:
+        """Hands say no number: of two on a bus, values go to the same sensors by turns.
+
+        Raises:
+            BusError: two hands that send different identifiers are heard.
+        """
+        tips, pads = set(counted) & {one for ids in TIPS.values() for one in ids}, set(counted) & set(PADS.values())
+        doubled = [name for name, ids in TIPS.items() if set(ids) <= tips]
+        if (tips and pads) or doubled:
+            what = " and ".join(f"{one:03X}" for one in sorted(tips | pads))
+            raise BusError(
+                f"{link.bus_name}: {what} are heard, which no single hand sends: two hands on one bus cannot be told"
+                " apart; give each a bus of its own"
+            )
+        most = max((counted[one] for one in tips | pads), default=0)
+        if most > _TWICE * self.options.learn_s / self.period_s + 1:
+            log.warning(
+                "%s: a message comes every %.1f ms, not every %.0f ms: if two hands are on this bus, their values mix,"
+                " as nothing tells them apart: give each a bus of its own; if there is one, say its period_ms",
+                link.bus_name,
+                1e3 * self.options.learn_s / most,
+                1e3 * self.period_s,
+            )
 
     def _take_tips(self) -> None:
         self.types = (PRESSURE.measured(offset=-float(self.options.zero_pa)),)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -428,6 +429,34 @@ def test_what_is_no_skin_of_an_allegro_is_not_shown(frame: tuple[int, str]) -> N
 def test_a_hand_of_which_nothing_is_heard_is_waited_for() -> None:
     with pytest.raises(HandshakeTimeout, match="its own program has to set a period"):
         allegro("auto")
+
+
+@pytest.mark.parametrize(
+    ("counted", "refused"),
+    [
+        ({0x3C0: 50, 0x3C8: 50}, None),
+        ({0x140: 50, 0x148: 50}, None),
+        ({0x3C0: 50, 0x3C8: 50, 0x140: 50, 0x148: 50}, "140 and 148 and 3C0 and 3C8"),
+        ({0x3C0: 50, 0x150: 50}, "150 and 3C0"),
+    ],
+)
+def test_two_allegro_hands_that_send_different_identifiers_are_refused(
+    counted: dict[int, int], refused: str | None
+) -> None:
+    driver, link = AllegroV5Driver(AllegroV5Options()), Link(VirtualCanBus("allegro_v5"))
+    if refused is None:
+        driver._refuse_two(link, Counter(counted))
+        return
+    with pytest.raises(BusError, match=f"{refused} are heard, which no single hand sends"):
+        driver._refuse_two(link, Counter(counted))
+
+
+@pytest.mark.parametrize(("times", "warned"), [(50, False), (74, False), (100, True)])
+def test_two_allegro_hands_alike_are_warned_of(times: int, warned: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """In half a second, of messages every 10 ms."""
+    driver, link = AllegroV5Driver(AllegroV5Options()), Link(VirtualCanBus("allegro_v5"))
+    driver._refuse_two(link, Counter({0x150: times, 0x154: times}))
+    assert ("if two hands are on this bus, their values mix" in caplog.text) == warned
 
 
 DATAGRAM = (

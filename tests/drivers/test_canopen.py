@@ -16,9 +16,11 @@ from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware_drivers.can.canopen_patch import CanopenDriver, CanopenOptions, MappingChanged
 from skinware_drivers.notice import Notice
 from skinware_drivers.registry import make_bus
+from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen, EmulatedCanopenOptions
+from skinware_drivers.virtual.emulator import CanFrame, Device
 from skinware_drivers.virtual.events import CommandReceived, ErrorReported
 from tests.drivers.bench import EXAMPLE_EDS, Bench, Case, play
 from tests.sdk.driving import Driving, driving_lines, read_until
@@ -285,3 +287,24 @@ def test_a_node_of_the_canopen_package_on_python_cans_bus() -> None:
         node.nmt.stop_heartbeat()
     # python-can's threads of cyclic messages end a while after they were told to
     wait_until(lambda: not any(thread.name.startswith("Cyclic send task") for thread in threading.enumerate()))
+
+
+class WithoutSdoReplies(EmulatedCanopen):
+    """Nobody hears what node 6 answers."""
+
+    def reply(self, device: Device, frame: CanFrame, now_ns: int) -> None:
+        if frame[0] != 0x580 + 6:
+            super().reply(device, frame, now_ns)
+
+
+@pytest.mark.usefixtures("namespace")
+def test_a_node_whose_sdo_replies_are_lost_is_shown_as_the_eds_says() -> None:
+    """It sends its TPDOs all the same: their values are its own, and the other node is not disturbed."""
+    with emulated_skin(CanopenDriver, WithoutSdoReplies, driver_options={"nodes": (5, 6)}) as skin:
+        first = read_until(skin.reader, lambda frame: not frame.status.any())
+        of_each = len(first.values) // 2
+        for node in (slice(0, of_each), slice(of_each, None)):
+            read_until(
+                skin.reader,
+                lambda frame, node=node: not frame.status.any() and (frame.values[node] != first.values[node]).any(),  # type: ignore[misc]
+            )

@@ -183,6 +183,10 @@ class Emulator(Stage, HasOptions[OptionsT]):
         """What a device does by itself; by default it has one timer, for its data."""
         self.burst(device, time_ns)
 
+    def kinds(self) -> Sequence[str]:
+        """Name the kinds of frames with data that the devices send, for the option ``silence``."""
+        return [self.kind_of(identifier, b"") for identifier in sorted(self.identifiers)]
+
     # What a subclass may use
 
     def start(self, device: Device, now_ns: int, period_s: float | None = None) -> None:
@@ -261,6 +265,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         ):
             for number in numbers:
                 self.schedule(now_ns + round(after_s * 1e9), partial(action, self.devices[number]))
+        self.plan_silence(options.silence, self.kinds(), options.silence_after_s, now_ns)
         return [*self.devices.values(), *self._foreign(now_ns)]
 
     def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:

@@ -110,6 +110,12 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             of_board = self._answer_of_hand
         return of_board(device, command, now_ns)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        if self.options.board == "high_speed":
+            return "data" if payload[:2] == b"\xaa\x56" else "answer"
+        return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """What was asked for, or all modules."""
         forces = self._tared(device, values)

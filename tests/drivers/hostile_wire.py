@@ -146,7 +146,8 @@ class _Life:
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(emulation, bus))
         self._thread.start()
-        assert self._ready.wait(30 * SLOWER), self._error
+        assert self._ready.wait(30 * SLOWER)
+        assert self._error is None, self._error
 
     def fileno(self) -> int:
         return self._woken.fileno()
@@ -170,6 +171,7 @@ class _Life:
             emulation.run(self, bus_name=bus, driver="hostile", options=_NoOptions())
         except SkinwareError as error:
             self._error = error
+            self._ready.set()
 
 
 @contextmanager

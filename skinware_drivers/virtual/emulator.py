@@ -129,6 +129,8 @@ class Emulator(Stage, HasOptions[OptionsT]):
     medium: ClassVar[str] = "can"
     Options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
     least_options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    options_command = "skin-emulate"
+    reserved_options = frozenset(("bus", "driver", "geometry", "help", "json", "log", "name", "namespace", "version"))
     numbers: Sequence[int] = (0,)
     identifiers: Collection[int] = ()
     full_scale: ClassVar[int | Sequence[int]]

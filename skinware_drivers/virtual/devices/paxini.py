@@ -37,7 +37,7 @@ class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_f
         Literal["converter", "high_speed"], Meta(description="sensors that are asked, or a hand that streams")
     ] = "converter"
     sensors: Annotated[tuple[int, ...], Meta(description="converter: ids of its sensors")] = (3,)
-    version: Annotated[str, Meta(description="converter: what its sensors say they are")] = (
+    sensor_version: Annotated[str, Meta(description="converter: version text of its sensors")] = (
         "PAXINI PXSR-STDDP03F-v1.0.5"
     )
     points: Annotated[int, Meta(ge=1, le=255, description="taxels of each sensor, or of each module on a finger")] = 31
@@ -75,7 +75,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
 
     def text(self) -> str:
         """What its sensors say they are."""
-        return self.options.version
+        return self.options.sensor_version
 
     def slots(self) -> Sequence[int]:
         """To which modules are connected."""

@@ -133,10 +133,10 @@ class Emulator(Stage, HasOptions[OptionsT]):
     reserved_options = frozenset(("bus", "driver", "geometry", "help", "json", "log", "name", "namespace", "version"))
     numbers: Sequence[int] = (0,)
     identifiers: Collection[int] = ()
-    full_scale: ClassVar[int | Sequence[int]]
-    lowest: ClassVar[int | Sequence[int]] = 0
-    rest: ClassVar[int | Sequence[int]] = 0
-    swing: ClassVar[int | Sequence[int]]
+    full_scale: int | Sequence[int]
+    lowest: int | Sequence[int] = 0
+    rest: int | Sequence[int] = 0
+    swing: int | Sequence[int]
     longest_queue: ClassVar[int] = 256
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:

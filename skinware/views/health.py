@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState, PatchState, Status
 
@@ -119,9 +119,9 @@ def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
         return status | stale
     fresh = is_fresh(
         status,
-        frame.module_time_ns[frame.structure.sensor_module],
+        frame.sensor_time_ns,
         at_ns=now_ns(),
-        max_age_ns=age_limit_ns(frame.period_ns),
+        max_age_ns=frame.structure.age_limits_ns(frame.period_ns),
         alive=not frame.stale,
     )
     return np.where(fresh | (status != 0), status, stale)
@@ -138,7 +138,7 @@ def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
 def patch_ages_ns(frame: DriverFrame) -> list[int | None]:
     """How old the newest data of every patch is; None for one that was never heard."""
     newest_ns = np.zeros(frame.structure.n_patches, np.int64)
-    np.maximum.at(newest_ns, frame.structure.module_patch, frame.module_time_ns)
+    np.maximum.at(newest_ns, frame.structure.group_patch, frame.group_time_ns)
     time_ns = now_ns()
     return [time_ns - newest if newest else None for newest in newest_ns.tolist()]
 

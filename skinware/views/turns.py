@@ -251,7 +251,7 @@ class Viewer:
         frame, structure = driver.frame, driver.structure
         of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
         raw = frame.values[position].item()
-        time_ns = int(frame.module_time_ns[structure.sensor_module[position]])
+        time_ns = int(frame.group_time_ns[structure.sensor_group[position]])
         return {
             "driver": number,
             "position": position,

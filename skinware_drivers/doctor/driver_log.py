@@ -125,7 +125,7 @@ class DriverLog:
         for total, name in ((self._interval, "patch_interval_counts"), (self._delay, "patch_age_counts")):
             now, was = (getattr(one, name).astype(np.int64) for one in (frame, before))
             total += np.where((now >= was) & same_writer, now - was, now)
-        times, earlier = frame.module_time_ns, before.module_time_ns
+        times, earlier = frame.group_time_ns, before.group_time_ns
         self.backwards += int(np.count_nonzero((times < earlier) & (times > 0))) if same_writer else 0
         self.future_ns = max(self.future_ns, int(times.max(initial=0)) - frame.published_ns)
         self.longest_gap_s = max(self.longest_gap_s, (frame.published_ns - before.published_ns) / 1e9)
@@ -183,7 +183,7 @@ class DriverLog:
             return ()
         n = structure.n_patches
         newest_ns = np.zeros(n, np.int64)
-        np.maximum.at(newest_ns, structure.module_patch, frame.module_time_ns)
+        np.maximum.at(newest_ns, structure.group_patch, frame.group_time_ns)
         sensors, modules, fresh = (
             np.bincount(of, minlength=n).tolist()
             for of in (structure.sensor_patch, structure.module_patch, structure.sensor_patch[status == 0])

@@ -56,6 +56,14 @@ class DriverFrame(Frame):
         return self.group_time_ns[self.structure.sensor_group]
 
     @property
+    def module_untouched(self) -> npt.NDArray[np.bool_]:
+        """(n_modules,) bool: modules that have sent nothing but 0 so far: not touched yet, or dead.
+
+        Their values are fresh all the same. All False where the driver does not look for that.
+        """
+        return self._told("module_untouched", (self.structure.n_modules,), np.uint8).astype(bool)
+
+    @property
     def patch_state(self) -> npt.NDArray[np.uint8]:
         """(n_patches,) uint8, :class:`skinware.status.PatchState`."""
         return self.column("patch_state")

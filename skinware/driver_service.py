@@ -1,9 +1,9 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
-Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
-``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``,
-``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``; and ``group_time_ns`` where a module has several
-update groups.
+Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``module_untouched``, ``patch_state``, ``bus_state``,
+``bus_reason``, ``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``,
+``patch_interval_counts``, ``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``; and
+``group_time_ns`` where a module has several update groups.
 Static columns: the structure's tables, ``driver_type`` and the names of the counters.
 """
 
@@ -275,6 +275,7 @@ def _frame_columns(
         "status": ("u1", structure.n_sensors),
         "module_time_ns": ("<i8", structure.n_modules),
         **({} if structure.groups_are_modules else {"group_time_ns": ("<i8", structure.n_groups)}),
+        "module_untouched": ("u1", structure.n_modules),
         "patch_state": ("u1", n_patches),
         "bus_state": ("u1", n_buses),
         "bus_reason": ("u1", n_buses),

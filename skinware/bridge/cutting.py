@@ -20,7 +20,7 @@ from skinware.transfer.frames import RecordedDriverFrame
 from skinware.transfer.generation import Generation
 
 _OF_SENSORS = ("values", "status")
-_OF_MODULES = ("module_time_ns",)
+_OF_MODULES = ("module_time_ns", "module_untouched")
 _OF_GROUPS = ("group_time_ns",)
 _OF_PATCHES = ("patch_state", "patch_counters", "patch_interval_counts", "patch_age_counts")
 _OF_BUSES = (

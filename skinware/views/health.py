@@ -67,7 +67,8 @@ class SkinHealth:
         rate_hz: frames per second now; None where not known yet.
         age_ns: how old its newest data is; None before the first frame.
         sensors: how many it has.
-        statuses: sensors by status, ``fresh`` and ``stale`` first; one sensor can have several.
+        statuses: sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``: those of
+            modules that have sent nothing but 0 so far, which are fresh all the same.
         patches: patches by state (``was live``: by their last state, where nothing newer comes).
         counters: sums over all buses and patches of the counters that the driver publishes, by name.
     """
@@ -106,7 +107,7 @@ def health_of(reader: DriverReader, frame: DriverFrame | None, measured_hz: floa
         rate_hz,
         frame.age_ns,
         frame.structure.n_sensors,
-        count_statuses(status_now(life, frame)),
+        count_statuses(status_now(life, frame)) | {"untouched": int(np.count_nonzero(untouched(frame)))},
         {state: states.count(state) for state in dict.fromkeys(sorted(states))},
         counters,
     )
@@ -125,6 +126,11 @@ def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
         alive=not frame.stale,
     )
     return np.where(fresh | (status != 0), status, stale)
+
+
+def untouched(frame: DriverFrame) -> npt.NDArray[np.bool_]:
+    """(n_sensors,) bool: sensors of modules that have sent nothing but 0 so far; they are fresh all the same."""
+    return frame.module_untouched[frame.structure.sensor_module]
 
 
 def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:

@@ -260,6 +260,7 @@ class Viewer:
             "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
             "noise": abs(of_type.scale) * float(driver.past.noise([position])[0]),
             "status": int(driver.status[position]),
+            "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
 
     def _next_questions(self) -> list[operations.Names | operations.Series]:

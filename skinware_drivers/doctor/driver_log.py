@@ -233,8 +233,9 @@ class DriverLog:
         return whole_lines(self.structure, ((self._always & _BAD) != 0) & ~dark) if self.frames else ()
 
     def dark(self) -> dict[str, int]:
-        """The modules that told nothing but 0, and are suspect for it, with their numbers of sensors."""
-        sensors = np.bincount(self.structure.sensor_module, minlength=self.structure.n_modules)
+        """The modules that sent nothing but 0, if the driver says so, with how many of their sensors are suspect."""
+        suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
+        sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
         dark = np.flatnonzero(self._dark_modules()).tolist()
         return {self.structure.module_names[module]: int(sensors[module]) for module in dark}
 
@@ -242,7 +243,7 @@ class DriverLog:
         is_dark = ((self._always & np.uint8(Status.SUSPECT)) != 0) & ~self._is_lit & (self.frames > 0)
         found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
         found[self.structure.sensor_module[~is_dark]] = False
-        return found
+        return found if self.newest is None else found | self.newest.module_untouched
 
 
 __all__ = ["DriverLog"]

@@ -128,7 +128,8 @@ enum { UPDATES, ORPHANS, LATE, SEQUENCE_LOST, SEQUENCE_REPEATED, SEQUENCE_BACK, 
 enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, SAMPLE_REFUSED, N_SAMPLE_KINDS };
 
 struct columns { /* of a slot: where they begin, bytes from its start */
-    int64_t values, status, module_time_ns, group_time_ns, patch_state, bus_state, bus_reason, bus_since_ns, bus_load, bus_samples;
+    int64_t values, status, module_time_ns, group_time_ns, module_untouched, patch_state, bus_state, bus_reason, bus_since_ns;
+    int64_t bus_load, bus_samples;
     int64_t bus_counters, patch_counters, patch_interval_counts, patch_age_counts, latency_ns, data_path, bus_data_path;
 };
 
@@ -178,7 +179,7 @@ struct plan {
     int64_t *group_heard_ns;           /* (n_groups,) */
     int64_t *patch_heard_ns, *patch_lives_until_ns; /* (n_patches,) */
     uint8_t *patch_state;
-    const uint8_t *module_status; /* (n_modules,) of the watch */
+    const uint8_t *module_status, *module_untouched; /* (n_modules,) of the watch */
     const uint8_t *bus_state, *bus_reason, *bus_samples;
     const int64_t *bus_since_ns;
     const uint16_t *bus_load;

@@ -100,6 +100,7 @@ static void write_frame(struct path *path, int64_t time_ns)
     fill(plan->values, slot, columns->values, plan->n_sensors * plan->value_bytes);
     fill_times(plan, slot);
     fill_status(path, slot + columns->status, time_ns);
+    fill(plan->module_untouched, slot, columns->module_untouched, plan->n_modules);
     fill(plan->patch_state, slot, columns->patch_state, plan->n_patches);
     fill(plan->bus_state, slot, columns->bus_state, plan->n_buses);
     fill(plan->bus_reason, slot, columns->bus_reason, plan->n_buses);

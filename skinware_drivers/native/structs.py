@@ -126,8 +126,9 @@ class Columns(ctypes.Structure):
     """Where the columns of a slot begin."""
 
     _fields_ = _fields(
-        "values status module_time_ns group_time_ns patch_state bus_state bus_reason bus_since_ns bus_load bus_samples"
-        " bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns data_path bus_data_path"
+        "values status module_time_ns group_time_ns module_untouched patch_state bus_state bus_reason bus_since_ns"
+        " bus_load bus_samples bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns"
+        " data_path bus_data_path"
     )
 
 
@@ -174,7 +175,10 @@ class Plan(ctypes.Structure):
         *_fields("period_ns patience_ns pause_ns silence_ns by_cycle most_at_once idle_ns n_counts n_own_counts"),
         *_fields("stale state_live state_stale"),
         *_fields("burst_pause_ns standing_out_ns gap_ns group_heard_ns patch_heard_ns patch_lives_until_ns", _POINTER),
-        *_fields("patch_state module_status bus_state bus_reason bus_samples bus_since_ns bus_load", _POINTER),
+        *_fields(
+            "patch_state module_status module_untouched bus_state bus_reason bus_samples bus_since_ns bus_load",
+            _POINTER,
+        ),
         *_fields("bus_samples_bytes"),
         *_fields("latency_ns data_path bus_data_path", _POINTER),
         *_fields("counts skipped skipped_before patch_bus", _POINTER),

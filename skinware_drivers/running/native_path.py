@@ -207,7 +207,9 @@ class NativePath:
         plan.patch_lives_until_ns = arrays.at(publisher.patch_lives_until_ns)
         plan.patch_state = arrays.at(publisher.patch_state)
         self._module_status = publisher.watch.module_status.copy()  # a watch may replace its own
+        self._module_untouched = publisher.watch.module_untouched.copy()
         plan.module_status = arrays.at(self._module_status)
+        plan.module_untouched = arrays.at(self._module_untouched)
         plan.bus_state, plan.bus_reason = arrays.at(publisher.bus_state), arrays.at(publisher.bus_reason)
         plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
         plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
@@ -354,7 +356,7 @@ class NativePath:
 
     def _take_from_watch(self) -> None:
         watch = self._publisher.watch
-        self._module_status[:] = watch.module_status
+        self._module_status[:], self._module_untouched[:] = watch.module_status, watch.module_untouched
         self._words.sees_all = watch.sees_all
 
     def _on_published(self, oldest_ns: int) -> None:

@@ -203,6 +203,7 @@ class Publisher:
         if not self._structure.groups_are_modules:
             columns["group_time_ns"][:] = state.group_time_ns
         self._fill_status(columns["status"], time_ns)
+        columns["module_untouched"][:] = self.watch.module_untouched
         columns["patch_state"][:] = self.patch_state
         columns["bus_state"][:] = self.bus_state
         columns["bus_reason"][:] = self.bus_reason

@@ -11,13 +11,11 @@ import pytest
 
 from skinware import DriverReader
 from skinware.errors import ConfigurationError
-from skinware.status import Status
 from skinware_drivers.description import assemble
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import device, rtu_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 
@@ -137,9 +135,8 @@ def test_a_server_with_a_hand_to_which_nothing_is_written_unless_somebody_wants_
 # What is wrong with a hand
 
 
-def test_pads_that_are_off_are_doubted_until_they_are_switched_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
+def test_pads_that_are_off_are_untouched_until_they_are_switched_on() -> None:
     with patient("revo3", enabled=False) as skin:
-        read_until(skin.reader, lambda frame: bool(((frame.status & Status.SUSPECT) != 0).all()))
+        read_until(skin.reader, lambda frame: bool(frame.module_untouched.all()))
         skin.reader.call("enable")
-        read_until(skin.reader, lambda frame: not frame.status.any())
+        read_until(skin.reader, lambda frame: not frame.module_untouched.any() and not frame.status.any())

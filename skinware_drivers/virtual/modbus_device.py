@@ -64,6 +64,11 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
     def boot(self, device: Device, now_ns: int) -> None:
         """Wait to be asked."""
 
+    def kinds(self) -> Sequence[str]:
+        """Name the registers with data: a question for one that is silent has no answer."""
+        device = Device(self.numbers[0], self, self.wire.attach(), 0)
+        return [str(address) for address in sorted(self.registers(device, self._each("rest").tolist()))]
+
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         """Cut questions out of a stream, as on a line or as over TCP."""
         found: list[bytes] = []
@@ -85,6 +90,9 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
         if function == self.function and 1 <= count <= _MOST_READ:
             wanted = range(address, address + count * self.step, self.step)
+            if not self.silent.isdisjoint(map(str, wanted)):
+                self.counts["silenced"] += 1
+                return b""
             if self._is_to_sample(device, wanted):
                 device.memory[_ASKED] = asked
                 self.burst(device, now_ns)

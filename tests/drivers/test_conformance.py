@@ -353,7 +353,7 @@ class TestPaxiniConverter(DriverConformance):
     driver_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3)}
     emulator_options: ClassVar[Mapping[str, Any]] = {
         "sensors": (1, 3),
-        "version": "PAXINI PXSR-STDIP03B-v1.0.5",
+        "sensor_version": "PAXINI PXSR-STDIP03B-v1.0.5",
         "points": 25,
     }
 

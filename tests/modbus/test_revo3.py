@@ -11,7 +11,6 @@ import pytest
 
 from skinware import DriverReader, Structure
 from skinware.errors import ConfigurationError
-from skinware.status import Status
 from skinware_drivers.description import assemble
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
@@ -22,7 +21,6 @@ from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
 from skinware_drivers.virtual.emulator import Device
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.modbus.peers import Action, rtu_server
 from tests.modbus.peers import device as server_device
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
@@ -279,9 +277,8 @@ def serving(mapping: str, action: Action | None = None) -> Iterator[str]:
 # What is wrong with a hand
 
 
-def test_pads_that_are_off_are_doubted_until_they_are_switched_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
+def test_pads_that_are_off_are_untouched_until_they_are_switched_on() -> None:
     with patient("revo3", enabled=False) as skin:
-        read_until(skin.reader, lambda frame: bool(((frame.status & Status.SUSPECT) != 0).all()))
+        read_until(skin.reader, lambda frame: bool(frame.module_untouched.all()))
         skin.reader.call("enable")
-        read_until(skin.reader, lambda frame: not frame.status.any())
+        read_until(skin.reader, lambda frame: not frame.module_untouched.any() and not frame.status.any())

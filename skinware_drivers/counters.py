@@ -49,6 +49,8 @@ class BusCounters:
     """Polls of devices that only answer which could not be sent in time."""
     polls_unanswered: int = 0
     """Polls in lock step whose answer did not come in time."""
+    polls_late: int = 0
+    """Answers to polls in lock step that came after their timeout; what they say is shown all the same."""
     updates_skipped: int = 0
     """Updates of modules that were never published, as newer ones came before that was possible."""
     overflows: int = 0

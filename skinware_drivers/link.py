@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -68,6 +68,22 @@ class Match(NamedTuple):
         return is_from_there and frame.payload.startswith(self.prefix) and len(frame.payload) >= self.shortest
 
 
+class _Overdue(NamedTuple):
+    """A question in lock step that was given up.
+
+    Attributes:
+        answer: to it.
+        due_ns: when the answer should have come.
+        until_ns: until when an answer may still come.
+        on_late: called with how late the answer came, s.
+    """
+
+    answer: Match
+    due_ns: int
+    until_ns: int
+    on_late: Callable[[float], None]
+
+
 class Heard(NamedTuple):
     """By what :meth:`Link.listen` distinguishes frames."""
 
@@ -99,6 +115,8 @@ class Link:
         self._no_question.set()
         self._data_question = asyncio.Lock()  # held while one is open
         self._expected: tuple[Match, asyncio.Event] | None = None
+        self._came_ns = 0
+        self._overdue: list[_Overdue] = []
         self._heard: Counter[Heard] | None = None
 
     @property
@@ -171,6 +189,7 @@ class Link:
         awaited = [match.filter for matches, _ in self._waiters for match in matches]
         if self._expected is not None:
             awaited.append(self._expected[0].filter)
+        awaited += [overdue.answer.filter for overdue in self._overdue]
         self._bus.narrow(fewest([*self._wanted, *awaited]))
 
     @contextmanager
@@ -218,14 +237,32 @@ class Link:
         times = "" if tries == 1 else f", {tries} times"
         raise HandshakeTimeout(f"{self.bus_name}: no answer to {sent} within {timeout_s:g} s{times}")
 
-    async def ask(self, identifier: int, payload: bytes, answer: Match, *, timeout_s: float) -> bool:
+    async def ask(
+        self,
+        identifier: int,
+        payload: bytes,
+        answer: Match,
+        *,
+        timeout_s: float,
+        extra_s: float = 0.0,
+        on_late: Callable[[float], None] = lambda _late_s: None,
+    ) -> bool:
         """Send one frame and wait for an answer that may be data; nothing else is sent on this bus meanwhile.
 
         It waits until every ``request`` and ``collect`` has ended. For questions that are asked again and again, see
         :class:`skinware_drivers.polling.Poll`.
 
+        Args:
+            identifier: of the frame.
+            payload: of the frame.
+            answer: which frames answer it.
+            timeout_s: when the answer should have come.
+            extra_s: how much longer to wait for it.
+            on_late: called with how long after ``timeout_s`` the answer came, s (0 or less: it was read late): while it
+                is waited for, or up to five seconds later, unless the question was asked again.
+
         Returns:
-            Whether an answer came within ``timeout_s``.
+            Whether an answer came within ``timeout_s`` and ``extra_s``.
 
         Raises:
             BusSendError: as ``send``.
@@ -234,17 +271,31 @@ class Link:
             await self._no_question.wait()
             async with self._data_question:
                 if not self._questions:
-                    return await self._ask(identifier, payload, answer, timeout_s)
+                    return await self._ask(identifier, payload, answer, timeout_s, extra_s, on_late)
 
-    async def _ask(self, identifier: int, payload: bytes, answer: Match, timeout_s: float) -> bool:
+    async def _ask(
+        self,
+        identifier: int,
+        payload: bytes,
+        answer: Match,
+        timeout_s: float,
+        extra_s: float,
+        on_late: Callable[[float], None],
+    ) -> bool:
         came = asyncio.Event()
+        self._overdue = [one for one in self._overdue if one.answer != answer and one.until_ns > now_ns()]
         self._expected = answer, came
         self._tell_bus()
         try:
             await self._send(identifier, payload, timeout_s)
+            overdue = _Overdue(answer, now_ns() + round(timeout_s * NS_PER_S), now_ns() + _LATE_NS, on_late)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(timeout_s):
+                async with asyncio.timeout(timeout_s + extra_s):
                     await came.wait()
+            if not came.is_set():
+                self._overdue.append(overdue)
+            elif self._came_ns > overdue.due_ns:
+                on_late((self._came_ns - overdue.due_ns) / NS_PER_S)
         finally:
             self._expected = None
             self._tell_bus()
@@ -300,16 +351,24 @@ class Link:
 
     @property
     def expects_data(self) -> bool:
-        """Whether a question is open whose answer may be data: ``hear`` wants to be called."""
-        return self._expected is not None
+        """Whether a question is open, or was given up, whose answer may be data: ``hear`` wants to be called."""
+        return self._expected is not None or bool(self._overdue)
 
     def hear(self, batch: FrameBatch, rows: npt.NDArray[np.int64]) -> None:
         """Look among frames of this bus, data or not, for the answer of ``ask`` (called by the runner)."""
+        for overdue in tuple(self._overdue):
+            likely = rows[_any_match((overdue.answer,), batch.wire["identifier"][rows])].tolist()
+            came_ns = next((int(batch.time_ns[row]) for row in likely if overdue.answer.fits(_reply(batch, row))), None)
+            if came_ns is not None:
+                self._overdue.remove(overdue)
+                overdue.on_late((came_ns - overdue.due_ns) / NS_PER_S)
         if self._expected is None:
             return
         match, came = self._expected
         likely = rows[_any_match((match,), batch.wire["identifier"][rows])].tolist()
-        if any(match.fits(_reply(batch, row)) for row in likely):
+        fitting = next((row for row in likely if match.fits(_reply(batch, row))), None)
+        if fitting is not None and not came.is_set():
+            self._came_ns = int(batch.time_ns[fitting])
             came.set()
 
     def _forget_late(self) -> None:

@@ -163,6 +163,13 @@ _LOSSES = {
     "polls_unanswered": _Loss(
         Severity.WARNING, "devices did not answer", "check their power and cable", ("skin-find {name}",), unit="poll"
     ),
+    "polls_late": _Loss(
+        Severity.WARNING,
+        "answers of devices came after their timeout",
+        "the device lives, but is slower than the driver expects: the driver's log says by how much its timeout_s is"
+        " too short",
+        unit="answer",
+    ),
     "updates_skipped": _Loss(
         Severity.WARNING,
         "more updates came at once than the ring has slots",

@@ -52,8 +52,11 @@ def check(evidence: Evidence) -> Iterator[Note]:
     """What is to be said of the taxels of all drivers."""
     for driver in evidence.drivers:
         told = ", ".join(f"{count_text(n)} {name.replace('_', ' ')}" for name, n in driver.statuses.items() if n)
+        untouched = f"; {_only_zero(len(driver.dark))}: {_dark_names(driver)}" if _is_idle(driver) else ""
         yield Looked(
-            AREA, f"driver {driver.name}", f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}"
+            AREA,
+            f"driver {driver.name}",
+            f"{plural(driver.structure.n_sensors, 'sensor')}: {told or 'no data'}{untouched}",
         )
         yield from _statuses(driver)
         yield from _dark(driver)
@@ -86,21 +89,30 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
 
 
 def _dark(driver: DriverSeen) -> Iterator[Finding]:
-    if driver.dark:
-        count = len(driver.dark)
-        is_fresh = not any(driver.dark.values())
-        named = "; ".join(list(driver.dark)[:_MOST_LINES])
+    if driver.dark and not _is_idle(driver):
         yield Finding(
-            Severity.NOTE if is_fresh else Severity.WARNING,
+            Severity.WARNING,
             AREA,
-            f"{plural(count, 'module')} {'has' if count == 1 else 'have'} sent nothing but 0 so far",
+            _only_zero(len(driver.dark)),
             f"driver {driver.name}",
-            f"{named}{' ...' if count > _MOST_LINES else ''}",
-            "fine where nothing touches them and taxels rest at 0; else touch each once: those that go on with 0 are"
-            " dead or switched off, look at their cables and plugs",
+            _dark_names(driver),
+            "touch each once: those that go on with 0 are dead or switched off; look at their cables and plugs",
             (f"skin-top {driver.name}",),
             _STATUS,
         )
+
+
+def _is_idle(driver: DriverSeen) -> bool:
+    """Whether modules that sent nothing but 0 are good all the same: nothing may have touched them."""
+    return bool(driver.dark) and not any(driver.dark.values())
+
+
+def _only_zero(count: int) -> str:
+    return f"{plural(count, 'module')} {'has' if count == 1 else 'have'} sent nothing but 0 so far"
+
+
+def _dark_names(driver: DriverSeen) -> str:
+    return f"{'; '.join(list(driver.dark)[:_MOST_LINES])}{' ...' if len(driver.dark) > _MOST_LINES else ''}"
 
 
 def _lines(driver: DriverSeen) -> Iterator[Finding]:

@@ -124,7 +124,8 @@ class Master(Talk):
         self._was_guest = False
         self._troubles: dict[Hashable, Trouble] = {}
         self._open: Open | None = None
-        self._late: Message | None = None
+        self._late: Open | None = None
+        self._has_told_late = False
         self._again: Open | None = None
         self._number = 0
         self._free_ns = self._cycle_ns = begun_ns
@@ -196,9 +197,9 @@ class Master(Talk):
 
     def _look_on_line(self, line: wire.RtuMessages, time_ns: int) -> None:
         if self._late is not None:
-            if line.reply_to(self._late.unit, self._late.data) is not None:
-                self._counters.refused += 1
-                self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
+            found = line.reply_to(self._late.message.unit, self._late.message.data)
+            if found is not None:
+                self._take_late(self._late, found, time_ns)
         elif self._open is None:
             line.drop()
         else:
@@ -213,9 +214,10 @@ class Master(Talk):
     def _take(self, message: Message, time_ns: int) -> None:
         asked = self._open
         if asked is None or message.number != asked.message.number or message.unit != asked.message.unit:
-            self._counters.refused += 1
-            if self._late is not None and message.number == self._late.number:
-                self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
+            if self._late is not None and message.number == self._late.message.number:
+                self._take_late(self._late, message, time_ns)
+            else:
+                self._counters.refused += 1
             return
         self._open = None
         self._free_ns = time_ns + self._timing.turnaround_ns
@@ -232,6 +234,26 @@ class Master(Talk):
             self._take_exception(asked, code, time_ns)
         else:
             self._troubles.pop(("read", asked.read), None)
+            read = self._reads[asked.read]
+            self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._cycle_ns)
+
+    def _take_late(self, asked: Open, message: Message, time_ns: int) -> None:
+        """A reply after its timeout: the device lives, and what it says is shown."""
+        self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
+        self._counters.polls_late += 1
+        self._troubles.pop(("unit", message.unit), None)
+        if not self._has_told_late:
+            self._has_told_late = True
+            late_ms, timeout_ms = (time_ns - asked.until_ns) / 1e6, self._timing.timeout_ns / 1e6
+            log.warning(
+                "%s: unit %d answers %.3g ms after timeout_s = %.3g ms: make timeout_s longer; logged once",
+                self._name,
+                message.unit,
+                late_ms,
+                timeout_ms,
+            )
+        is_good = wire.is_reply(asked.message.data, message.data) and not wire.exception_of(message.data)
+        if asked.read >= 0 and is_good:
             read = self._reads[asked.read]
             self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._cycle_ns)
 
@@ -265,7 +287,7 @@ class Master(Talk):
         if asked.read >= 0:
             self._troubles.setdefault(("unit", asked.message.unit), Trouble()).again(time_ns)
         self._answer_guest(asked, None, time_ns)
-        self._late, self._free_ns = asked.message, time_ns + self._timing.timeout_ns
+        self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns
         if self._rtu is not None:
             self._rtu.drop()
 

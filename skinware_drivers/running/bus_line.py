@@ -213,6 +213,11 @@ class BusLine:
         counters = self.bus.counters
         return counters.lost, counters.overflows, counters.bus_offs, self.opened_ns
 
+    def excuse(self, since_ns: int, silence_ns: int) -> None:
+        """Count silence from now on, if frames came until this process was held up."""
+        if since_ns - self.heard_ns <= max(NS_PER_S // 2, silence_ns):
+            self.heard_ns = now_ns()
+
     def look(self, silence_ns: int) -> None:
         """Tell a living bus from one that says nothing, is off the wire, or is gone."""
         if self.bus.fileno() < 0 or self.lost.is_set():

@@ -24,6 +24,9 @@ from skinware_drivers.running.unused_frames import why_unused
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _DATA_TIMEOUT_S = 1.0
+_SURE_NS = NS_PER_S
+"""A patch that was live has to be silent for so long beyond its age limit before it may be set up: that moves the
+baseline of hardware that had not restarted."""
 _DATA_CHECKS_HZ = 100
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
@@ -111,14 +114,26 @@ class PatchCare:
         states = [PatchState.STALE, PatchState.EXPECTED]
         if now_ns() - line.revived_ns > 2 * silence_ns:  # set up anew, and no data came of it
             states.append(PatchState.RESTARTED)
-        silent, asked_ns = generation.patches_in(line, *states), now_ns()
+        silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
         if self._knows_only_all:
             silent = silent[:1] if self._may_set_up_all(silent) else []  # the others are set up with it
         for patch in self._patches_in(PatchState.LIVE):
             self._set_ups.pop(patch.key, None)
         for patch in silent:
-            if await self._is_to_be_set_up(patch):
+            if await self._is_to_be_set_up(patch) and self._surely_silent([patch]):
                 await self._revive(patch, asked_ns)
+
+    def _surely_silent(self, patches: Sequence[Patch]) -> list[Patch]:
+        """Those of which nothing came for long enough, while this process attended."""
+        line, generation = self._line, self._generation()
+        if generation is None:
+            return []
+        numbers = [generation.number_of(line, patch) for patch in patches]
+        return [
+            patch
+            for patch, number in zip(patches, numbers, strict=True)
+            if number is not None and generation.publisher.silent_ns(number) >= _SURE_NS
+        ]
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         """Whether a silent patch answers, and has not been set up in vain a moment ago."""

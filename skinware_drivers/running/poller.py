@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Sequence
 
 from skinware.errors import BusSendError
@@ -12,10 +13,14 @@ from skinware_drivers.link import Link, Match
 from skinware_drivers.polling import Poll
 from skinware_drivers.running.backoff import Backoff
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
 _LOOK_AGAIN_S = 0.05
 _PATIENT_TIMES = 3
 """So often in a row an answer has to be missing before a device is asked more rarely."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
+_ROOM, _LONGEST_EXTRA_S = 1.25, 1.0
+"""How much longer than it was late an answer is waited for the next time."""
 
 
 class _Place:
@@ -25,11 +30,13 @@ class _Place:
         timer: their deadlines.
         asked_ns: when one was last sent, or would have been.
         silent_until_ns: nobody is asked before, because nobody answered.
+        extra_s: how much longer than its timeout an answer is waited for, because answers came late.
     """
 
     def __init__(self, timer: Periodic) -> None:
         self.timer = timer
         self.asked_ns = 0
+        self.extra_s = 0.0
         self.answered()
 
     def answered(self) -> None:
@@ -42,6 +49,7 @@ class _Place:
         """The device did not answer."""
         self._missing += 1
         if self._missing >= _PATIENT_TIMES:
+            self.extra_s = 0.0
             self.silent_until_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
 
 
@@ -53,7 +61,9 @@ class Poller:
     time) is counted as missed and not made up for: the next poll goes out at the next deadline.
 
     In lock step, a device that does not answer costs the others its timeout. After three times in a row it is asked
-    more and more rarely, if there are others; once it has answered, as often as before.
+    more and more rarely, if there are others; once it has answered, as often as before. An answer that comes after the
+    timeout is an answer: it is counted in ``polls_late``, and from then on the device is given as much time as it
+    takes, up to a second more.
 
     Args:
         link: the bus.
@@ -69,6 +79,7 @@ class Poller:
         self._check = check
         self._checked: list[tuple[float, float]] = []
         self._places: list[_Place] = []
+        self._slow: set[str] = set()
 
     async def run(self, polls: Callable[[], Sequence[Poll]], is_away: Callable[[], bool]) -> None:
         """Ask what ``polls`` names, the first of each at once, until it is cancelled.
@@ -137,11 +148,37 @@ class Poller:
 
     async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
         """In lock step."""
-        if await self._link.ask(poll.identifier, poll.payload, answer, timeout_s=poll.patience_s):
+        came = await self._link.ask(
+            poll.identifier,
+            poll.payload,
+            answer,
+            timeout_s=poll.patience_s,
+            extra_s=place.extra_s,
+            on_late=lambda late_s: self._count_late(poll, place, late_s),
+        )
+        if came:
             place.answered()
         else:
             self._counters.polls_unanswered += 1
             place.unanswered()
+
+    def _count_late(self, poll: Poll, place: _Place, late_s: float) -> None:
+        """A device answered after its timeout: it lives, at a pace of its own."""
+        place.answered()
+        if late_s <= 0:
+            return  # it came in time, this process read it late
+        self._counters.polls_late += 1
+        place.extra_s = min(max(place.extra_s, _ROOM * late_s), _LONGEST_EXTRA_S)
+        if poll.name not in self._slow:
+            self._slow.add(poll.name)
+            log.warning(
+                "%s: answers to %s come %.3g ms after timeout_s = %.3g ms; they are waited for, but others have to"
+                " wait, too: make timeout_s longer; logged once",
+                self._link.bus_name,
+                poll.name,
+                1e3 * late_s,
+                1e3 * poll.patience_s,
+            )
 
 
 __all__ = ["Poller"]

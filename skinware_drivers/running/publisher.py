@@ -16,6 +16,7 @@ from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, Status
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.skin_state import BUS_COUNTERS, PATCH_COUNTERS, Updates
+from skinware_drivers.running.attention import HoldUp
 from skinware_drivers.running.bursts import Bursts
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.patch_timing import PatchTiming
@@ -239,6 +240,21 @@ class Publisher:
         """Take a patch as silent from here on, until its next data."""
         self.patch_lives_until_ns[patch] = 0
         self.patch_state[patch] = state
+
+    def excuse(self, hold_up: HoldUp) -> None:
+        """Count silence from now on, of patches that lived when this process was held up.
+
+        What was heard before the machine slept is older by as much as it slept.
+        """
+        lived = self.patch_lives_until_ns > hold_up.since_ns
+        until_ns = np.maximum(self.patch_lives_until_ns, now_ns() + self._silence_ns)
+        self.patch_lives_until_ns[lived] = until_ns[lived]
+        times_ns = self._state.group_time_ns
+        times_ns[:] = np.where(times_ns > 0, np.maximum(1, times_ns - hold_up.asleep_ns), 0)
+
+    def silent_ns(self, patch: int) -> int:
+        """For how long a patch has been silent beyond its age limit, while this process attended."""
+        return now_ns() - int(self.patch_lives_until_ns[patch])
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """(n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""

@@ -21,6 +21,7 @@ from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types
 from skinware_drivers.layout import Layout
+from skinware_drivers.running.attention import Attention
 from skinware_drivers.running.bus_changes import BusChanges
 from skinware_drivers.running.bus_line import BusLine, open_buses
 from skinware_drivers.running.desk import RequestDesk, offered
@@ -109,6 +110,7 @@ class Runner:
         self._geometry = geometry
         self._on_ready, self._on_patches = on_ready, on_patches
         self._machine = MachineLimits()
+        self._attention = Attention()
         self._latency_s = latency_s
         self._intake = Intake(
             self._epoll, self.lines, self._empty_batch, self._digest, self._longest_rest_s, self._guard
@@ -364,6 +366,7 @@ class Runner:
 
     def _digest(self, batch: FrameBatch) -> None:
         if self.generation is not None:
+            self._attend()
             self._machine.look()
             self.generation.digest(batch)
             self._arm_timer()
@@ -373,7 +376,17 @@ class Runner:
             line.link.hear(batch, own)
             line.link.offer(batch, own)
 
+    def _attend(self) -> None:
+        """If this process was held up: what fell silent meanwhile did so because nobody listened."""
+        hold_up = self._attention.look(None if self._timer is None else round(self._timer.when() * NS_PER_S))
+        if hold_up is None or self.generation is None:
+            return
+        self.generation.publisher.excuse(hold_up)
+        for line in self.lines:
+            line.excuse(hold_up.since_ns, self.generation.publisher.silence_ns)
+
     def _publish_when_due(self) -> None:
+        self._attend()
         if not self._flows:
             self._intake.take()  # what has arrived comes first: this may be late
         if self.writer is None or self.generation is None:

@@ -162,15 +162,16 @@ def test_a_late_reply_is_known_by_its_number() -> None:
     assert talk.counters.refused == 2
 
 
-def test_a_late_reply_is_waited_for_and_dropped(over_tcp: bool) -> None:
+def test_a_late_reply_is_waited_for_and_shown(over_tcp: bool, caplog: pytest.LogCaptureFixture) -> None:
     talk = Conversation(Registers(100, 4), Registers(300, 4), over_tcp=over_tcp)  # replies look alike
     late = talk.next_question()
     asked = talk.now
     talk.now = asked + TIMEOUT
     assert talk.master.say(talk.now) == b""
     talk.now += TIMEOUT // 2
-    assert talk.registers(late) == []
-    assert talk.counters.refused == 1
+    assert [row.identifier for row in talk.registers(late)] == [0]
+    assert (talk.counters.polls_late, talk.counters.refused) == (1, 0)
+    assert "after timeout_s = " in caplog.text
     second = talk.next_question()
     assert talk.now < asked + 2 * TIMEOUT
     assert address_of(second) == 300

@@ -123,12 +123,12 @@ class Line:
 
     def __init__(self, clock: Callable[[], int] = now_ns, takes: Callable[[], bool] = lambda: True) -> None:
         self.sent: list[tuple[float, int, bytes]] = []
-        self._clock, self._takes = clock, takes
+        self.now_ns, self._takes = clock, takes
 
     def send(self, identifier: int, payload: bytes) -> None:
         if not self._takes():
             raise BusSendError("queue full")
-        self.sent.append((self._clock() / 1e9, identifier, payload))
+        self.sent.append((self.now_ns() / 1e9, identifier, payload))
 
     @property
     def times_s(self) -> list[float]:
@@ -150,7 +150,7 @@ class Polling:
 
     def hear(self, identifier: int, payload: bytes) -> None:
         batch = FrameBatch(1)
-        batch.append(0, 0, identifier, payload)
+        batch.append(0, self.line.now_ns(), identifier, payload)
         self.link.hear(batch, np.arange(1))
 
     async def for_s(self, duration_s: float) -> None:
@@ -487,3 +487,30 @@ def test_polls_are_checked_when_their_times_change_and_not_before_each_question(
 
     asyncio.run(scenario())
     assert checked == [1, 1]
+
+
+def test_late_answers_are_answers_and_devices_are_followed_at_their_pace(caplog: pytest.LogCaptureFixture) -> None:
+    """Four devices on one line that answer 24 ms after they were asked, where the driver waits 20 ms."""
+    polls = [Poll(16 * n, bytes([n]), 0.2, answer=Match(16 * n + 1), timeout_s=0.02) for n in range(1, 5)]
+    polling = poll_for(3.0, lambda: polls, lambda polling: _answer_after(polling, 0.024))
+    asked = Counter(polling.line.payloads)
+    assert min(asked.values()) >= 14  # no pause grows
+    assert polling.counters.polls_unanswered <= len(polls)  # once each, until it is known that they take longer
+    assert polling.counters.polls_late >= len(polling.line.sent) - 2
+    lines = [record.getMessage() for record in caplog.records if "after timeout_s = 20 ms" in record.getMessage()]
+    assert len(lines) == len(polls)
+
+
+def test_a_late_answer_that_comes_after_the_next_question_is_of_its_own_device() -> None:
+    polls = [Poll(16 * n, bytes([n]), 0.1, answer=Match(16 * n + 1), timeout_s=0.01) for n in (1, 2)]
+
+    async def answering(polling: Polling) -> None:
+        await asyncio.sleep(0.012)
+        assert len(polling.line.sent) == 2
+        polling.hear(17, b"\x01")  # while the second is asked
+        await asyncio.sleep(0)
+        assert polling.counters.polls_late == 1
+        assert polling.counters.polls_unanswered == 1
+
+    polling = poll_for(0.015, lambda: polls, answering)
+    assert polling.counters.polls_late == 1

@@ -40,6 +40,7 @@ _ROW = np.dtype(
         ("reserved", "u1", (6,)),
         ("lost", "<u8"),
         ("rate_hz", "<f8"),
+        ("lost_hz", "<f8"),
         ("bytes_per_s", "<f8"),
         ("age_p50_ns", "<f8"),
         ("age_p99_ns", "<f8"),
@@ -51,6 +52,12 @@ _COLUMNS = {
     "clock_offset_ns": Column(np.dtype("<i8"), (), "ns", "our clock minus the robot's"),
     "clock_error_ns": Column(np.dtype("<i8"), (), "ns", "what that may be wrong by; -1: nothing is known"),
     "round_trip_ns": Column(np.dtype("<i8"), (), "ns", "the shortest lately"),
+    "instance": Column(np.dtype("S16"), (), "", "number of the bridge that is followed"),
+    "host": Column(np.dtype("S64"), (), "", "name of its machine"),
+    "namesakes": Column(np.dtype("<u4"), (), "", "other bridges that serve a robot of this name"),
+    "switches": Column(np.dtype("<u4"), (), "", "how often another robot of this name took the place of the first"),
+    "refused": Column(np.dtype("<u8"), (), "", "messages of the robot that could not be read"),
+    "last_refused": Column(np.dtype("S160"), (), "", "the last of those, and what was wrong"),
     "count": Column(np.dtype("<u4"), (), "", "rows of services that are in use"),
     "services": Column(_ROW, (MOST,), "", "each service: frames of the last second, ages from there to here"),
 }
@@ -63,7 +70,8 @@ class ServiceState:
     Attributes:
         state: one of ``STATES``.
         mode: one of ``MODES``.
-        rate_hz: frames published here in the last second.
+        rate_hz, lost_hz: frames of the last second that were published here, and that the robot published and that did
+            not come.
         lost: frames that the robot published and that did not come, since the first one.
         bytes_per_s: of messages, in the last second.
         age_p50_ns, age_p99_ns: from the publication there to the one here, in the last second; None: there was none.
@@ -76,6 +84,7 @@ class ServiceState:
     bytes_per_s: float = 0.0
     age_p50_ns: float | None = None
     age_p99_ns: float | None = None
+    lost_hz: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -90,6 +99,12 @@ class BridgeState:
         clock_error_ns: what that may be wrong by; likewise.
         round_trip_ns: the shortest lately.
         services: by name.
+        instance: number of the bridge that is followed; empty: none so far.
+        host: name of its machine; empty: not known.
+        namesakes: other bridges that serve a robot of this name.
+        switches: how often another robot of this name took the place of the one that was followed.
+        refused: messages of the robot that could not be read.
+        last_refused: the last of those, and what was wrong; empty: none so far.
     """
 
     robot: str
@@ -99,6 +114,12 @@ class BridgeState:
     clock_error_ns: int | None
     round_trip_ns: int
     services: Mapping[str, ServiceState]
+    instance: str = ""
+    host: str = ""
+    namesakes: int = 0
+    switches: int = 0
+    refused: int = 0
+    last_refused: str = ""
 
 
 def service_name(robot: str) -> str:
@@ -125,6 +146,12 @@ class BridgeFrame(Frame):
             error_ns if is_known else None,
             int(self.column("round_trip_ns")),
             {row["name"].decode(errors="replace"): _state_of(row) for row in rows},
+            instance=_text(self.column("instance")),
+            host=_text(self.column("host")),
+            namesakes=int(self.column("namesakes")),
+            switches=int(self.column("switches")),
+            refused=int(self.column("refused")),
+            last_refused=_text(self.column("last_refused")),
         )
 
 
@@ -181,6 +208,10 @@ class BridgeStateWriter:
         columns["clock_offset_ns"][...] = state.clock_offset_ns or 0
         columns["clock_error_ns"][...] = -1 if state.clock_error_ns is None else state.clock_error_ns
         columns["round_trip_ns"][...] = state.round_trip_ns
+        for name in ("namesakes", "switches", "refused"):
+            columns[name][...] = getattr(state, name)
+        for name in ("instance", "host", "last_refused"):
+            columns[name][...] = getattr(state, name).encode(errors="replace")
         told = list(state.services.items())[:MOST]
         columns["count"][...] = len(told)
         columns["services"][:] = np.zeros(MOST, _ROW)
@@ -202,7 +233,8 @@ class BridgeStateWriter:
 def _row_of(name: str, service: ServiceState) -> tuple[Any, ...]:
     ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
     state, mode = STATES.index(service.state), MODES.index(service.mode)
-    return name.encode(), state, mode, 0, service.lost, service.rate_hz, service.bytes_per_s, *ages
+    rates = service.rate_hz, service.lost_hz, service.bytes_per_s
+    return name.encode(), state, mode, 0, service.lost, *rates, *ages
 
 
 def _state_of(row: npt.NDArray[Any]) -> ServiceState:
@@ -216,7 +248,12 @@ def _state_of(row: npt.NDArray[Any]) -> ServiceState:
         float(row["bytes_per_s"]),
         p50_ns,
         p99_ns,
+        float(row["lost_hz"]),
     )
+
+
+def _text(column: npt.NDArray[Any]) -> str:
+    return bytes(column.item()).decode(errors="replace")
 
 
 __all__ = [

@@ -7,12 +7,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
 from skinware.bridge.link import Question
-from skinware.bridge.messages import Answered
+from skinware.bridge.messages import Answered, read_text
 from skinware.errors import Paused, RequestCancelled, RequestError, RequestRefused, SkinwareError
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -23,6 +23,7 @@ from skinware.service.messages import Answer
 _AT_ONCE = 4
 _MOST = 64
 _CALL_S = 30.0
+_LONGEST_ERROR = 4096
 _OPERATIONS_S = 1.0
 _SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 
@@ -72,11 +73,11 @@ class Calls:
     def carry_out(self, question: Question, name: str, operation: str) -> None:
         """Call an operation of a service, and tell who asked how it ended."""
         try:
-            arguments = msgspec.json.decode(question.payload, type=dict[str, Any]) if question.payload else {}
+            arguments = read_text(question.payload, dict[str, Any]) if question.payload else {}
             with self._reader(name) as reader:
                 answer = self._result_of(reader.ask(operation, **arguments))
         except Exception as error:  # noqa: BLE001, whoever asked is told
-            answered = Answered(error=str(error), why=_why(error))
+            answered = Answered(error=str(error)[:_LONGEST_ERROR], why=_why(error))
         else:
             result = msgspec.Raw(msgspec.json.encode(answer.result))
             answered = Answered(answer.generation, answer.sequence, result)
@@ -105,10 +106,13 @@ class Calls:
         return ServiceReader(name, namespace=self._namespace, announce=False)
 
 
-def _why(error: Exception) -> str:
-    for kind, why in ((Paused, "paused"), (RequestRefused, "refused"), (RequestCancelled, "cancelled")):
-        if isinstance(error, kind):
-            return why
+def _why(error: Exception) -> Literal["refused", "failed", "paused", "cancelled"]:
+    if isinstance(error, Paused):
+        return "paused"
+    if isinstance(error, RequestCancelled):
+        return "cancelled"
+    if isinstance(error, RequestRefused):
+        return "refused"
     return "failed" if isinstance(error, RequestError) else "refused"
 
 

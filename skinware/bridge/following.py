@@ -9,7 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.bridge.link import Priority
-from skinware.bridge.messages import RAW, Service, coded_part, form_of, generation_of, slot_of, split_generation
+from skinware.bridge.messages import (
+    MOST_FRAMES,
+    RAW,
+    Service,
+    coded_part,
+    form_of,
+    generation_of,
+    slot_of,
+    split_generation,
+)
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.pacing import Pacing
 from skinware.bridge.peer import ANSWER_S, Peer
@@ -25,6 +34,8 @@ _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
 """A large structure takes its time on a slow link: each time that none comes, it gets twice as long."""
 _AGAIN_NS = NS_PER_S // 4
 """Until a service that could not be published is tried again."""
+_LATEST_NS = 1 << 61
+"""No clock has counted so far."""
 _STATES = {"paused": PAUSED, "live": LIVE, "closed": CLOSED, "dead": DEAD}
 
 
@@ -34,13 +45,14 @@ class Traffic:
 
     Attributes:
         frames: that were published here.
-        lost: of the robot's, that were not, since the first one.
+        lost: of the robot's, that were not, since the first one; ``lost_before``: when it was looked at last.
         bytes: of messages.
         ages_ns: from the publication there to the one here.
     """
 
     frames: int = 0
     lost: int = 0
+    lost_before: int = 0
     bytes: int = 0
     ages_ns: list[int] = field(default_factory=list)
 
@@ -82,7 +94,7 @@ class Follower:
         self._is_gone = False  # from here, since the robot was not heard
         self._silence: Callable[[], None] | None = None  # ends the subscription to frames
         self._pulls = 0  # how often the newest frame was asked for
-        self._pull_until_ns = 0  # until when an answer to the last such question may come, 0: none is open
+        self._open: dict[int, int] = {}  # until when an answer to a question for it may come, by its number
         self._probe_until_ns = 0  # likewise, to one for a frame as it would be pushed
 
     @property
@@ -94,6 +106,11 @@ class Follower:
     def _of_part(self) -> dict[str, object]:
         """What tells in questions which part is meant."""
         return {"part": self._part} if self._part else {}
+
+    @property
+    def _of_frame(self) -> str:
+        """A frame, for people."""
+        return f"a frame of service {self._name!r}"
 
     @property
     def _frame_key(self) -> str:
@@ -110,12 +127,16 @@ class Follower:
         if told.state == "closed":
             self.is_over = True
             self._unsubscribe()
+            self._peer.room.give_back(self._name)
 
     def look(self, time_ns: int) -> None:
         """What is to be done by the clock."""
         if not self._peer.is_connected or self._generation is None or not self._peer.clock.is_known:
             return
-        if (self._pacing.pulls or self._is_gone) and time_ns > self._pull_until_ns:
+        self._open = {pull: until_ns for pull, until_ns in self._open.items() if time_ns <= until_ns}
+        if self._pacing.pulls:
+            self._pull_all()
+        elif self._is_gone and not self._open:
             self._pull()
         if self._pacing.wants_probe(time_ns) and time_ns > self._probe_until_ns and self._count is not None:
             self._probe()
@@ -129,7 +150,8 @@ class Follower:
         self._mirror.happened(self._name, DEAD)
         self._is_gone, self._newest = True, (0, 0)
         self._asked, self._patience_s = (0, 0), _FIRST_GENERATION_S
-        self._pull_until_ns = self._probe_until_ns = 0
+        self._open.clear()
+        self._probe_until_ns = 0
 
     def clock_told(self) -> None:
         """The robot's clock is known."""
@@ -165,8 +187,10 @@ class Follower:
         try:
             about, head = split_generation(payload)
             generation = Generation(head, self._name)
+            _check(generation)
+            self._peer.room.take(self._name, len(head) + generation.slot_count * generation.slot_stride)
         except (BridgeError, BadRecording) as error:
-            self._trouble(error, " cannot be read")
+            self._refuse(f"service {self._name!r}", error)
             return
         before = self._generation
         if before is not None and generation.generation < before.generation:
@@ -186,7 +210,7 @@ class Follower:
     def subscribe(self) -> None:
         """Have its frames come, as its pacing wants it."""
         self._unsubscribe()
-        self._pull_until_ns = 0
+        self._open.clear()
         if self._generation is not None and not self._pacing.pulls:
             self._silence = self._peer.listen(self._frame_key, self._frame_came)
 
@@ -201,22 +225,29 @@ class Follower:
             if key == self._frame_key:  # and not of a bridge that is not followed any more
                 self._take_frame(message)
 
+    def _pull_all(self, here: RecordedFrame | None = None) -> None:
+        """Have as many questions open as are to be."""
+        while len(self._open) < self._pacing.open:
+            self._pull(here)
+
     def _pull(self, here: RecordedFrame | None = None) -> None:
         """Ask for a frame that is newer than all that are here; ``here`` is one that is not published yet."""
-        self._pull_until_ns = now_ns() + round(2 * ANSWER_S * NS_PER_S)
         self._pulls += 1
-        pull = self._pulls
+        pull, others = self._pulls, len(self._open)
+        timeout_s = 2 * (ANSWER_S + self._peer.clock.round_trip_ns / NS_PER_S)
+        self._open[pull] = now_ns() + round(timeout_s * NS_PER_S)
         number, sequence = self._newest if here is None else max(self._newest, here.position)
         self._peer.ask(
             self._peer.keys.of(self._name, "newest"),
             lambda payload, _: self._take_pulled(pull, payload),
-            timeout_s=2 * ANSWER_S,
+            timeout_s=timeout_s,
             priority=Priority.PULLED,
             parameters={
                 "who": self._peer.who,
                 "generation": number,
                 "sequence": sequence,
                 "base": 0 if self._decoder is None else self._decoder.sequence,
+                "others": others,
                 **self._of_part,
             },
         )
@@ -225,10 +256,9 @@ class Follower:
         if self.is_over:
             return
         frame = self._frame_of(message) if message else None
-        if pull == self._pulls:  # a late answer begins no second round
-            self._pull_until_ns = 0
-            if self._pacing.pulls and message is not None and self._peer.is_connected:
-                self._pull(frame)  # the next one is on its way while this one is published
+        is_open = self._open.pop(pull, None) is not None  # a late answer begins no second round
+        if is_open and self._pacing.pulls and message is not None and self._peer.is_connected:
+            self._pull_all(frame)  # the next ones are on their way while this one is published
         if frame is not None:
             self._publish(frame)
 
@@ -277,7 +307,7 @@ class Follower:
         try:
             form, number = form_of(message), generation_of(message)
         except BridgeError as error:
-            self._trouble(error)
+            self._refuse(self._of_frame, error)
             return None
         generation = self._generation
         if generation is None or generation.generation != number:
@@ -289,10 +319,9 @@ class Follower:
             self._held = message
             return None
         try:
-            return frame_of(generation, self._slot(form, message, generation))
+            return _checked(frame_of(generation, self._slot(form, message, generation)), generation)
         except BadRecording as error:
-            self._decoder = None
-            self._trouble(error)
+            self._refuse(self._of_frame, error)
             return None
 
     def _slot(self, form: int, message: bytes, generation: Generation) -> Slot:
@@ -303,14 +332,19 @@ class Follower:
             return slot
         if self._decoder is None:
             self._decoder = Decoder(generation.coded, generation.slot_stride)
-        return self._decoder.decode(coded_part(message))
+        coded, keeps = coded_part(message)
+        return self._decoder.decode(coded, keeps=keeps)
 
     def _publish(self, frame: RecordedFrame) -> None:
         generation = self._generation
         if generation is None or frame.position <= self._newest or now_ns() < self._again_ns:
             return
         count = generation.published_before + frame.sequence
-        age_ns = now_ns() - self._peer.clock.offset_ns(now_ns()) - frame.published_ns
+        published_ns = frame.published_ns + self._peer.clock.offset_ns(now_ns())
+        age_ns = now_ns() - published_ns
+        if published_ns < 0 or frame.published_ns - frame.acquired_ns > published_ns:
+            self._refuse(self._of_frame, BadRecording("it is from before this machine was started"))
+            return
         try:
             self._mirror.publish(self._name, frame, generation)
         except SkinwareError as error:
@@ -324,11 +358,41 @@ class Follower:
             self._mirror.happened(self._name, _STATES[self.state])
         self.traffic.frames += 1
         self.traffic.ages_ns.append(age_ns)
-        if self._pacing.saw(now_ns(), age_ns):
+        if self._pacing.saw(now_ns(), age_ns, self._peer.clock.round_trip_ns):
             self._changed_mode()
 
     def _trouble(self, error: SkinwareError, what: str = "") -> None:
         self._peer.say_once(self._name, f"service {self._name!r}{what}: {error}")
+
+    def _refuse(self, kind: str, error: SkinwareError) -> None:
+        """Count a message that cannot be taken."""
+        self._peer.guard.refuse(kind, str(error))
+
+
+def _check(generation: Generation) -> None:
+    """Look whether there can be such a generation.
+
+    Raises:
+        BadRecording: there cannot.
+    """
+    if generation.published_before > MOST_FRAMES or generation.period_ns < 0:
+        raise BadRecording(
+            f"a generation after {generation.published_before} frames with a period of {generation.period_ns} ns"
+        )
+
+
+def _checked(frame: RecordedFrame, generation: Generation) -> RecordedFrame:
+    """The frame, if it can be one.
+
+    Raises:
+        BadRecording: its number or its times are of no frame.
+    """
+    count = generation.published_before + frame.sequence
+    if not (0 < frame.sequence <= count <= MOST_FRAMES):
+        raise BadRecording(f"it has number {count}")
+    if max(frame.acquired_ns, frame.published_ns) > _LATEST_NS:
+        raise BadRecording("its times are of no clock")
+    return frame
 
 
 __all__ = ["Follower", "Traffic"]

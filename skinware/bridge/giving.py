@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from skinware.bridge.link import Question, Sender
-from skinware.bridge.messages import RAW, coded_message, raw_message
+from skinware.bridge.messages import RAW, coded_message, number_in, raw_message
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.transfer.codec import CodedColumn, Encoder
+from skinware.transfer.codec import CodedColumn, encoded
 
 _HELD_NS = NS_PER_S // 2
 """How long a question for the newest frame waits for one."""
 _GONE_NS = 10 * NS_PER_S
-"""Who has not asked for so long has to be given a whole frame first."""
+"""A puller that has not asked for so long is forgotten: it gets a whole frame first when it asks again."""
+_KEY_NS, _KEY_FRAMES = NS_PER_S, 32
+"""How long, and how many frames at least are the difference to the same one: who misses some can read all others."""
+_MOST_KEPT = 2
+_MOST_PULLERS = 64
+_MOST_OPEN = 1024
+"""Questions of one puller that wait for a frame."""
+_LONGEST_NAME = 64
 
 
 @dataclass(frozen=True)
@@ -35,17 +43,22 @@ class _Form:
 
 @dataclass
 class _Puller:
-    """Somebody who asks for frames one by one.
+    """A receiver that asks for frames one by one.
 
     Attributes:
-        encoder: of those frames.
-        generation, sequence: of the last one.
-        asked_ns: when that was asked for.
+        open: questions that wait for a newer frame, with the time at which each came; the oldest first.
+        sent: position of the last frame that was sent.
+        kept: by sequence, the frames of ``generation`` that the receiver keeps, and to which others are the difference.
+        kept_ns, since: when the newest of those was sent, and how many frames after it.
+        asked_ns: when it asked last.
     """
 
-    encoder: Encoder
-    generation: int
-    sequence: int = 0
+    open: deque[tuple[int, Question]] = field(default_factory=deque)
+    sent: tuple[int, int] = (0, 0)
+    generation: int = 0
+    kept: dict[int, Frame] = field(default_factory=dict)
+    kept_ns: int = 0
+    since: int = 0
     asked_ns: int = 0
 
 
@@ -65,7 +78,6 @@ class Stream:
         self._lock = threading.Lock()
         self._form = _Form(0, (), _as_it_is)
         self._newest: Frame | None = None
-        self._asked: list[tuple[int, Question]] = []  # who wait for a newer frame, and since when
         self._pullers: dict[str, _Puller] = {}
         self.frames: int = 0
 
@@ -91,7 +103,6 @@ class Stream:
         """
         with self._lock:
             self._form, self._newest = _Form(generation, columns, made_of or _as_it_is), None
-            self._pullers.clear()
 
     def take(self, frame: Frame) -> None:
         """A frame; those of other generations, and older ones than the newest, are left out."""
@@ -100,32 +111,49 @@ class Stream:
             if frame.generation != form.generation or (before is not None and frame.position <= before.position):
                 return
             self._newest = frame
-            asked, self._asked = self._asked, []
+            asked = [(puller, puller.open.popleft()[1]) for puller in self._pullers.values() if puller.open]
+            for puller, _ in asked:
+                puller.sent = frame.position
         if self._send.is_heard:
             self._send(raw_message(form.made_of(frame)))
         self.frames += 1
-        for _, question in asked:
-            self._soon(self._give, form, frame, question)
+        for puller, question in asked:
+            self._soon(self._give, form, frame, question, puller)
 
     def asked(self, question: Question) -> None:
-        """Somebody asks for the newest frame."""
+        """A receiver asks for the newest frame."""
+        if question.parameters.get("form") == str(RAW):
+            self._asked_raw(question)
+            return
         known = _number_in(question, "generation"), _number_in(question, "sequence")
+        time_ns = now_ns()
         with self._lock:
             form, newest = self._form, self._newest
-            if newest is None or newest.position <= known:
-                self._asked.append((now_ns(), question))
-                return
-        self._soon(self._give, form, newest, question)
+            puller = self._puller(question)
+            puller.asked_ns = time_ns
+            if _number_in(question, "others"):
+                known = max(known, puller.sent)  # what was sent is on its way
+            is_new = newest is not None and newest.position > known
+            if is_new and newest is not None:
+                puller.sent = newest.position
+            refused = question if not is_new and len(puller.open) >= _MOST_OPEN else None
+            if not is_new and refused is None:
+                puller.open.append((time_ns, question))
+        if is_new:
+            self._soon(self._give, form, newest, question, puller)
+        if refused is not None:
+            refused.fail(b"too many questions at once")
 
     def let_go(self) -> None:
-        """Of questions that no frame comes for, and of those who ask no more."""
+        """Answer questions that no frame comes for, and forget pullers that ask no more."""
         time_ns = now_ns()
-        until_ns = time_ns - _HELD_NS
+        late: list[Question] = []
         with self._lock:
-            for who in [who for who, puller in self._pullers.items() if time_ns - puller.asked_ns > _GONE_NS]:
-                del self._pullers[who]
-            late = [question for since_ns, question in self._asked if since_ns < until_ns]
-            self._asked = [(since_ns, question) for since_ns, question in self._asked if since_ns >= until_ns]
+            for who, puller in list(self._pullers.items()):
+                while puller.open and puller.open[0][0] < time_ns - _HELD_NS:
+                    late.append(puller.open.popleft()[1])
+                if not puller.open and time_ns - puller.asked_ns > _GONE_NS:
+                    del self._pullers[who]
         for question in late:
             question.reply(b"")
 
@@ -133,27 +161,48 @@ class Stream:
         """Nothing is given any more."""
         self._send.close()
         with self._lock:
-            asked, self._asked = self._asked, []
-        for _, question in asked:
+            late = [question for puller in self._pullers.values() for _, question in puller.open]
+            self._pullers.clear()
+        for question in late:
             question.reply(b"")
 
-    def _give(self, form: _Form, frame: Frame, question: Question) -> None:
-        """A frame to who asked for one."""
+    def _puller(self, question: Question) -> _Puller:
+        """The one that asks; the one that has asked for the longest time goes where there are too many."""
+        who = question.parameters.get("who", "")[:_LONGEST_NAME]
+        puller = self._pullers.get(who)
+        if puller is None:
+            if len(self._pullers) >= _MOST_PULLERS:
+                idle = [name for name, one in self._pullers.items() if not one.open] or list(self._pullers)
+                gone = self._pullers.pop(min(idle, key=lambda name: self._pullers[name].asked_ns))
+                for _, open_ in gone.open:
+                    self._soon(open_.fail, b"too many ask at once")
+            puller = self._pullers[who] = _Puller()
+        return puller
+
+    def _asked_raw(self, question: Question) -> None:
+        """A frame as it would be pushed, now."""
+        form, newest = self._form, self._newest
+        if newest is None:
+            question.reply(b"")
+        else:
+            self._soon(lambda: question.reply(raw_message(form.made_of(newest))))
+
+    def _give(self, form: _Form, frame: Frame, question: Question, puller: _Puller) -> None:
+        """Answer a question for a frame; always in the same thread."""
         given = form.made_of(frame)
-        if question.parameters.get("form") == str(RAW):
-            question.reply(raw_message(given))
-            return
-        who = question.parameters.get("who", "")
-        base = _number_in(question, "base")
-        with self._lock:
-            puller = self._pullers.get(who)
-            if puller is None or puller.generation != given.generation:
-                puller = self._pullers[who] = _Puller(Encoder(form.columns), given.generation)
-            puller.asked_ns = now_ns()
-        if not base or base != puller.sequence or given.sequence <= base:
-            puller.encoder.next_is_key()
-        puller.sequence = given.sequence
-        question.reply(coded_message(puller.encoder.encode(given)))
+        if puller.generation != given.generation:
+            puller.generation, puller.kept_ns = given.generation, 0
+            puller.kept.clear()
+        before, time_ns = puller.kept.get(_number_in(question, "base")), now_ns()
+        puller.since += 1
+        keeps = time_ns - puller.kept_ns > _KEY_NS and (before is None or puller.since > _KEY_FRAMES)
+        if keeps:
+            puller.kept_ns, puller.since = time_ns, 0
+            puller.kept[given.sequence] = given
+            for oldest in list(puller.kept)[:-_MOST_KEPT]:
+                del puller.kept[oldest]
+        message = encoded(given, None if keeps else before, form.columns)
+        question.reply(coded_message(message, keeps))
 
 
 def _as_it_is(frame: Frame) -> Frame:
@@ -162,8 +211,7 @@ def _as_it_is(frame: Frame) -> Frame:
 
 def _number_in(question: Question, name: str) -> int:
     """A parameter of a question that is a number from 0 on; 0 if there is none."""
-    text = question.parameters.get(name, "")
-    return int(text) if text.isdigit() else 0
+    return number_in(question.parameters.get(name, ""))
 
 
 __all__ = ["Stream"]

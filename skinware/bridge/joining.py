@@ -11,12 +11,12 @@ import msgspec
 from skinware.bridge.clock import PeerClock
 from skinware.bridge.following import Follower, Traffic
 from skinware.bridge.link import Link, Priority
-from skinware.bridge.messages import Answered, Keys, Service, Services, Wish
+from skinware.bridge.messages import Answered, Keys, Service, Services, Wish, read_text
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.bridge.turns import Turns
 from skinware.bridge_state import BridgeState, BridgeStateWriter, ServiceState
-from skinware.errors import SkinwareError
+from skinware.errors import BridgeError, SkinwareError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns, short_turns
 from skinware.service import Request
@@ -65,8 +65,7 @@ class Joiner:
         self._mirror.watch(self._turns.fd, self._turns.take)
         self._peer = Peer(robot, link, self._turns, self, why_not=why_not, tell=tell)
         self._of_any = Keys(robot)
-        link.listen(self._of_any.services, lambda _, payload: self._turns.soon(lambda: self._services_changed(payload)))
-
+        link.listen(self._of_any.services, self._heard_services)
         self._state = BridgeState(robot, False, self._peer.since_ns, None, None, 0, {})
 
     @property
@@ -128,14 +127,17 @@ class Joiner:
         """How every service comes, since the last call."""
         states = {}
         for name, follower in self._followers.items():
-            traffic, follower.traffic = follower.traffic, Traffic(lost=follower.traffic.lost)
+            traffic = follower.traffic
+            follower.traffic = Traffic(lost=traffic.lost, lost_before=traffic.lost)
             states[name] = ServiceState(
                 follower.state if self.is_connected else "unheard",
                 follower.mode,
                 traffic.frames,
                 traffic.lost,
                 traffic.bytes,
-                *(_quantile(traffic.ages_ns, share) for share in (0.5, 0.99)),
+                _quantile(traffic.ages_ns, 0.5),
+                _quantile(traffic.ages_ns, 0.99),
+                traffic.lost - traffic.lost_before,
             )
         return states
 
@@ -149,6 +151,12 @@ class Joiner:
             clock.error_ns if clock.is_known else None,
             clock.round_trip_ns,
             services,
+            self._peer.instance,
+            self._peer.host,
+            self._peer.namesakes,
+            self._peer.switches,
+            self._peer.guard.count + self._turns.left_out,
+            self._peer.guard.last,
         )
         try:
             if self._state_writer is None:
@@ -196,6 +204,9 @@ class Joiner:
             payload=b"" if self._wish is None else msgspec.json.encode(self._wish),
         )
 
+    def _heard_services(self, _key: str, payload: bytes) -> None:
+        self._peer.soon("a list of services", lambda: self._services_changed(payload), len(payload))
+
     def _services_changed(self, payload: bytes) -> None:
         if self._wish is None:
             self._take_services(payload)
@@ -206,11 +217,11 @@ class Joiner:
         if not payload:
             return
         try:
-            told = msgspec.json.decode(payload, type=Services)
-        except msgspec.MsgspecError as error:
-            self._peer.say_once("services", f"robot {self._peer.robot} tells what cannot be read: {error}")
+            told = read_text(payload, Services)
+        except BridgeError as error:
+            self._peer.guard.refuse("a list of services", str(error))
             return
-        if not self._peer.follows(told.instance, told.start):
+        if not self._peer.follows(told):
             return
         self._callers = told.callers
         before, self._missing = self._missing, told.missing
@@ -253,10 +264,12 @@ class Joiner:
             self._mirror.answered(name, request, Answered(error=f"no answer from robot {robot}{only}"), None)
             return
         try:
-            answer = msgspec.json.decode(payload, type=Answered)
-            result = msgspec.json.decode(answer.result)
-        except msgspec.MsgspecError as error:
-            self._mirror.answered(name, request, Answered(error=f"robot {robot} answers nonsense: {error}"), None)
+            answer = read_text(payload, Answered)
+            result = read_text(bytes(answer.result), Any)
+        except BridgeError as error:
+            self._peer.guard.refuse("an answer to a call", str(error))
+            why = f"robot {robot} gave an answer that cannot be read: {error}"
+            self._mirror.answered(name, request, Answered(error=why), None)
             return
         self._peer.heard()
         self._mirror.answered(name, request, answer, result)

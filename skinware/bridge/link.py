@@ -24,6 +24,8 @@ _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_facto
 _FOREVER_MS = -1
 _BATCHES = 4
 """Of 64 KiB, that may wait to be sent: a frame of 30,848 sensors takes three, and who puts it waits for none."""
+_LONGEST_MESSAGE = 1 << 26
+"""Bytes that are put together of the parts of a message of somebody else."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
 Payload = bytes
@@ -264,6 +266,7 @@ def _configuration(endpoints: Endpoints) -> zenoh.Config:
         "scouting/multicast/enabled": "false",
         "scouting/gossip/enabled": "false",
         "transport/shared_memory/enabled": "false",
+        "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
         "transport/link/tx/lease": str(LEASE_MS),
         "transport/link/tx/queue/size/data": str(_BATCHES),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(round(endpoints.patience_us)),

@@ -14,9 +14,11 @@ robots of one name are never taken for each other.
                         shared memory up to its slots, packed (zlib)
 ``S/frame``             every frame: ``RAW`` below
 ``S/frame/PART``        likewise, some sensors of it: those of the wish of that number
-``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``: that
-                        frame's sequence if the asker still has it, else 0; answered with the newest frame as soon as
-                        there is one, with nothing after half a second: ``CODED`` below, ``RAW`` with ``form=0``
+``S/newest``            question with ``generation`` and ``sequence`` of the last frame, ``who`` asks, ``base``:
+                        sequence of the newest frame that the asker keeps, else 0, ``others``: questions of this kind
+                        that are open. Each is answered with a frame of its own, the newest as soon as there is one that
+                        was not sent for an open question, with nothing after half a second: ``CODED`` below, ``RAW``
+                        with ``form=0``
 ``S/call/OPERATION``    question with arguments as JSON; answer: :class:`Answered` as JSON
 ======================  ===============================================================================================
 
@@ -24,17 +26,20 @@ Questions for ``generation`` and ``newest`` may have ``part``: the number of a w
 
 ``skinware/live/R/1/INSTANCE`` is a token of who serves the robot.
 
-A frame begins with a byte that tells its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
-``CODED``: a message of :mod:`skinware.transfer.codec`.
+A frame begins with a byte for its form and seven that are 0. ``RAW``: u64 generation, then the slot of the ring.
+``CODED``: a message of :mod:`skinware.transfer.codec`; the second byte is 1 where the receiver keeps the frame, since
+later ones may be the difference to it. It keeps the last two of those.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
+import socket
 import struct
 import threading
 import zlib
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -49,10 +54,27 @@ VERSION = 1
 RAW, CODED = 0, 1
 
 _HEAD = struct.Struct("<B7xQ")
-_CODED_HEAD = struct.pack("<B7x", CODED)
+_CODED_HEAD = struct.Struct("<BB6x")
 _SIZE = struct.Struct("<I")
-_LONGEST_HEAD = 1 << 30
+LONGEST_TEXT = 1 << 20
+"""Bytes of the JSON of a message."""
+LONGEST_HEAD = 1 << 26
+"""Bytes of a service's file up to its slots, unpacked."""
+MOST_SERVICES = 256
+"""Of a robot."""
+MOST_FRAMES = 1 << 53
+"""More frames than any robot ever published: a number above it is wrong."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
+_INSTANCE = re.compile(r"[0-9a-f]{16}")
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 62) - 1)]
+_Figure = Annotated[float, msgspec.Meta(ge=-1e18, le=1e18)]
+_Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,46}$")]
+_Word = Annotated[str, msgspec.Meta(max_length=256)]
+_Line = Annotated[str, msgspec.Meta(max_length=1 << 14)]
+State = Literal["live", "paused", "closed", "dead"]
+
+_Kind = TypeVar("_Kind")
 
 
 class Service(msgspec.Struct, frozen=True):
@@ -64,9 +86,9 @@ class Service(msgspec.Struct, frozen=True):
         sequence: of its newest frame when it became so: those up to it may be on their way still.
     """
 
-    generation: int = 0
-    state: str = "live"
-    sequence: int = 0
+    generation: _Count = 0
+    state: State = "live"
+    sequence: _Count = 0
 
 
 class Services(msgspec.Struct, frozen=True):
@@ -79,13 +101,15 @@ class Services(msgspec.Struct, frozen=True):
         callers: who may call, by the names in their certificates; empty: whoever is let in.
         services: by name.
         missing: what of a wish is not there, a line for people; empty if nothing is missing.
+        host: name of the machine, for people.
     """
 
-    instance: str
-    start: str = ""
-    callers: tuple[str, ...] = ()
-    services: dict[str, Service] = {}
-    missing: str = ""
+    instance: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
+    start: _Word = ""
+    callers: Annotated[tuple[_Word, ...], msgspec.Meta(max_length=256)] = ()
+    services: Annotated[dict[_Name, Service], msgspec.Meta(max_length=MOST_SERVICES)] = {}
+    missing: _Line = ""
+    host: _Word = ""
 
 
 class Wish(msgspec.Struct, frozen=True):
@@ -130,16 +154,16 @@ class DriverSummary(msgspec.Struct, frozen=True):
         problems: what is not in order: the driver, or each of its buses and patches.
     """
 
-    state: str
-    rate_hz: float
-    age_ms: float | None
-    lost: int
-    sensors: int
-    fresh: int
-    patches: int
-    silent: tuple[str, ...]
-    n_silent: int
-    problems: int
+    state: State
+    rate_hz: _Figure
+    age_ms: _Figure | None
+    lost: _Count
+    sensors: _Count
+    fresh: _Count
+    patches: _Count
+    silent: Annotated[tuple[_Word, ...], msgspec.Meta(max_length=16)]
+    n_silent: _Count
+    problems: _Count
 
 
 class Summary(msgspec.Struct, frozen=True):
@@ -150,12 +174,14 @@ class Summary(msgspec.Struct, frozen=True):
         drivers: by name.
         services: how many others there are.
         lost: frames that the bridge could not take from their rings.
+        host: name of the machine, for people.
     """
 
-    namespace: str
-    drivers: dict[str, DriverSummary] = {}
-    services: int = 0
-    lost: int = 0
+    namespace: _Name
+    drivers: Annotated[dict[_Name, DriverSummary], msgspec.Meta(max_length=MOST_SERVICES)] = {}
+    services: _Count = 0
+    lost: _Count = 0
+    host: _Word = ""
 
 
 class About(msgspec.Struct, frozen=True):
@@ -165,7 +191,7 @@ class About(msgspec.Struct, frozen=True):
         operations: of the service: descriptions by name.
     """
 
-    operations: dict[str, str] = {}
+    operations: Annotated[dict[_Word, _Line], msgspec.Meta(max_length=256)] = {}
 
 
 class Answered(msgspec.Struct, frozen=True):
@@ -178,11 +204,25 @@ class Answered(msgspec.Struct, frozen=True):
         why: kind of error: ``refused``, ``failed``, ``paused``, ``cancelled``.
     """
 
-    generation: int = 0
-    sequence: int = 0
+    generation: _Count = 0
+    sequence: _Count = 0
     result: msgspec.Raw = msgspec.Raw(b"null")
-    error: str | None = None
-    why: str = ""
+    error: _Line | None = None
+    why: Literal["", "refused", "failed", "paused", "cancelled"] = ""
+
+
+def read_text(message: bytes, kind: type[_Kind]) -> _Kind:
+    """The content of a JSON message of somebody else.
+
+    Raises:
+        BridgeError: it is longer, deeper or otherwise than such a message can be; says what is wrong.
+    """
+    if len(message) > LONGEST_TEXT:
+        raise BridgeError(f"{len(message)} bytes of JSON; at most {LONGEST_TEXT}")
+    try:
+        return msgspec.json.decode(message, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+        raise BridgeError(str(error)) from None
 
 
 ALL_TOKENS = "skinware/live/*/*/*"
@@ -245,9 +285,28 @@ def bridge_of(key: str) -> tuple[str, str]:
 
 
 def token_parts(key: str) -> tuple[str, int, str]:
-    """(robot, version, instance) of a token; version 0: not to be understood."""
-    robot, version, instance = key.split("/")[2:5]
-    return robot, (int(version) if version.isdigit() else 0), instance
+    """(robot, version, instance) of a token; version 0: not to be understood.
+
+    Raises:
+        BridgeError: it is no token.
+    """
+    parts = key.split("/")
+    if len(parts) != 5 or not _NAME.fullmatch(parts[2]) or len(key) > 256:
+        raise BridgeError("a token of no bridge")
+    robot, version, instance = parts[2:]
+    if version == str(VERSION) and not _INSTANCE.fullmatch(instance):
+        raise BridgeError("a token of no bridge")
+    return robot, number_in(version), instance
+
+
+def number_in(text: str) -> int:
+    """A number from 0 to 2**64 - 1 that is written in digits; 0 if it is none."""
+    return min(int(text), (1 << 64) - 1) if text.isascii() and text.isdecimal() and len(text) <= 20 else 0
+
+
+def host_name() -> str:
+    """Name of this machine, for people."""
+    return socket.gethostname()[:64]
 
 
 def raw_message(frame: Frame) -> bytes:
@@ -255,9 +314,9 @@ def raw_message(frame: Frame) -> bytes:
     return b"".join((_HEAD.pack(RAW, frame.generation), frame.slot))
 
 
-def coded_message(coded: bytes) -> bytes:
-    """A message of :mod:`skinware.transfer.codec`, for the link."""
-    return _CODED_HEAD + coded
+def coded_message(coded: bytes, keeps: bool) -> bytes:
+    """A message of :mod:`skinware.transfer.codec`, for the link; ``keeps``: the receiver keeps the frame."""
+    return _CODED_HEAD.pack(CODED, keeps) + coded
 
 
 def form_of(message: bytes) -> int:
@@ -282,9 +341,9 @@ def slot_of(message: bytes) -> npt.NDArray[np.uint8]:
     return np.frombuffer(message, np.uint8, offset=_HEAD.size)
 
 
-def coded_part(message: bytes) -> memoryview:
-    """What was coded, of a coded frame."""
-    return memoryview(message)[len(_CODED_HEAD) :]
+def coded_part(message: bytes) -> tuple[memoryview, bool]:
+    """What was coded, of a coded frame, and whether the receiver keeps the frame."""
+    return memoryview(message)[_CODED_HEAD.size :], bool(message[1])
 
 
 class Head:
@@ -323,7 +382,11 @@ def split_generation(message: bytes) -> tuple[About, bytes]:
     try:
         (size,) = _SIZE.unpack_from(message)
         begin = _SIZE.size + size
-        about = msgspec.json.decode(message[_SIZE.size : begin], type=About)
-        return about, zlib.decompressobj().decompress(message[begin:], _LONGEST_HEAD)
-    except (struct.error, msgspec.MsgspecError, UnicodeDecodeError, zlib.error) as error:
+        about = read_text(message[_SIZE.size : begin], About)
+        unpacker = zlib.decompressobj()
+        head = unpacker.decompress(memoryview(message)[begin:], LONGEST_HEAD)
+    except (struct.error, BridgeError, zlib.error) as error:
         raise BridgeError(f"what a generation is cannot be read ({error})") from None
+    if unpacker.unconsumed_tail:
+        raise BridgeError(f"the file of a generation has more than {LONGEST_HEAD} bytes before its slots")
+    return about, head

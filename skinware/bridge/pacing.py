@@ -1,12 +1,16 @@
-"""Whether frames are pushed or pulled: pure decisions from what was seen.
+"""Whether frames are pushed or pulled, and how many are asked for at once: pure decisions from what was seen.
 
 Pushed frames are the youngest where the link is fast enough. Where it is not, they wait in queues, and grow old there;
-then each is asked for: the newest, one at a time and packed, and the link is never given more than it takes. Which it
-is shows a frame that is asked for as it would be pushed: how long it is on its way.
+then they are asked for: the newest, packed, and no more of them at once than the link takes. A frame that is asked for
+as it would be pushed shows which it is: how long it is on its way, beyond what an empty answer takes.
+
+The time that the link itself takes is no fault of either way. A link is judged by how long frames wait in its queues:
+their age minus the least age lately. As many questions are open as fit into a round trip, so that each frame finds one.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 from skinware.realtime import NS_PER_S
@@ -19,12 +23,50 @@ _WITHOUT_PERIOD_NS = 100_000_000
 _SHARE = 0.5
 """Of the period, what a frame may take on its way if it is to be pushed."""
 _PROBES = 3
-"""The fastest of so many tells: others had to wait for something else."""
+"""The fastest of so many counts: others had to wait for something else."""
+_OF_ROUND_TRIP = 0.25
+"""Of a round trip, what frames may wait: on a long link they come unevenly."""
+_KEPT_NS = 30 * NS_PER_S
+"""For how long the least age is remembered: clocks drift, and routes change."""
+MOST_OPEN = 512
+"""Questions for frames."""
 _FIRST_RETRY_NS, _LAST_RETRY_NS = 10 * NS_PER_S, 320 * NS_PER_S
 
 
+class _Waits:
+    """How long frames wait in queues, by their ages.
+
+    Attributes:
+        since_ns: when the first age counted.
+    """
+
+    def __init__(self) -> None:
+        self._ages: deque[tuple[int, int]] = deque()  # (when, age), of the last look
+        self._least: deque[tuple[int, int]] = deque()  # (when, least age) of looks
+        self.since_ns: int = 0
+
+    def add(self, at_ns: int, age_ns: int, kept_ns: int) -> None:
+        """Count the age of a frame that came; older ones than ``kept_ns`` are forgotten."""
+        self.since_ns = self.since_ns or at_ns
+        self._ages.append((at_ns, age_ns))
+        while at_ns - self._ages[0][0] > kept_ns:
+            self._ages.popleft()
+
+    def look(self, at_ns: int) -> int:
+        """The median wait of the frames that are counted."""
+        ages = sorted(age for _, age in self._ages)
+        self._least.append((at_ns, ages[0]))
+        while at_ns - self._least[0][0] > _KEPT_NS:
+            self._least.popleft()
+        return ages[len(ages) // 2] - min(age for _, age in self._least)
+
+    def forget_ages(self) -> None:
+        """Only what comes from now on counts at the next look."""
+        self._ages.clear()
+
+
 class Pacing:
-    """The mode of one service. It begins with pulling, which fills no queue.
+    """The mode of one service. It begins with pulling one frame at a time, which fills no queue.
 
     Args:
         period_ns: of its writer, 0 if it has none.
@@ -32,15 +74,18 @@ class Pacing:
 
     Attributes:
         pulls: frames are to be asked for.
+        open: so many at once.
     """
 
     def __init__(self, period_ns: int, fixed: str | None = None) -> None:
-        self._period_ns, self._fixed = period_ns, fixed
+        self._period_ns, self._fixed = max(0, period_ns), fixed
         self.pulls: bool = fixed != "push"
-        self._ages: deque[tuple[int, int]] = deque()  # (when, age)
+        self.open: int = 1
+        self._waits = _Waits()
         self._took: list[int] = []
         self._retry_ns = _FIRST_RETRY_NS
-        self._since_ns = self._looked_ns = self._probe_ns = 0
+        self._looked_ns = self._probe_ns = 0
+        self._more_ns, self._more_retry_ns = 0, _FIRST_RETRY_NS  # when more may be asked for at once
 
     @property
     def mode(self) -> str:
@@ -61,40 +106,60 @@ class Pacing:
             self._probe_ns = at_ns + self._retry_ns
             self._retry_ns = min(2 * self._retry_ns, _LAST_RETRY_NS)
             return False
-        return self._change(at_ns, False)
+        self._change(False)
+        return True
 
-    def saw(self, at_ns: int, age_ns: int) -> bool:
-        """A pushed frame came; whether that changes the mode.
+    def saw(self, at_ns: int, age_ns: int, round_trip_ns: int) -> bool:
+        """A frame came; whether that changes the mode.
 
         Args:
             at_ns: now.
             age_ns: since it was published on the robot.
+            round_trip_ns: the shortest of the link.
         """
-        if self._fixed or self.pulls:
+        if self.pulls:
+            self._saw_pulled(at_ns, age_ns, round_trip_ns)
             return False
-        self._ages.append((at_ns, age_ns))
-        while at_ns - self._ages[0][0] > _LOOK_NS:
-            self._ages.popleft()
-        if at_ns - self._since_ns < _LOOK_NS or at_ns - self._looked_ns < _EVERY_NS:
+        if self._fixed:
+            return False
+        self._waits.add(at_ns, age_ns, _LOOK_NS)
+        if at_ns - self._waits.since_ns < _LOOK_NS or at_ns - self._looked_ns < _EVERY_NS:
             return False
         self._looked_ns = at_ns
-        ages = sorted(age for _, age in self._ages)
-        limit_ns = max(_OLD_PERIODS * self._period_ns, _LEAST_OLD_NS) if self._period_ns else _WITHOUT_PERIOD_NS
-        if ages[len(ages) // 2] <= limit_ns:
+        old_ns = max(_OLD_PERIODS * self._period_ns, _LEAST_OLD_NS) if self._period_ns else _WITHOUT_PERIOD_NS
+        if self._waits.look(at_ns) <= max(old_ns, _OF_ROUND_TRIP * round_trip_ns):
             return False
         self._probe_ns = at_ns + self._retry_ns
         self._retry_ns = min(2 * self._retry_ns, _LAST_RETRY_NS)
-        return self._change(at_ns, True)
+        self._change(True)
+        return True
+
+    def _saw_pulled(self, at_ns: int, age_ns: int, round_trip_ns: int) -> None:
+        """As many questions at once as a round trip has periods, unless frames wait in queues then."""
+        period_ns = self._period_ns or _WITHOUT_PERIOD_NS
+        every_ns = max(_EVERY_NS, 5 * round_trip_ns // 4)
+        self._waits.add(at_ns, age_ns, every_ns)
+        wanted = min(MOST_OPEN, math.ceil(round_trip_ns / period_ns) + 2)
+        self.open = min(self.open, wanted)
+        if at_ns - self._looked_ns < (every_ns if self.open > 1 else _EVERY_NS):
+            return
+        self._looked_ns = at_ns
+        wait_ns, most_ns = self._waits.look(at_ns), max(_OLD_PERIODS * period_ns, _LEAST_OLD_NS) / 2
+        self._waits.forget_ages()
+        if self.open > 1 and wait_ns > max(most_ns, _OF_ROUND_TRIP * round_trip_ns):
+            self.open = max(1, min(self.open - 1, self.open * 3 // 4))
+            self._more_ns = at_ns + self._more_retry_ns
+            self._more_retry_ns = min(2 * self._more_retry_ns, _LAST_RETRY_NS)
+        elif self.open < wanted and at_ns >= self._more_ns:
+            self.open = min(wanted, 2 * self.open)
 
     @property
     def _most_ns(self) -> float:
         return _SHARE * (self._period_ns or _WITHOUT_PERIOD_NS)
 
-    def _change(self, at_ns: int, pulls: bool) -> bool:
+    def _change(self, pulls: bool) -> None:
         self.pulls = pulls
-        self._since_ns = at_ns
-        self._ages.clear()
-        return True
+        self._waits = _Waits()
 
 
-__all__ = ["Pacing"]
+__all__ = ["MOST_OPEN", "Pacing"]

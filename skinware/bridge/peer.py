@@ -8,10 +8,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.guarding import Guard, Room
 from skinware.bridge.link import Link, Reply
-from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, token_parts
+from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, Services, token_parts
 from skinware.bridge.pinging import Pinger
 from skinware.bridge.turns import Turns
+from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
 
 ANSWER_S = 1.0
@@ -19,6 +21,10 @@ _PATIENCE_NS = 3 * NS_PER_S
 """With nobody there, until it is looked at why, and until it is looked at again."""
 _PING_NS = 150_000_000
 _SILENCE_NS = 400_000_000
+"""Without round trips: on a long link the answer to a ping needs that, too."""
+_ROUND_TRIPS = 2
+"""The answer to a ping, and once more where a packet of it got lost."""
+_MOST_TROUBLE, _MOST_BRIDGES = 256, 256
 
 
 class Watcher(Protocol):
@@ -57,6 +63,9 @@ class Peer:
         clock: of the robot.
         is_connected: whether it is heard.
         since_ns: since when that is so.
+        guard: counts its messages that cannot be taken.
+        room: memory for its services.
+        host: name of its machine; empty: not known.
     """
 
     def __init__(
@@ -72,7 +81,8 @@ class Peer:
         self.keys = Keys(robot)
         self.who: str = os.urandom(8).hex()
         self.clock = PeerClock()
-        self._instance, self._start = "", ""
+        self.instance, self._start, self.host = "", "", ""
+        self.switches = 0
         self.is_connected = False
         self.since_ns: int = now_ns()
         self.tell = tell
@@ -82,8 +92,10 @@ class Peer:
         self._why_not, self._next_why_ns, self._asking_why = why_not, now_ns() + _PATIENCE_NS, False
         self._heard_ns = self._pinged_ns = self._next_clock_ns = 0
         self._told: set[str] = set()
-        self._pinger = Pinger(link, self.who, lambda sample: turns.soon(lambda: self._take_clock(sample)))
-        link.watch(ALL_TOKENS, lambda key, there: turns.soon(lambda: self._token(key, there)))
+        self.guard = Guard(self._refused)
+        self.room = Room()
+        self._pinger = Pinger(link, self.who, self._clock_answered, self.guard)
+        link.watch(ALL_TOKENS, lambda key, there: self.soon("a token", lambda: self._token(key, there)))
 
     @property
     def robot(self) -> str:
@@ -104,8 +116,8 @@ class Peer:
         """See :meth:`skinware.bridge.link.Link.ask`; in a turn it is told the answer and when that came."""
 
         def came(reply: Reply) -> None:
-            returned_ns = now_ns()
-            self._turns.soon(lambda: answered(reply.payload, returned_ns))
+            returned_ns, payload = now_ns(), reply.payload
+            self.soon("an answer", lambda: answered(payload, returned_ns), len(payload or b""))
 
         self._link.ask(
             key,
@@ -119,29 +131,53 @@ class Peer:
 
     def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:
         """See :meth:`skinware.bridge.link.Link.listen`: it is heard in the thread that receives."""
-        return self._link.listen(key, heard)
+        return self._link.listen(key, self.guard.of_messages("a frame", heard))
 
-    def follows(self, instance: str, start: str) -> bool:
-        """Whether what a bridge says of itself counts: not if another one is followed and still there.
+    def soon(self, kind: str, work: Callable[[], object], size: int = 0) -> None:
+        """Have what a message of the robot asks for done in a turn; see :meth:`skinware.bridge.turns.Turns.soon`."""
+        self._turns.soon(lambda: self.guard.run(kind, work), size)
 
-        Args:
-            instance: its number.
-            start: from which its clock counts.
-        """
-        if self._instance and instance != self._instance and self._instance in self._there:
-            self.say_once("robot", f"robot {self.robot} is served by two bridges: give each robot a name of its own")
+    def follows(self, told: Services) -> bool:
+        """Whether what a bridge says of itself counts: not if another one is followed and still there."""
+        before, instance = self.instance, told.instance
+        if before and instance != before and before in self._there:
+            self._namesake(instance, told.host)
             return False
-        self.heard()
-        if instance != self._instance:
-            self._instance, self.keys = instance, Keys(self.robot, instance)
+        is_other = bool(before) and (instance != before) and told.start != self._start
+        host, self.host = self.host, told.host
+        if instance != before:
+            self.instance, self.keys = instance, Keys(self.robot, instance)
             self._pinger.follow(self.keys)
             self._watcher.moved()
-        if start != self._start:
-            self._start = start
+        self.heard()
+        if is_other:
+            self._switched(before, host)
+        if told.start != self._start:
+            self._start = told.start
             self.clock = PeerClock()
             self._ask_clock()
             self._watcher.restarted()
         return True
+
+    @property
+    def namesakes(self) -> int:
+        """Other bridges that serve a robot of this name."""
+        return len(self._there - {self.instance}) if self.instance else 0
+
+    def _namesake(self, instance: str, host: str) -> None:
+        self.say_once(
+            "robot",
+            f"robot {self.robot} is served by two bridges: {_named(self.instance, self.host)}, which is followed, and"
+            f" {_named(instance, host)}: give each robot a name of its own",
+        )
+
+    def _switched(self, before: str, host: str) -> None:
+        """Another machine, or another start or namespace of it, has taken the place of the one that was followed."""
+        why = (
+            f"{_named(self.instance, self.host)} serves it now, and not {_named(before, host)}: it may be another robot"
+        )
+        self.switches += 1
+        self.tell({"event": "switched", "robot": self.robot, "instance": self.instance, "host": self.host, "why": why})
 
     def heard(self) -> None:
         """Something came from it."""
@@ -149,14 +185,14 @@ class Peer:
         if not self.is_connected:
             self.is_connected, self.since_ns = True, self._heard_ns
             self._told.clear()
-            self.tell({"event": "connected", "robot": self.robot})
+            self.tell({"event": "connected", "robot": self.robot, "instance": self.instance, "host": self.host})
 
     def look(self, time_ns: int) -> None:
         """What is to be done by the clock."""
         if time_ns >= self._next_clock_ns:
             self._ask_clock()
         if self.is_connected and time_ns - self._heard_ns > _SILENCE_NS - _PING_NS:
-            if time_ns - self._heard_ns > _SILENCE_NS:
+            if time_ns - self._heard_ns > _SILENCE_NS + _ROUND_TRIPS * self.clock.round_trip_ns:
                 self._lose("nothing comes over the link")
             elif time_ns - self._pinged_ns > _PING_NS:
                 self._ask_clock()
@@ -164,17 +200,25 @@ class Peer:
             self._asking_why, self._next_why_ns = True, time_ns + _PATIENCE_NS
             threading.Thread(target=self._ask_why, name="skinware bridge diagnosis", daemon=True).start()
 
+    def _refused(self, kind: str, why: str) -> None:
+        """In the thread that found it."""
+        text = f"robot {self.robot}: {kind} cannot be read: {why}"
+        self._turns.soon(lambda: self.tell({"event": "trouble", "about": "message", "why": text}))
+
     def say_once(self, about: str, text: str) -> None:
-        """Tell of trouble, once for as long as the robot is heard."""
-        if text not in self._told:
+        """Report trouble, once for as long as the robot is heard."""
+        if text not in self._told and len(self._told) < _MOST_TROUBLE:
             self._told.add(text)
             self.tell({"event": "trouble", "about": about, "why": text})
 
     def _token(self, key: str, there: bool) -> None:
         robot, version, instance = token_parts(key)
         if robot != self.robot:
-            (self._others.add if there else self._others.discard)(robot)
+            if not there or len(self._others) < _MOST_BRIDGES:
+                (self._others.add if there else self._others.discard)(robot)
             return
+        if there and len(self._there) >= _MOST_BRIDGES:
+            raise BridgeError(f"more than {_MOST_BRIDGES} bridges serve robot {self.robot}")
         (self._there.add if there else self._there.discard)(instance)
         if there and version != VERSION:
             self.say_once(
@@ -184,7 +228,7 @@ class Peer:
             )
         elif there:
             self._watcher.appeared()
-        elif instance == self._instance:
+        elif instance == self.instance:
             self._lose("its bridge ended")
 
     def _lose(self, why: str) -> None:
@@ -212,10 +256,18 @@ class Peer:
         self._next_clock_ns = self._pinged_ns + self.clock.pause_ns()
         self._pinger.ask()
 
+    def _clock_answered(self, sample: Sample) -> None:
+        self.soon("a clock", lambda: self._take_clock(sample))
+
     def _take_clock(self, sample: Sample) -> None:
         self.heard()
         self.clock.add(sample)
         self._watcher.clock_told()
+
+
+def _named(instance: str, host: str) -> str:
+    """A bridge, for people."""
+    return f"bridge {instance[:8]} on {host}" if host else f"bridge {instance[:8]}"
 
 
 __all__ = ["ANSWER_S", "Peer", "Watcher"]

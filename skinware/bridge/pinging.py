@@ -11,13 +11,17 @@ import struct
 from collections.abc import Callable
 
 from skinware.bridge.clock import Sample
+from skinware.bridge.guarding import Guard
 from skinware.bridge.link import Link, Priority
 from skinware.bridge.messages import Keys
+from skinware.errors import BridgeError
 from skinware.realtime import now_ns
 
 QUESTIONS = 16
 _PING = struct.Struct("<16sq")
 _PONG = struct.Struct("<qqq")
+_LATEST_NS = 1 << 61
+"""No clock has counted so far."""
 
 
 class Pinger:
@@ -26,12 +30,13 @@ class Pinger:
     Args:
         link: to the other machine.
         who: asks, 16 letters.
-        told: is told what came of them together, in the thread that receives the last answer; what came of some that
-            are not answered to the end, when the next ones are asked.
+        told: gets the sample of all of them, in the thread that receives the last answer; where some are not answered,
+            when the next ones are asked.
+        guard: counts answers that cannot be.
     """
 
-    def __init__(self, link: Link, who: str, told: Callable[[Sample], None]) -> None:
-        self._link, self._who, self._told = link, who, told
+    def __init__(self, link: Link, who: str, told: Callable[[Sample], None], guard: Guard) -> None:
+        self._link, self._who, self._told, self._guard = link, who, told, guard
         self._ping = ""
         self._silence: Callable[[], None] = lambda: None
         self._asked_ns = self._left = self._since_ns = 0
@@ -41,7 +46,7 @@ class Pinger:
         """Ask the bridge with these keys from now on."""
         self._silence()
         self._ping, self._since_ns = keys.ping, now_ns()
-        self._silence = self._link.listen(keys.pong(self._who), self._answered)
+        self._silence = self._link.listen(keys.pong(self._who), self._guard.of_messages("a clock", self._answered))
 
     def close(self) -> None:
         """Ask nobody any more."""
@@ -70,8 +75,11 @@ class Pinger:
         if len(message) != _PONG.size:
             return
         asked_ns, heard_ns, answered_ns = _PONG.unpack(message)
-        if asked_ns < self._since_ns:
+        if not self._since_ns <= asked_ns <= returned_ns:
             return  # of another bridge, whose clock may be another
+        took_ns = answered_ns - heard_ns
+        if not 0 <= heard_ns < _LATEST_NS or not 0 <= took_ns <= returned_ns - asked_ns:
+            raise BridgeError(f"a clock that shows {heard_ns} ns, and {took_ns} ns later, cannot be")
         is_newest, is_last = asked_ns == self._asked_ns, self._left == 0
         if is_newest and not is_last:
             self._ask()  # before all else, while threads are awake

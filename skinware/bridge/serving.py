@@ -15,8 +15,21 @@ import msgspec
 
 from skinware.bridge.calling import Calls
 from skinware.bridge.giving import Stream
+from skinware.bridge.guarding import Guard
 from skinware.bridge.link import Link, Question
-from skinware.bridge.messages import About, Head, Keys, Service, Services, Wish, generation_message, parts_of
+from skinware.bridge.messages import (
+    About,
+    Head,
+    Keys,
+    Service,
+    Services,
+    State,
+    Wish,
+    generation_message,
+    host_name,
+    parts_of,
+    read_text,
+)
 from skinware.bridge.parts import Parts
 from skinware.bridge.pinging import answering
 from skinware.bridge.summaries import Summaries, Summarised
@@ -30,7 +43,17 @@ from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
 from skinware.transfer.generation import Generation
 
-_STATES = {"live": "live", "paused": "paused", "closed": "closed", "dead": "dead", "restarted": "live", "found": "live"}
+_LONGEST_LINE = 4096
+_MOST_WAITING = 1024
+"""Questions that wait to be answered by the thread that codes."""
+_STATES: dict[str, State] = {
+    "live": "live",
+    "paused": "paused",
+    "closed": "closed",
+    "dead": "dead",
+    "restarted": "live",
+    "found": "live",
+}
 
 
 @dataclass
@@ -79,6 +102,9 @@ class Server:
         namespace: whose services.
         names: of them; None: all there are and come.
         callers: who may call, told to all.
+
+    Attributes:
+        guard: counts questions that cannot be understood.
     """
 
     def __init__(
@@ -96,7 +122,9 @@ class Server:
         self._services: dict[str, _Served] = {}
         self._states: dict[str, Service] = {}
         self._lock = threading.Lock()
+        self.guard = Guard()
         self._calls = Calls(namespace)
+        self._waiting = 0  # for the thread that codes
         self._coding = ThreadPoolExecutor(1, "skinware bridge coding")
         self._parts = Parts(self._stream)
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
@@ -104,10 +132,15 @@ class Server:
         self._collector.take()  # who asks is told of all that there is
         self._answering = [
             answering(link, self._keys),
-            link.answer(self._keys.services, self._services_asked),
-            link.answer(self._keys.of("*", "generation"), self._generation_asked),
-            link.answer(self._keys.of("*", "newest"), self._newest_asked),
-            link.answer(self._keys.call("*", "*"), self._called),
+            *(
+                link.answer(key, self.guard.of_questions("a question", asked))
+                for key, asked in (
+                    (self._keys.services, self._services_asked),
+                    (self._keys.of("*", "generation"), self._generation_asked),
+                    (self._keys.of("*", "newest"), self._newest_asked),
+                    (self._keys.call("*", "*"), self._called),
+                )
+            ),
         ]
         link.be_there(self._keys.token)
 
@@ -207,12 +240,22 @@ class Server:
         return [service for service in services if service[1].state != "closed"]
 
     def _soon(self, work: Callable[..., None], *arguments: object) -> None:
-        """Have frames coded, or cut, after what waits for that already."""
+        """Have frames coded, or cut, after what waits for that already; what is too much is counted, and left out."""
+        with self._lock:
+            if self._waiting >= _MOST_WAITING:
+                self.guard.refuse("a question", f"{_MOST_WAITING} others wait")
+                return
+            self._waiting += 1
         with contextlib.suppress(RuntimeError):  # it is closed
-            self._coding.submit(work, *arguments)
+            self._coding.submit(self._code, work, *arguments)
+
+    def _code(self, work: Callable[..., None], *arguments: object) -> None:
+        with self._lock:
+            self._waiting -= 1
+        self.guard.run("a question", work, *arguments)
 
     def _let_go(self) -> None:
-        """Of what nobody wants any more."""
+        """Forget questions and parts that are over."""
         for served in self._services.values():
             served.stream.let_go()
         self._parts.let_go()
@@ -228,16 +271,16 @@ class Server:
     def _told(self) -> bytes:
         with self._lock:
             services = {name: served.told for name, served in self._services.items()}
-        return msgspec.json.encode(Services(self._instance, self._start, self._callers, services))
+        return msgspec.json.encode(Services(self._instance, self._start, self._callers, services, host=host_name()))
 
     def _tell_part(self, question: Question) -> None:
         """What there is of the sensors that somebody wants."""
         services: dict[str, Service] = {}
         try:
-            missing = self._fit(msgspec.json.decode(question.payload, type=Wish), services)
-        except (msgspec.MsgspecError, BridgeError, ConfigurationError) as error:
+            missing = self._fit(read_text(question.payload, Wish), services)
+        except (BridgeError, ConfigurationError) as error:
             missing = str(error)
-        told = Services(self._instance, self._start, self._callers, services, missing)
+        told = Services(self._instance, self._start, self._callers, services, missing[:_LONGEST_LINE], host_name())
         question.reply(msgspec.json.encode(told))
 
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:

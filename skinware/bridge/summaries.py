@@ -10,9 +10,9 @@ import numpy as np
 
 from skinware.bridge.giving import Stream
 from skinware.bridge.link import Sender
-from skinware.bridge.messages import DriverSummary, Summary
+from skinware.bridge.messages import DriverSummary, State, Summary, host_name
 from skinware.driver_service import counters_of
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
@@ -35,7 +35,7 @@ class Summarised:
     """
 
     name: str
-    state: str
+    state: State
     generation: Generation
     stream: Stream
 
@@ -49,7 +49,7 @@ class Summaries:
     """
 
     def __init__(self, namespace: str, send: Sender) -> None:
-        self._namespace, self._send_bytes = namespace, send
+        self._namespace, self._host, self._send_bytes = namespace, host_name(), send
         self._frames: dict[str, int] = {}
         self._counted_ns = now_ns()
         self._rates_hz: dict[str, float] = {}
@@ -76,7 +76,7 @@ class Summaries:
             lost: frames that the bridge could not take from their rings.
         """
         told = {driver.name: self._of(driver) for driver in drivers}
-        self._send_bytes(msgspec.json.encode(Summary(self._namespace, told, services, lost)))
+        self._send_bytes(msgspec.json.encode(Summary(self._namespace, told, services, lost, self._host)))
 
     def _of(self, driver: Summarised) -> DriverSummary:
         structure = driver.generation.context
@@ -114,9 +114,9 @@ def _fresh(frame: RecordedDriverFrame, structure: Structure, time_ns: int, is_li
     """How many sensors can be trusted now."""
     fresh = is_fresh(
         frame.status,
-        frame.module_time_ns[structure.sensor_module],
+        frame.sensor_time_ns,
         at_ns=time_ns,
-        max_age_ns=age_limit_ns(frame.period_ns),
+        max_age_ns=structure.age_limits_ns(frame.period_ns),
         alive=is_live,
     )
     return int(np.count_nonzero(fresh))

@@ -8,15 +8,26 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import msgspec
-
 from skinware.bridge.clock import PeerClock, Sample
+from skinware.bridge.guarding import Guard
 from skinware.bridge.link import Link
-from skinware.bridge.messages import ALL_SUMMARIES, ALL_TOKENS, VERSION, Keys, Summary, bridge_of, token_parts
+from skinware.bridge.messages import (
+    ALL_SUMMARIES,
+    ALL_TOKENS,
+    VERSION,
+    Keys,
+    Summary,
+    bridge_of,
+    read_text,
+    token_parts,
+)
 from skinware.bridge.pinging import Pinger
+from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
 
 _TICK_S = 0.05
+_MOST = 1024
+"""Bridges that are watched."""
 
 Bridge = tuple[str, str]
 """(robot, number of the bridge that serves it)."""
@@ -34,6 +45,7 @@ class Seen:
         summary: what it told last; None: nothing yet.
         told_ns: when that was, 0 if it was never.
         bytes: of all that it told so far.
+        guard: counts its messages that cannot be taken.
         next_clock_ns: when its clock is to be asked next.
         pinger: asks for it; None: nobody wants to know.
     """
@@ -45,6 +57,7 @@ class Seen:
     summary: Summary | None = None
     told_ns: int = 0
     bytes: int = 0
+    guard: Guard = field(default_factory=Guard)
     next_clock_ns: int = 0
     pinger: Pinger | None = None
 
@@ -55,6 +68,9 @@ class Watcher:
     Args:
         link: to them.
         asks: have them tell how they are; otherwise only who is there.
+
+    Attributes:
+        guard: counts messages that cannot be taken, and are of no robot that is known.
     """
 
     def __init__(self, link: Link, *, asks: bool = True) -> None:
@@ -62,9 +78,10 @@ class Watcher:
         self._lock = threading.Lock()
         self._seen: dict[Bridge, Seen] = {}
         self._stopping = False
-        link.watch(ALL_TOKENS, self._token)
+        self.guard = Guard()
+        link.watch(ALL_TOKENS, self._token_changed)
         if asks:
-            link.listen(ALL_SUMMARIES, self._told)
+            link.listen(ALL_SUMMARIES, self.guard.of_messages("a summary", self._told))
 
     def robots(self) -> list[Seen]:
         """All that are reached now, by name; two of one name are two."""
@@ -88,11 +105,16 @@ class Watcher:
         """End it; from any thread, and from a signal handler."""
         self._stopping = True
 
+    def _token_changed(self, key: str, there: bool) -> None:
+        self.guard.run("a token", self._token, key, there)
+
     def _token(self, key: str, there: bool) -> None:
         robot, version, instance = token_parts(key)
         gone = None
         with self._lock:
             if there:
+                if len(self._seen) >= _MOST and (robot, instance) not in self._seen:
+                    raise BridgeError(f"more than {_MOST} bridges are reached")
                 self._seen.setdefault((robot, instance), Seen(robot, instance)).version = version
             else:
                 gone = self._seen.pop((robot, instance), None)
@@ -100,13 +122,16 @@ class Watcher:
             gone.pinger.close()
 
     def _told(self, key: str, payload: bytes) -> None:
-        try:
-            summary = msgspec.json.decode(payload, type=Summary)
-        except msgspec.MsgspecError:
-            return  # it is not new any more, and shown as such
         with self._lock:
             seen = self._seen.get(bridge_of(key))
-            if seen is not None:
+        if seen is None:
+            return
+        try:
+            summary = read_text(payload, Summary)
+        except BridgeError as error:
+            seen.guard.refuse("a summary", str(error))
+        else:
+            with self._lock:
                 seen.summary, seen.told_ns = summary, now_ns()
                 seen.bytes += len(payload)
 
@@ -118,7 +143,7 @@ class Watcher:
         seen.next_clock_ns = now_ns() + seen.clock.pause_ns()
         pinger = seen.pinger
         if pinger is None:
-            pinger = Pinger(self._link, self._who, told)
+            pinger = Pinger(self._link, self._who, told, seen.guard)
             pinger.follow(Keys(seen.robot, seen.instance))
             with self._lock:
                 if self._seen.get((seen.robot, seen.instance)) is seen:

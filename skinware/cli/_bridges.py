@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from skinware.bridge_state import BridgeState, ServiceState
-from skinware.cli._format import age_text, count_text, rate_text, table
+from skinware.cli._format import age_text, count_text, plural, rate_text, table
 from skinware.realtime import NS_PER_S, now_ns
 
 _TITLES = ("service", "state", "mode", "rate", "age 50 %", "age 99 %", "not come")
@@ -24,6 +24,12 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
         "connected": bridge.is_up,
         "since_s": round(max(0, now_ns() - bridge.since_ns) / NS_PER_S, 3),
         "clock": clock,
+        "instance": bridge.instance or None,
+        "host": bridge.host or None,
+        "namesakes": bridge.namesakes,
+        "switches": bridge.switches,
+        "refused": bridge.refused,
+        "last_refused": bridge.last_refused or None,
         "services": {name: _service_data(service) for name, service in bridge.services.items()},
     }
 
@@ -31,11 +37,26 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
 def summary(robot: str, told: dict[str, Any]) -> str:
     """A bridge, of which ``as_data`` tells, in a line."""
     state = "heard" if told["connected"] else "not heard"
-    line, clock = f"robot {robot} {state} for {age_text(told['since_s'] * 1e9)}", told["clock"]
+    host = f" on {told['host']}" if told["host"] else ""
+    line, clock = f"robot {robot}{host} {state} for {age_text(told['since_s'] * 1e9)}", told["clock"]
     if clock is None:
         return f"{line}, its clock is not known"
     error, round_trip = age_text(clock["error_ms"] * 1e6), age_text(clock["round_trip_ms"] * 1e6)
     return f"{line}, its clock known to {error}, round trip {round_trip}"
+
+
+def trouble(told: dict[str, Any]) -> list[str]:
+    """Lines on messages that could not be read, and on robots of one name; of what ``as_data`` returns."""
+    lines = []
+    if told["refused"]:
+        lines.append(f"{plural(told['refused'], 'message')} could not be read; the last: {told['last_refused']}")
+    if told["namesakes"]:
+        lines.append(
+            f"{plural(told['namesakes'], 'other bridge')} of this name; bridge {told['instance'][:8]} is followed"
+        )
+    if told["switches"]:
+        lines.append(f"another robot of this name took its place {plural(told['switches'], 'time')}")
+    return lines
 
 
 def as_lines(robot: str, told: dict[str, Any]) -> list[str]:
@@ -51,7 +72,7 @@ def as_lines(robot: str, told: dict[str, Any]) -> list[str]:
         )
         for name, service in told["services"].items()
     ]
-    return [summary(robot, told), *(["", *table(_TITLES, rows, left=3)] if rows else [])]
+    return [summary(robot, told), *trouble(told), *(["", *table(_TITLES, rows, left=3)] if rows else [])]
 
 
 def _age_text(age_ms: float | None) -> str:
@@ -65,6 +86,7 @@ def _service_data(service: ServiceState) -> dict[str, Any]:
         "mode": service.mode,
         "rate_hz": service.rate_hz,
         "lost": service.lost,
+        "lost_hz": service.lost_hz,
         "bytes_per_s": round(service.bytes_per_s),
         "age_ms": {
             "p50": None if p50_ns is None else p50_ns / 1e6,
@@ -73,4 +95,4 @@ def _service_data(service: ServiceState) -> dict[str, Any]:
     }
 
 
-__all__ = ["as_data", "as_lines", "summary"]
+__all__ = ["as_data", "as_lines", "summary", "trouble"]

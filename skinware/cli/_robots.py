@@ -163,7 +163,7 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
 
 
 class _Listed:
-    """Tells each second how all robots are, or once."""
+    """Prints each second how all robots are, or once."""
 
     def __init__(
         self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
@@ -201,15 +201,20 @@ class _Listed:
 def _report(robots: Sequence[Seen]) -> dict[str, Any]:
     """How robots are, as JSON has it."""
     count = Counter(seen.robot for seen in robots)
-    text = "{} robots are called {}: give each a name of its own"
-    twice = [text.format(number, name) for name, number in count.items() if number > 1]
-    return {"event": "status", "robots": [_report_of(seen) for seen in robots], "problems": twice}
+    problems = [f"{n} robots are called {name}: give each a name of its own" for name, n in count.items() if n > 1]
+    problems += [
+        f"{plural(seen.guard.count, 'message')} of {seen.robot} could not be read; the last: {seen.guard.last}"
+        for seen in robots
+        if seen.guard.count
+    ]
+    return {"event": "status", "robots": [_report_of(seen) for seen in robots], "problems": problems}
 
 
 def _as_text(found: dict[str, Any]) -> list[str]:
     """The report for people, as lines."""
     lines = [plural(len(found["robots"]), "robot")]
-    rows = [row for robot in found["robots"] for row in _rows_of(robot)]
+    count = Counter(robot["robot"] for robot in found["robots"])
+    rows = [row for robot in found["robots"] for row in _rows_of(robot, count[robot["robot"]] > 1)]
     if rows:
         lines += table(_TITLES, rows, left=3, width=terminal_width())
     return [*lines, *(click.style("problem: ", fg="red") + text for text in found["problems"])]
@@ -225,6 +230,8 @@ def _report_of(seen: Seen) -> dict[str, Any]:
         "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
         "told_s": told_s,
         "bytes": seen.bytes,
+        "refused": seen.guard.count,
+        "last_refused": seen.guard.last or None,
         "clock": {
             "offset_ms": clock.offset_ns(now_ns()) / 1e6,
             "error_ms": clock.error_ns / 1e6,
@@ -236,14 +243,17 @@ def _report_of(seen: Seen) -> dict[str, Any]:
     }
 
 
-def _rows_of(robot: dict[str, Any]) -> list[tuple[str, ...]]:
+def _rows_of(robot: dict[str, Any], has_namesakes: bool) -> list[tuple[str, ...]]:
+    called = (
+        f"{robot['robot']} ({robot.get('host') or '?'}, {robot['instance'][:8]})" if has_namesakes else robot["robot"]
+    )
     clock = robot["clock"]
     error = NO_VALUE if clock is None else f"± {age_text(clock['error_ms'] * 1e6)}"
     nothing = (NO_VALUE,) * 6
     if not robot.get("drivers"):
-        return [(robot["robot"], NO_VALUE, robot["state"], *nothing, error)]
+        return [(called, NO_VALUE, robot["state"], *nothing, error)]
     return [
-        (robot["robot"], name, _state_of(robot, driver), *_figures_of(driver), error)
+        (called, name, _state_of(robot, driver), *_figures_of(driver), error)
         for name, driver in robot["drivers"].items()
     ]
 

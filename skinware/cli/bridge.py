@@ -129,7 +129,9 @@ class _Serving:
                 name: {"state": state, "rate_hz": count - self._before.get(name, 0), "pulled_by": pullers}
                 for name, (state, count, pullers) in frames.items()
             }
-            print_json({"event": "status", "lost": self._server.lost, "services": services})
+            guard = self._server.guard
+            counts = {"lost": self._server.lost, "refused": guard.count, "last_refused": guard.last or None}
+            print_json({"event": "status", **counts, "services": services})
         for name, (state, count, _) in frames.items():
             if not self._as_json and self._known.get(name) != state:
                 click.echo(f"{name}: {state}")
@@ -246,8 +248,8 @@ class _Joined:
 
 
 _MODES = {
-    "push": "all frames come again",
-    "pull": "the link is too slow for all frames: only the newest come, as fast as it takes them",
+    "push": "the link is fast: every frame comes as it is published",
+    "pull": "frames wait on the link: the newest are asked for, as many as it takes",
 }
 
 

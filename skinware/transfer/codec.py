@@ -104,22 +104,30 @@ class Encoder:
 
     def encode(self, frame: Frame) -> bytes:
         """The message of a frame, which is kept until the next one."""
-        before = None if self._before is None else self._before.slot
-        after = 0 if self._before is None else self._before.sequence
-        slot = frame.slot
-        header = _HEADER.pack(
-            frame.generation, frame.sequence, frame.acquired_ns, frame.published_ns, frame.flags, after
-        )
-        codes, parts, sizes = bytearray(), [], []
-        for column in self._columns:
-            words = column.words_of(slot)
-            change = _change(words, None if before is None else column.words_of(before), column.is_integer)
-            code, part = _coded(change, column)
-            codes.append(code)
-            parts.append(part)
-            sizes.append(len(part))
-        self._before = frame
-        return b"".join([header, codes, struct.pack(f"<{len(sizes)}I", *sizes), *parts])
+        before, self._before = self._before, frame
+        return encoded(frame, before, self._columns)
+
+
+def encoded(frame: Frame, before: Frame | None, columns: Sequence[CodedColumn]) -> bytes:
+    """The message of a frame.
+
+    Args:
+        frame: which.
+        before: the frame to which it is the difference; None: it is a key frame.
+        columns: of the slots of both.
+    """
+    slot, slot_before = frame.slot, None if before is None else before.slot
+    after = 0 if before is None else before.sequence
+    header = _HEADER.pack(frame.generation, frame.sequence, frame.acquired_ns, frame.published_ns, frame.flags, after)
+    codes, parts, sizes = bytearray(), [], []
+    for column in columns:
+        words = column.words_of(slot)
+        change = _change(words, None if slot_before is None else column.words_of(slot_before), column.is_integer)
+        code, part = _coded(change, column)
+        codes.append(code)
+        parts.append(part)
+        sizes.append(len(part))
+    return b"".join([header, codes, struct.pack(f"<{len(sizes)}I", *sizes), *parts])
 
 
 def _change(words: Words, before: Words | None, is_integer: bool) -> Words:
@@ -220,7 +228,7 @@ class Run:
 
 
 class Decoder:
-    """Decodes the frames of one generation as they come.
+    """Decodes frames of one generation, each of which may be the difference to one of the last two that were kept.
 
     Args:
         columns: of its slots.
@@ -229,32 +237,41 @@ class Decoder:
 
     def __init__(self, columns: Sequence[CodedColumn], stride: int) -> None:
         self._columns, self._stride = columns, stride
-        self._before: npt.NDArray[np.uint8] | None = None
+        self._kept: dict[int, npt.NDArray[np.uint8]] = {}
 
     @property
     def sequence(self) -> int:
-        """Of the frame that was decoded last; 0: none."""
-        return 0 if self._before is None else int(self._before[: SLOT.itemsize].view(SLOT)[0]["sequence"])
+        """Of the newest frame that is kept; 0: none."""
+        return max(self._kept, default=0)
 
-    def decode(self, message: bytes | memoryview) -> npt.NDArray[np.uint8]:
-        """(stride,) the slot of a frame, which is kept until the next one: not to be changed.
+    def decode(self, message: bytes | memoryview, *, keeps: bool = True) -> npt.NDArray[np.uint8]:
+        """(stride,) the slot of a frame, not to be changed.
+
+        Args:
+            message: of the frame.
+            keeps: later frames may be the difference to this one.
 
         Raises:
-            BadRecording: it is no such message, or the difference to another frame than the last one.
+            BadRecording: it is no such message, or the difference to a frame that is not kept.
         """
         run = Run([message], self._columns)
-        after = int(run.headers["after"][0])
-        if after not in (0, self.sequence):
-            raise BadRecording(f"a frame tells its difference to frame {after}, which is not the last one")
+        sequence, after = int(run.headers["sequence"][0]), int(run.headers["after"][0])
+        before = self._kept.get(after)
+        if after and before is None:
+            raise BadRecording(f"a frame is the difference to frame {after}, which is not here")
         slot: npt.NDArray[np.uint8] = run.decode_slots(self._stride)[0]
-        if after and self._before is not None:
+        if before is not None:
             for column in self._columns:
-                words, before = column.words_of(slot.data), column.words_of(self._before.data)
+                words, words_before = column.words_of(slot.data), column.words_of(before.data)
                 if column.is_integer:
-                    words += before
+                    words += words_before
                 else:
-                    words ^= before
-        self._before = slot
+                    words ^= words_before
+        if keeps:
+            self._kept.pop(sequence, None)
+            self._kept[sequence] = slot
+            for oldest in list(self._kept)[:-2]:
+                del self._kept[oldest]
         return slot
 
 

@@ -6,11 +6,13 @@ from collections.abc import Iterator
 
 from skinware.bridge_state import BridgeState
 from skinware.cli._bridges import as_data, summary
-from skinware.cli._format import age_text, rate_text
+from skinware.cli._format import age_text, count_text, rate_text
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, Severity
 
 AREA = "bridges"
+_LOST = 0.05
+"""Of all frames: fewer are no reason to look at the link."""
 _PAGE = "how-to/two-machines.md"
 _PULLED = "how-to/two-machines.md#what-the-link-cannot-take"
 
@@ -22,6 +24,9 @@ def check(evidence: Evidence) -> Iterator[Note]:
         if not bridge.is_up:
             yield _not_heard(bridge)
         yield from _pulled(bridge)
+        yield from _refused(bridge)
+        if bridge.namesakes or bridge.switches:
+            yield _namesakes(bridge)
 
 
 def _not_heard(bridge: BridgeState) -> Finding:
@@ -38,17 +43,44 @@ def _not_heard(bridge: BridgeState) -> Finding:
 
 def _pulled(bridge: BridgeState) -> Iterator[Finding]:
     for name, service in bridge.services.items():
-        if service.state == "live" and service.mode == "pull" and service.age_p50_ns is not None:
+        all_hz = service.rate_hz + service.lost_hz
+        if service.state == "live" and service.lost_hz > _LOST * all_hz and service.age_p50_ns is not None:
             age = age_text(service.age_p50_ns)
             yield Finding(
                 Severity.NOTE,
                 AREA,
                 "the link is too slow for all frames",
                 f"{name} of robot {bridge.robot}",
-                f"{rate_text(service.rate_hz)} come, {age} old (p50); the others are left out",
+                f"{rate_text(service.rate_hz)} of {rate_text(all_hz)} come, {age} old (p50)",
                 "a faster link has them all",
                 see=_PULLED,
             )
+
+
+def _refused(bridge: BridgeState) -> Iterator[Finding]:
+    if bridge.refused:
+        yield Finding(
+            Severity.WARNING,
+            AREA,
+            "messages of a robot cannot be read",
+            f"robot {bridge.robot}",
+            f"{count_text(bridge.refused)} so far; the last: {bridge.last_refused}",
+            "install the same version on both machines; if it is the same, something else speaks as this robot",
+            see=_PAGE,
+        )
+
+
+def _namesakes(bridge: BridgeState) -> Finding:
+    now = f"bridge {bridge.instance[:8]}{' on ' if bridge.host else ''}{bridge.host} is followed"
+    return Finding(
+        Severity.WARNING,
+        AREA,
+        "several robots have one name",
+        f"robot {bridge.robot}",
+        f"{now}; {bridge.namesakes} other now, {bridge.switches} switches between robots so far",
+        "give each robot a name of its own: skin-bridge serve --robot NAME",
+        see=_PAGE,
+    )
 
 
 __all__ = ["check"]

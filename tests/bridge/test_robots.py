@@ -143,7 +143,7 @@ def test_nothing_is_told_where_nobody_listens_and_nonsense_is_left_out(namespace
             nonsense = NetLink(net)
             for payload in (b"", b"\xff\xfe", b"[]", b'{"drivers": 5}'):
                 nonsense.tell(Keys("walle", watcher.robots()[0].instance).summary, payload)
-                nonsense.tell(Keys("eve", "0").summary, payload)
+                nonsense.tell(Keys("eve", "00000000000000ee").summary, payload)
             net.idle()
             assert [seen.robot for seen in watcher.robots()] == ["walle"]
 
@@ -175,7 +175,7 @@ def test_a_robot_that_goes_as_its_clock_is_asked_for_leaves_nothing(moment: str)
 
         link = Vanishing(net)
         watcher = Watcher(link)
-        robot.be_there(Keys("eve", "0").token)
+        robot.be_there(Keys("eve", "00000000000000ee").token)
         watcher.run()
         assert not watcher.robots()
         assert not [key for key, _ in net.listeners if "/pong/" in key]

@@ -26,7 +26,7 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.rig import ROBOT, joined, publish, serving, structure
 from tests.doctor.rig import found, looked
 
-ARM = ServiceState("live", "pull", 20.0, 7, 1e6, 3e7, 9e7)
+ARM = ServiceState("live", "pull", 20.0, 7, 1e6, 3e7, 9e7, 5.0)
 
 
 def state(*, is_up: bool = True, **services: ServiceState) -> BridgeState:

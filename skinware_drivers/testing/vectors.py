@@ -86,16 +86,18 @@ def decode_frames(
     *,
     strict: bool = True,
     devices: EmulatedHardware | None = None,
+    apart_s: float = 0.001,
 ) -> Shown:
-    """What a driver makes of frames that arrive a millisecond apart.
+    """What a driver makes of frames that arrive one after the other.
 
     Args:
         adapter: the driver. Its ``layout`` is used, and its ``patches`` or what its ``describe`` finds.
         frames: identifier and payload (bytes, or hexadecimal digits) of each.
         strict: fail the test if one of them is not shown.
         devices: emulated ones, for a ``describe`` that asks.
+        apart_s: time from one frame to the next, s.
     """
-    return _decode(adapter, frames, [], strict, devices)
+    return _decode(adapter, frames, [], strict, devices, round(apart_s * NS_PER_S))
 
 
 def decode_stream(
@@ -151,6 +153,7 @@ def _decode(
     problems: list[str],
     strict: bool,
     devices: EmulatedHardware | None,
+    apart_ns: int = _MS,
 ) -> Shown:
     patches = _patches(adapter, devices)
     decoder = Decoder([adapter.layout], assemble([("bus", patches)], adapter.types, adapter.dtype))
@@ -165,7 +168,7 @@ def _decode(
             problems.append(f"{name}: too long, the longest of the layout has {adapter.payload_size} bytes")
             continue
         decoder.put_back(batch)
-        taken.append(((number + 1) * _MS, identifier, payload))
+        taken.append(((number + 1) * apart_ns, identifier, payload))
         batch.append(0, *taken[-1])
         before = state.bus_counters[0].copy()
         updates, foreign = decoder.decode(batch)

@@ -10,8 +10,9 @@ import sys
 import threading
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +23,17 @@ from skinware.conversion.showing import Showing
 from skinware.conversion.tables import sensor_names
 from skinware.geometry import Geometry
 from skinware.ros2 import discovery, types
+from skinware.ros2.taring import response
 from skinware.ros2.transport import Distro, Identity, MessageType, Qos
 from skinware.sensor_types import PRESSURE
 
+if TYPE_CHECKING:
+    from skinware.ros2.dds import DdsNode
+
 PATIENCE_S = 30.0
 PERIOD_S = 0.05
+SERVICE = "/skin/check/tare"
+ENCAPSULATION = bytes.fromhex("00010000")
 
 
 class Peer:
@@ -36,14 +43,20 @@ class Peer:
         self.process = subprocess.Popen([program, str(domain)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self.messages: dict[str, list[bytes]] = defaultdict(list)
         self.data: dict[str, str] = {}
+        self.readers: dict[str, str] = {}
         assert self.process.stdout is not None
         self._thread = threading.Thread(target=self._read, args=(self.process.stdout,))
         self._thread.start()
 
-    def listen(self, topic: str, message_type: MessageType, qos: Qos) -> None:
+    def listen(self, topic: str, message_type: MessageType, *, latched: bool = False) -> None:
+        self._say(topic, message_type.dds_name, "latched" if latched else "volatile")
+
+    def send(self, topic: str, message_type: MessageType, message: bytes) -> None:
+        self._say(topic, message_type.dds_name, "send", message.hex())
+
+    def _say(self, *words: str) -> None:
         assert self.process.stdin is not None
-        durability = "latched" if qos.latched else "volatile"
-        self.process.stdin.write(f"rt{topic} {message_type.dds_name} {durability}\n".encode())
+        self.process.stdin.write(f"{' '.join(words)}\n".encode())
         self.process.stdin.flush()
 
     def end(self) -> None:
@@ -57,6 +70,8 @@ class Peer:
             what, topic, more = line.decode().rstrip("\n").split(" ", 2)
             if what == "W":
                 self.data[topic] = more
+            elif what == "R":
+                self.readers[topic] = more
             else:
                 self.messages[topic].append(out.read(int(more)))
 
@@ -108,6 +123,38 @@ def made(modules: int, count: int) -> list[tuple[str, MessageType, Qos, list[byt
     ]
 
 
+def check_service(peer: Peer, node: DdsNode) -> tuple[list[str], bool]:
+    """Look whether the program finds a service of the node, and call it as rmw_cyclonedds does."""
+    asked: list[bytes] = []
+
+    def answer(request: bytes) -> bytes:
+        asked.append(request)
+        return response(True, "done")
+
+    node.service(SERVICE, types.TRIGGER, answer)
+    request, reply = types.TRIGGER.request, types.TRIGGER.response
+    ask, told = f"rq{SERVICE}Request", f"rr{SERVICE}Reply"
+    peer.listen(told, reply)
+    wait_for(lambda: told in peer.data and ask in peer.readers)
+    is_seen = told in peer.data and peer.readers.get(ask) == request.dds_name
+    lines = [f"service {SERVICE}: {'seen' if is_seen else 'NOT seen'}, its request is {peer.readers.get(ask)}"]
+    identity = bytes(range(16))
+    peer.send(ask, request, ENCAPSULATION + identity + bytes(4))
+    wait_for(lambda: bool(peer.messages[told]))
+    answers = [message[: len(ENCAPSULATION) + 16] for message in peer.messages[told]]
+    is_answered = answers == [ENCAPSULATION + identity] and len(asked) == 1
+    lines.append(
+        f"called with an identity before the request (rmw_cyclonedds): {'answered' if is_answered else 'NOT answered'}"
+    )
+    return lines, is_seen and is_answered
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not condition() and time.monotonic() < until_s:
+        time.sleep(PERIOD_S)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("program", type=Path)
@@ -127,7 +174,7 @@ def main() -> int:
     try:
         publishers = [node.publisher(topic, message_type, qos) for topic, message_type, qos, _ in topics]
         for topic, message_type, qos, _ in topics:
-            peer.listen(topic, message_type, qos)
+            peer.listen(f"rt{topic}", message_type, latched=qos.latched)
         until_s = time.monotonic() + PATIENCE_S
         volatile = [each for each, (_, _, qos, _) in zip(publishers, topics, strict=True) if not qos.latched]
         while not all(each.is_wanted for each in volatile) and time.monotonic() < until_s:
@@ -142,10 +189,11 @@ def main() -> int:
         wanted = sum(len(sent) for *_, sent in topics)
         while sum(map(len, peer.messages.values())) < wanted - refused and time.monotonic() < until_s:
             time.sleep(PERIOD_S)
+        service_lines, is_good = check_service(peer, node)
     finally:
         node.close()
         peer.end()
-    is_good = not refused
+    is_good &= not refused
     print(f"{refused} of {wanted} messages were not taken by the carrier")
     for topic, message_type, _, sent in topics:
         came = peer.messages[f"rt{topic}"]
@@ -157,6 +205,8 @@ def main() -> int:
             f"{message_type.name:32} {len(sent[0]):8} B: {len(sent):3} sent, {len(came):3} came, {equal:3} byte-equal,"
             f" hash {'told' if hash_told else 'NOT told'}   {topic}"
         )
+    for line in service_lines:
+        print(line)
     return 0 if is_good else 1
 
 

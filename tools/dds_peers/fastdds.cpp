@@ -1,18 +1,23 @@
-// A subscriber with Fast DDS, of this machine alone: fastdds DOMAIN, then lines "TOPIC TYPE latched|volatile" on stdin.
+// A participant with Fast DDS, of this machine alone: fastdds DOMAIN, then lines on stdin:
+// "TOPIC TYPE latched|volatile" listens; "TOPIC TYPE send HEX" writes bytes, with their encapsulation, once a reader is matched.
 //
-// On stdout, for each writer that it finds: "W TOPIC USER_DATA", for each message: "M TOPIC SIZE", and SIZE bytes as they
-// came, with their encapsulation. It knows no types: what comes is not looked at. Ends with its stdin.
+// On stdout, for each writer that it finds: "W TOPIC USER_DATA", for each reader: "R TOPIC TYPE", for each message:
+// "M TOPIC SIZE", and SIZE bytes as they came, with their encapsulation. It knows no types. Ends with its stdin.
 
+#include <chrono>
 #include <cstring>
 #include <iostream>
 #include <mutex>
 #include <sstream>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
 #include <fastdds/dds/domain/DomainParticipantListener.hpp>
+#include <fastdds/dds/publisher/DataWriter.hpp>
+#include <fastdds/dds/publisher/Publisher.hpp>
 #include <fastdds/dds/subscriber/DataReader.hpp>
 #include <fastdds/dds/subscriber/DataReaderListener.hpp>
 #include <fastdds/dds/subscriber/SampleInfo.hpp>
@@ -95,7 +100,37 @@ struct Discovering : DomainParticipantListener
             std::cout << "W " << found.info.topicName() << " " << std::string(data.begin(), data.end()) << std::endl;
         }
     }
+
+    void on_subscriber_discovery(DomainParticipant *, ReaderDiscoveryInfo && found) override
+    {
+        if (found.status == ReaderDiscoveryInfo::DISCOVERED_READER) {
+            const std::lock_guard<std::mutex> guard(output);
+            std::cout << "R " << found.info.topicName() << " " << found.info.typeName() << std::endl;
+        }
+    }
 };
+
+static bool send(DomainParticipant * participant, const std::string & topic, const std::string & type, const std::string & digits)
+{
+    DataWriterQos qos;
+    qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
+    qos.endpoint().history_memory_policy = PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
+    auto writer = participant->create_publisher(PUBLISHER_QOS_DEFAULT)->create_datawriter(
+        participant->create_topic(topic, type, TOPIC_QOS_DEFAULT), qos);
+    if (writer == nullptr) {return false;}
+    PublicationMatchedStatus matched;
+    for (int tries = 0; tries < 300; ++tries) {
+        writer->get_publication_matched_status(matched);
+        if (matched.current_count > 0) {break;}
+        std::this_thread::sleep_for(std::chrono::milliseconds(50));
+    }
+    std::this_thread::sleep_for(std::chrono::seconds(1));  // that the reader of the answer is known, too
+    Bytes bytes;
+    for (size_t at = 0; at + 1 < digits.size(); at += 2) {
+        bytes.push_back(static_cast<unsigned char>(std::stoul(digits.substr(at, 2), nullptr, 16)));
+    }
+    return matched.current_count > 0 && writer->write(&bytes);
+}
 
 int main(int count, char ** arguments)
 {
@@ -125,8 +160,13 @@ int main(int count, char ** arguments)
     std::vector<std::unique_ptr<Printing>> printing;
     for (std::string line; std::getline(std::cin, line); ) {
         std::string topic, type, durability;
-        std::istringstream(line) >> topic >> type >> durability;
+        std::string digits;
+        std::istringstream(line) >> topic >> type >> durability >> digits;
         TypeSupport(new AnyType(type)).register_type(participant);
+        if (durability == "send") {
+            if (!send(participant, topic, type, digits)) {std::cerr << "nothing sent to " << topic << std::endl;}
+            continue;
+        }
         DataReaderQos reader;
         reader.reliability().kind = RELIABLE_RELIABILITY_QOS;
         reader.durability().kind = durability == "latched" ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;

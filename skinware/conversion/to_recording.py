@@ -26,7 +26,7 @@ class _Told(NamedTuple):
     """An event, or what the clocks were.
 
     Attributes:
-        time_ns: wall clock.
+        time_ns: on the axis of the recording.
         topic: of which.
         data: as JSON has it.
     """

@@ -47,7 +47,7 @@ class Message(NamedTuple):
     Attributes:
         channel_id: of its channel.
         sequence: of the message.
-        time_ns: when it was published, wall clock.
+        time_ns: when it was published, on the axis that orders the file (``log_time``).
         data: of it.
     """
 
@@ -63,7 +63,7 @@ class ChunkPlace:
 
     Attributes:
         offset: of its record in the file.
-        start_ns, end_ns: times of its first and last message, wall clock.
+        start_ns, end_ns: times of its first and last message.
         size: bytes of its contents.
         compressed_at, compressed_size: where its contents are in the file.
         crc: of its contents.

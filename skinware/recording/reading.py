@@ -42,7 +42,8 @@ class Recording:
     Attributes:
         path: of the file.
         is_whole: it was ended in good order; others are read too, only more slowly (``skin-recover``).
-        start_ns, end_ns: time of its first and last message, wall clock.
+        start_ns, end_ns: time of its first and last message, ns since 1970. All between them is on the axis of
+            CLOCK_MONOTONIC: how the wall clock was set meanwhile is in ``clock``.
 
     Raises:
         BadRecording: it is not a recording, or one of a newer version.
@@ -98,7 +99,7 @@ class Recording:
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """Both clocks of the machine at the same moments, once a second."""
+        """The clocks of the machine at the same moments, once a second: see "Recordings" in the documentation."""
         return list(self._json(CLOCK))
 
     @property

@@ -231,6 +231,8 @@ class _Report:
 
 def _text_of(event: dict[str, Any]) -> str:
     """What happened to the clocks of the machine, for people."""
+    if event["event"] == "unreadable":
+        return f"{event['service']} is not recorded: {event['why']}"
     if "for_ns" in event:
         return f"the machine was suspended for {event['for_ns'] / 1e9:.1f} s: nothing was recorded meanwhile"
     return f"the wall clock was set by {event['by_ns'] / 1e9:+.1f} s: times in the file go on as before"

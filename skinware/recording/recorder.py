@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from mcap.records import Channel, Schema
 
 from skinware.errors import BadRecording
+from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -29,7 +30,7 @@ from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
 from skinware.transfer.codec import CodedColumn, Encoder
-from skinware.transfer.collecting import Collector
+from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
@@ -234,8 +235,9 @@ class _Coder(threading.Thread):
         self.bytes_done = 0
         self.failure: Exception | None = None
         self._target, self._jobs, self._disguise, self._beside = target, jobs, disguise, beside
-        self._streams: dict[str, _Stream | _WireStream] = {}
+        self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
         self._chunk = OpenChunk()
+        self._frames_size = 0  # of the chunk, decoded
         self._heads: set[Head] = set()
         self._abouts = 0
         self._due_ns = 0
@@ -260,7 +262,8 @@ class _Coder(threading.Thread):
         """One job; False: that was the last."""
         if now_ns() >= self._next_clock_ns:
             self._look_around()
-        if not self._chunk.is_empty and (now_ns() >= self._due_ns or self._chunk.size > _CHUNK_BYTES):
+        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
+        if not self._chunk.is_empty and (now_ns() >= self._due_ns or is_large):
             self._close_chunk()
         until_ns = self._next_clock_ns if self._chunk.is_empty else min(self._due_ns, self._next_clock_ns)
         try:
@@ -273,6 +276,7 @@ class _Coder(threading.Thread):
                     case _WireStream() as stream:
                         self._add_wire(stream, frame)
                     case _Stream() as stream:
+                        self._frames_size += len(frame.slot)
                         self._add_frame(stream, service, frame)
                 self.bytes_done += len(frame.slot)
             case _Began(service, head):
@@ -288,6 +292,14 @@ class _Coder(threading.Thread):
 
     def _begin(self, service: str, head: bytes) -> None:
         segment = segments.recorded(head, service)
+        stride = segment.layout.slot_stride
+        if stride > LIMITS.slot_size:
+            why = f"frames of {stride} bytes; at most {LIMITS.slot_size} are recorded"
+            event = {"event": UNREADABLE, "service": service, "time_ns": now_ns(), "why": why}
+            self._streams[service] = None
+            self._add_json(EVENTS, event)
+            self.news.append(event)
+            return
         wires = _wires_of(segment)
         if wires is not None:
             self._begin_wires(service, wires)
@@ -360,7 +372,7 @@ class _Coder(threading.Thread):
         if self._chunk.is_empty:
             return
         chunk, heads = self._chunk.close(), self._heads
-        self._chunk, self._heads = OpenChunk(), set()
+        self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
         self._target.add(chunk, heads)
 
 

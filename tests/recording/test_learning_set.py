@@ -372,8 +372,9 @@ def test_what_is_joined_finds_its_frames_over_a_step_of_the_wall_clock(tmp_path:
     ]
     seconds = [0.25, 1.5]
     stepped = {"time_ns": [0, hour_ns], "monotonic_ns": [0, 0]}[base]
-    times = [int(TIME_BASES[base](each)) + step_ns for each, step_ns in zip(seconds, stepped, strict=True)]
-    np.savez(tmp_path / "joints.npz", **{base: np.array(times), "angle": np.zeros((2, 1))})
+    times = [int(TIME_BASES[base](each)) + later_ns for each, later_ns in zip(seconds, stepped, strict=True)]
+    arrays: dict[str, Any] = {base: np.array(times), "angle": np.zeros((2, 1))}
+    np.savez(tmp_path / "joints.npz", **arrays)
     rows = Joined(Join("action", tmp_path / "joints.npz", ()))
     assert rows.times_ns(source, is_only=True).tolist() == [START_NS + round(each * 1e9) for each in seconds]
 

@@ -49,7 +49,7 @@ class Limits:
     chunk_size: int = 64 << 20
     frames_size: int = 128 << 20
     ratio: int = 1000
-    always_size: int = 256 << 20
+    always_size: int = 1 << 30
     time_ns: int = (1 << 62) - 1
 
     def room(self, size: int) -> int:

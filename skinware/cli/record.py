@@ -22,6 +22,7 @@ from skinware.cli._command import (
     seconds,
     signals_end,
     version_option,
+    warn,
 )
 from skinware.cli._enter_key import is_there, pressed_calls
 
@@ -116,7 +117,8 @@ def command(
     """Record drivers and services NAME..., or all there are and come, with all counters and states.
 
     Frames that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
-    the last 0.3 s is in the file; skin-recover then makes it whole.
+    the last 0.3 s is in the file; skin-recover then makes it whole. If the file is deleted, moved or changed meanwhile,
+    the recording ends within a second, with status 1.
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
@@ -134,15 +136,15 @@ def command(
     beside = Viewers() if for_viewers else None
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, beside=beside)
     report = _Report(recorder, target, path, as_json)
-    failed = True
     keys = pressed_calls(recorder.save) if last_s is not None else contextlib.nullcontext()
     with signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
         report.ready(names, place.name, is_past=last_s is not None)
         try:
             recorder.run(duration_s, report.status)
-            failed = False
-        finally:
-            report.stopped(failed)
+        except BaseException:
+            report.stopped(is_complete=False)
+            raise
+        report.stopped(is_complete=True)
 
 
 def _target(path: Path, split_size: int | None, max_size: int | None, last_s: float | None) -> Target:
@@ -177,6 +179,7 @@ class _Report:
 
     def status(self) -> None:
         """How it goes, once a second."""
+        self._news()
         messages = self._recorder.messages
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
@@ -195,21 +198,44 @@ class _Report:
         for path in self._saved[len(saved) :]:
             click.echo(f"saved {path}")
 
-    def stopped(self, failed: bool) -> None:
-        """It has ended; the files are complete."""
+    def _news(self) -> None:
+        """Report what happened to the clocks of the machine."""
+        for event in self._recorder.news():
+            if self._as_json:
+                with contextlib.suppress(BrokenPipeError):
+                    print_json(event)
+            warn(_text_of(event))
+
+    def stopped(self, *, is_complete: bool) -> None:
+        """Report the end.
+
+        Args:
+            is_complete: all that was taken is in the files; otherwise an error follows.
+        """
+        self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
-                print_json({"event": "stopped", "file": (files or [""])[-1], "files": files, **self._figures(messages)})
+                ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete}
+                print_json({"event": "stopped", **ends, **self._figures(messages)})
             return
         for name, count in messages.items():
             click.echo(f"{name}: {count} messages")
-        lost = f"{self._recorder.lost} frames lost" if self._recorder.lost else "nothing lost"
-        ended = "ended early" if failed else "complete"
-        click.echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB, {lost}")
+        lost = f", {self._recorder.lost} frames lost" if self._recorder.lost else ", nothing lost" * is_complete
+        ended = "complete" if is_complete else "ended early"
+        click.echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{lost}")
 
     def _figures(self, messages: dict[str, int]) -> dict[str, Any]:
         return {"messages": messages, "lost": self._recorder.lost, "bytes": self._target.size}
+
+
+def _text_of(event: dict[str, Any]) -> str:
+    """What happened to the clocks of the machine, for people."""
+    if event["event"] == "unreadable":
+        return f"{event['service']} is not recorded: {event['why']}"
+    if "for_ns" in event:
+        return f"the machine was suspended for {event['for_ns'] / 1e9:.1f} s: nothing was recorded meanwhile"
+    return f"the wall clock was set by {event['by_ns'] / 1e9:+.1f} s: times in the file go on as before"
 
 
 def main() -> None:

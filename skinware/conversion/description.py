@@ -36,7 +36,7 @@ class Description(msgspec.Struct, frozen=True):
     Attributes:
         format: :data:`FORMAT`.
         version: of it.
-        start_ns: when the recording began, wall clock.
+        start_ns: when the recording began, ns since 1970.
         tables: in it.
         events: what happened to services.
         clock: both clocks of the machine at the same moments.

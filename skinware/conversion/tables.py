@@ -31,7 +31,7 @@ OF_FRAMES = {
     "frames/published_ns": np.dtype("<i8"),
     "frames/flags": np.dtype("<u8"),
 }
-"""``time_ns``: when it was published, wall clock (ns since 1970); the others as those of a frame."""
+"""``time_ns``: when it was published, ns since 1970, on the axis of the recording; the others as those of a frame."""
 
 Block = dict[str, npt.NDArray[Any]]
 """m rows of some arrays, by name."""
@@ -41,7 +41,7 @@ class Span(NamedTuple):
     """A part of the time of a recording.
 
     Attributes:
-        begin_ns, end_ns: wall clock; the end is not in it.
+        begin_ns, end_ns: on the axis of the recording; the end is not in it.
     """
 
     begin_ns: int
@@ -147,11 +147,11 @@ class Source(Protocol):
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """What happened to services, each with ``log_time_ns``: wall clock."""
+        """What happened to services, each with ``log_time_ns``, on the axis of the recording."""
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """Both clocks of the machine at the same moments, likewise."""
+        """The clocks of the machine at the same moments, likewise."""
 
     @property
     def problems(self) -> list[str]:

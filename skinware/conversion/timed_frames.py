@@ -18,7 +18,7 @@ class TimedFrame(NamedTuple):
     """A frame of a table.
 
     Attributes:
-        time_ns: when it was published, wall clock.
+        time_ns: when it was published, on the axis of the recording.
         service: whose it is.
         generation: of it.
         frame: it.

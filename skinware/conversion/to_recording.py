@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from skinware.conversion.tables import Source
 from skinware.conversion.timed_frames import TimedFrame, timed_frames
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
 from skinware.recording.files import Head, RecordingFile
 from skinware.recording.mcap_writing import OpenChunk
@@ -26,7 +27,7 @@ class _Told(NamedTuple):
     """An event, or what the clocks were.
 
     Attributes:
-        time_ns: wall clock.
+        time_ns: on the axis of the recording.
         topic: of which.
         data: as JSON has it.
     """
@@ -87,6 +88,7 @@ class _Writer:
         self._channels = Channels()
         self._streams: dict[str, _Stream] = {}
         self._chunk, self._heads, self._begun_ns = OpenChunk(), set[Head](), 0
+        self._frames_size = 0  # of the chunk, decoded
 
     def add_frame(self, timed: TimedFrame) -> None:
         """A frame of a service."""
@@ -97,6 +99,7 @@ class _Writer:
         if not self._chunk.has(channel):
             stream.encoder.next_is_key()
         self._heads.add(stream.head)
+        self._frames_size += len(timed.frame.slot)
         self._chunk.add(channel, schema, timed.frame.sequence, timed.time_ns, stream.encoder.encode(timed.frame))
 
     def add_json(self, told: _Told) -> None:
@@ -106,7 +109,8 @@ class _Writer:
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
-        if self._chunk.size > _CHUNK_BYTES or time_ns >= self._begun_ns + _CHUNK_NS:
+        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
+        if is_large or time_ns >= self._begun_ns + _CHUNK_NS:
             self.close_chunk()
             self._begun_ns = time_ns
 
@@ -114,7 +118,7 @@ class _Writer:
         """End the chunk at hand."""
         if not self._chunk.is_empty:
             self._file.add(self._chunk.close(), self._heads)
-            self._chunk, self._heads = OpenChunk(), set()
+            self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
 
     def _stream(self, service: str, generation: Generation, before: _Stream | None) -> _Stream:
         number = 1 if before is None else before.head.sequence + 1

@@ -19,13 +19,18 @@ ROOT = Path("/dev/shm")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
 
 
+def is_name(name: str) -> bool:
+    """Return whether a service or a namespace can have a name."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(name: str, what: str) -> str:
     """``name`` itself, if it can name a service or a namespace.
 
     Raises:
         ConfigurationError: it cannot; the message says what can.
     """
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise ConfigurationError(
             f"{what} name {name!r}: give 1 to 47 letters, digits, '_' or '-', beginning with a letter or digit"
         )

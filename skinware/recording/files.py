@@ -63,6 +63,13 @@ class Target(Protocol):
             OSError: it cannot be written; all before it is safe.
         """
 
+    def check(self) -> None:
+        """Make sure that the file that is being written is still there, and as it was written.
+
+        Raises:
+            OSError: it is not.
+        """
+
     def save(self) -> None:
         """Write what is only in memory.
 
@@ -143,7 +150,7 @@ class Files:
     @property
     def paths(self) -> list[Path]:
         """The files that are there now."""
-        return [file.path for file in self._all]
+        return [file.path for file in self._all if file.is_there]
 
     @property
     def size(self) -> int:
@@ -174,6 +181,10 @@ class Files:
             if not self._ended:
                 break
             self._ended.popleft().path.unlink(missing_ok=True)
+
+    def check(self) -> None:
+        """See :class:`Target`."""
+        self._file.file.check()
 
     def save(self) -> None:
         """Nothing: all is written."""
@@ -208,8 +219,8 @@ class Past:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that were written."""
-        return [file.path for file in self._saved]
+        """The files that were written, and are still there."""
+        return [file.path for file in self._saved if file.is_there]
 
     @property
     def size(self) -> int:
@@ -236,6 +247,9 @@ class Past:
         self._chunks.append((chunk, tuple(heads)))
         while self._chunks[0][0].end_ns < chunk.end_ns - self._duration_ns:
             self._chunks.popleft()
+
+    def check(self) -> None:
+        """Nothing: no file is being written."""
 
     def save(self) -> None:
         """Write what is kept; it stays in memory too."""

@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Header, Schema, Statistics
 
 from skinware.errors import BadRecording
+from skinware.limits import LIMITS, Limits
 from skinware.recording.mcap_writing import COMPRESSION, MAGIC
 
 _CHUNK = struct.Struct("<BQQQQII4sQ")  # opcode, length, start, end, uncompressed size, CRC, length of "zstd", it, size
@@ -33,8 +34,8 @@ _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, size of the map that follows
 _MESSAGE_INDEX = struct.Struct("<HQ")  # channel, offset
 _FOOTER = struct.Struct("<BQQQI")
-_LARGEST_CHUNK = 1 << 30
-"""Bytes of its contents. What claims more is damaged."""
+_MOST_REFUSED = 10
+"""Chunks that are named."""
 
 
 class Damaged(Exception):
@@ -47,7 +48,7 @@ class Message(NamedTuple):
     Attributes:
         channel_id: of its channel.
         sequence: of the message.
-        time_ns: when it was published, wall clock.
+        time_ns: when it was published, on the axis that orders the file (``log_time``).
         data: of it.
     """
 
@@ -63,7 +64,7 @@ class ChunkPlace:
 
     Attributes:
         offset: of its record in the file.
-        start_ns, end_ns: times of its first and last message, wall clock.
+        start_ns, end_ns: times of its first and last message.
         size: bytes of its contents.
         compressed_at, compressed_size: where its contents are in the file.
         crc: of its contents.
@@ -104,6 +105,7 @@ class McapSource:
 
     Args:
         path: of the file.
+        limits: of what its chunks may become.
 
     Attributes:
         is_whole: it ends with a summary that fits it.
@@ -111,14 +113,15 @@ class McapSource:
             are whole.
         channels: by id.
         damaged: chunks that were found to be damaged.
+        refused: those that claim to become larger than the limits allow, a line each; where they are.
 
     Raises:
         BadRecording: it is no such file.
         OSError: it cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, limits: Limits = LIMITS) -> None:
+        self.path, self._limits = path, limits
         with path.open("rb") as file:
             try:
                 self._map = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ)
@@ -127,11 +130,14 @@ class McapSource:
         self._data = memoryview(self._map)
         self.channels: dict[int, Channel] = {}
         self.damaged: int = 0
+        self.refused: list[str] = []
+        self._room = limits.room(len(self._map))
         self._compressions: set[str] = set()  # of chunks that are not where they should be
         try:
             self.chunks: list[ChunkPlace] = self._told_by_summary()
             self.is_whole: bool = True
         except Damaged:
+            self._room, self.damaged, self.refused = limits.room(len(self._map)), 0, []
             self.chunks, self.is_whole = list(self._whole_ones()), False
         if not self.chunks and self._compressions - {COMPRESSION}:
             self.close()
@@ -163,12 +169,14 @@ class McapSource:
         """
         try:
             compressed = self._data[place.compressed_at : place.end]
+            if zstandard.frame_content_size(compressed) not in (-1, place.size):
+                raise Damaged("its contents are not as large as it says")
             data = zstandard.ZstdDecompressor().decompress(compressed, max_output_size=place.size)
         except (zstandard.ZstdError, MemoryError) as error:
             raise Damaged(f"its contents cannot be decompressed ({error})") from None
         if len(data) != place.size or zlib.crc32(data) != place.crc:  # also 0, "none" in MCAP: ours always have one
             raise Damaged("its contents do not fit their checksum")
-        return _parsed(data)
+        return _parsed(data, self._limits)
 
     def close(self) -> None:
         """Close the file. What was read from it stays. Idempotent."""
@@ -191,14 +199,19 @@ class McapSource:
         if zlib.crc32(self._data[start : end - 4]) != crc:
             raise Damaged("the summary does not fit its checksum")
         places: list[ChunkPlace] = []
-        count = None
+        count, n_found = None, 0
         for kind, record in _records(self._data[start:footer_at]):
             if kind == Opcode.CHUNK_INDEX:
                 start_ns, end_ns, offset, channel_ids = _chunk_index(record)
+                n_found += 1
                 place = self._chunk_at(offset, channel_ids)
                 if place is None:
                     self._compressions.add(_read(ChunkIndex, record).compression)
                     raise Damaged("a chunk is not where the summary says")
+                if max(start_ns, end_ns) > self._limits.time_ns:
+                    raise Damaged("the summary has a time that no clock has")
+                if self._is_refused(place):
+                    continue
                 # times before a chunk have no checksum, those of the summary have
                 places.append(replace(place, start_ns=start_ns, end_ns=end_ns))
             elif kind == Opcode.CHANNEL:
@@ -206,7 +219,7 @@ class McapSource:
                 self.channels[channel.id] = channel
             elif kind == Opcode.STATISTICS:
                 count = _read(Statistics, record).chunk_count
-        if count != len(places):
+        if count != n_found:
             raise Damaged("the summary does not say where all chunks are")
         return places
 
@@ -216,7 +229,7 @@ class McapSource:
         while (signature := self._map.find(_SIGNATURE, at)) >= 0:
             at = signature + 1  # of one that is damaged, the length may be too: others may begin within it
             place = self._chunk_at(signature - _SIGNATURE_AT)
-            if place is None:
+            if place is None or self._is_refused(place):
                 continue
             try:
                 contents = self.contents(place)
@@ -241,10 +254,20 @@ class McapSource:
             or name != COMPRESSION.encode()
             or length != _CHUNK.size - _RECORD.size + compressed_size
             or compressed_at + compressed_size > len(self._data)
-            or size > _LARGEST_CHUNK
         ):
             return None
         return ChunkPlace(offset, start_ns, end_ns, size, compressed_at, compressed_size, crc, channel_ids)
+
+    def _is_refused(self, place: ChunkPlace) -> bool:
+        """Whether a chunk claims to become larger than the limits allow, or all chunks together do."""
+        most = min(self._limits.chunk_size, self._room)
+        if place.size <= most:
+            self._room -= place.size
+            return False
+        self.damaged += 1
+        if len(self.refused) < _MOST_REFUSED:
+            self.refused.append(f"the chunk at byte {place.offset} claims {place.size} bytes; at most {most} are read")
+        return True
 
     def __enter__(self) -> Self:
         return self
@@ -260,13 +283,15 @@ def _as_it_is(place: ChunkPlace, contents: ChunkContents) -> ChunkPlace:
     return replace(place, start_ns=min(times_ns), end_ns=max(times_ns), channel_ids=channels)
 
 
-def _parsed(data: bytes) -> ChunkContents:
+def _parsed(data: bytes, limits: Limits) -> ChunkContents:
     contents = ChunkContents()
     for opcode, record in _records(memoryview(data)):
         if opcode == Opcode.MESSAGE:
             if len(record) < _MESSAGE.size:
                 raise Damaged("a message is shorter than its header")
             channel_id, sequence, time_ns, _ = _MESSAGE.unpack_from(record)
+            if time_ns > limits.time_ns:
+                raise Damaged("a message has a time that no clock has")
             contents.messages.append(Message(channel_id, sequence, time_ns, record[_MESSAGE.size :]))
         elif opcode == Opcode.CHANNEL:
             channel = _read(Channel, record)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -40,6 +42,8 @@ _LEVEL = 1
 _MESSAGE = struct.Struct("<BQHIQQ")
 _LEAST_FREE = 64 << 10
 """Bytes that are left on the disk for what comes last, beside the summary."""
+_SPOOL_BYTES = 64 << 10
+"""Records of the summary that wait in memory; those of 500 chunks, two minutes."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +66,12 @@ class ClosedChunk:
 
     @property
     def start_ns(self) -> int:
-        """Time of its first message, wall clock."""
+        """Time of its first message: see :class:`OpenChunk`."""
         return int(self.index.message_start_time)
 
     @property
     def end_ns(self) -> int:
-        """Time of its last message, wall clock."""
+        """Time of its last message."""
         return int(self.index.message_end_time)
 
 
@@ -85,15 +89,24 @@ class OpenChunk:
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _places: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
-    def add(self, channel: Channel, schema: Schema, sequence: int, time_ns: int, data: bytes | memoryview) -> None:
+    def add(
+        self,
+        channel: Channel,
+        schema: Schema,
+        sequence: int,
+        time_ns: int,
+        data: bytes | memoryview,
+        wall_ns: int | None = None,
+    ) -> None:
         """Add a message.
 
         Args:
             channel: its channel, the same object each time.
             schema: of the channel.
             sequence: of the message.
-            time_ns: when it was published, wall clock.
+            time_ns: when it was published, on the axis that orders the file (MCAP's ``log_time``).
             data: of it.
+            wall_ns: the same moment by the wall clock (MCAP's ``publish_time``); None: the same number.
         """
         if schema.id not in self._schemas:
             self._schemas[schema.id] = schema
@@ -103,7 +116,8 @@ class OpenChunk:
             self._append(_bytes(channel))
         self._places.setdefault(channel.id, []).append((time_ns, self.size))
         length = _MESSAGE.size - 9 + len(data)
-        self._append(_MESSAGE.pack(Opcode.MESSAGE, length, channel.id, sequence & 0xFFFFFFFF, time_ns, time_ns))
+        label_ns = time_ns if wall_ns is None else max(0, wall_ns)
+        self._append(_MESSAGE.pack(Opcode.MESSAGE, length, channel.id, sequence & 0xFFFFFFFF, time_ns, label_ns))
         self._append(data)
 
     def has(self, channel: Channel) -> bool:
@@ -177,40 +191,80 @@ class McapFile:
         self.counts: Counter[int] = Counter()
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        self._index: list[ChunkIndex] = []
+        self._index = _Spool(path.parent)
+        self._chunks = 0
+        self._start_ns, self._end_ns = (1 << 64) - 1, 0
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._is_ours = True
+        info = os.fstat(self._fd)
+        self._inode = info.st_dev, info.st_ino
         self.size: int = 0
         try:
-            self._append(MAGIC + _bytes(Header(profile, f"skinware {version('skinware')}")))
+            self._append([MAGIC, _bytes(Header(profile, f"skinware {version('skinware')}"))])
         except BaseException:
             os.close(self._fd)
             path.unlink()
             raise
 
+    @property
+    def is_there(self) -> bool:
+        """Whether the file is still where it was made."""
+        try:
+            info = os.stat(self.path)
+        except OSError:
+            return False
+        return (info.st_dev, info.st_ino) == self._inode
+
+    def check(self) -> None:
+        """Make sure that the file is as it was written, and where it was made.
+
+        Raises:
+            OSError: it is not; the message says what became of it.
+        """
+        if self._fd < 0:
+            return
+        info = os.fstat(self._fd)
+        if not info.st_nlink:
+            raise OSError(errno.ENOENT, "deleted while it was recorded: what was in it is gone", str(self.path))
+        if info.st_size != self.size:
+            self._is_ours = False  # a summary would not fit it
+            what = f"changed by another program while it was recorded: {info.st_size} bytes instead of {self.size}"
+            raise OSError(errno.EIO, f"{what}; skin-recover saves what is left", str(self.path))
+        if not self.is_there:
+            where = os.readlink(f"/proc/self/fd/{self._fd}")
+            raise OSError(errno.ENOENT, f"moved while it was recorded; all until then is in {where}", str(self.path))
+
     def add(self, chunk: ClosedChunk) -> None:
         """Append a chunk.
 
         Raises:
-            OSError: it cannot be written, in particular because the disk is full: nothing of it is in the file then.
+            OSError: it cannot be written, in particular because the disk is full: nothing of it is in the file then;
+                or :meth:`check` fails.
         """
+        self.check()
         free = os.fstatvfs(self._fd)
         if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * self._summary_size + _LEAST_FREE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
-        begin = self.size
-        self._append(chunk.record)
         index = chunk.index
         moved = ChunkIndex(
             chunk_length=index.chunk_length,
-            chunk_start_offset=begin,
+            chunk_start_offset=self.size,
             compression=index.compression,
             compressed_size=index.compressed_size,
             message_end_time=index.message_end_time,
             message_index_length=index.message_index_length,
-            message_index_offsets={channel: begin + at for channel, at in index.message_index_offsets.items()},
+            message_index_offsets={channel: self.size + at for channel, at in index.message_index_offsets.items()},
             message_start_time=index.message_start_time,
             uncompressed_size=index.uncompressed_size,
         )
-        self._index.append(moved)
+        try:
+            self._index.save()
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
+        self._append([chunk.record])
+        self._index.add(_bytes(moved))
+        self._chunks += 1
+        self._start_ns, self._end_ns = min(self._start_ns, chunk.start_ns), max(self._end_ns, chunk.end_ns)
         self._channels |= chunk.channels
         self._schemas |= chunk.schemas
         self.counts += chunk.counts
@@ -224,57 +278,120 @@ class McapFile:
         if self._fd < 0:
             return
         try:
-            self._append(_bytes(DataEnd(0)) + self._summary(self.size + len(_bytes(DataEnd(0)))))
+            if self._is_ours:
+                end = _bytes(DataEnd(0))
+                self._append([end, *self._summary(self.size + len(end))])
         finally:
+            self._index.close()
             fd, self._fd = self._fd, -1
-            os.close(fd)
+            try:
+                os.close(fd)
+            except OSError as error:  # file systems of other machines say late that there is no room
+                raise OSError(error.errno, error.strerror, str(self.path)) from None
 
     @property
     def _summary_size(self) -> int:
-        return 2048 + sum(80 + 10 * len(index.message_index_offsets) for index in self._index[-1:]) * len(self._index)
+        return 2048 + self._index.size
 
-    def _summary(self, start: int) -> bytes:
+    def _summary(self, start: int) -> Iterator[bytes]:
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self.counts),
-            chunk_count=len(self._index),
+            chunk_count=self._chunks,
             message_count=self.counts.total(),
-            message_end_time=max((index.message_end_time for index in self._index), default=0),
-            message_start_time=min((index.message_start_time for index in self._index), default=0),
+            message_end_time=self._end_ns,
+            message_start_time=min(self._start_ns, self._end_ns),
             metadata_count=0,
             schema_count=len(self._schemas),
         )
-        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas.values()),
-            (Opcode.CHANNEL, self._channels.values()),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._index),
+        groups: list[tuple[Opcode, Iterable[bytes]]] = [
+            (Opcode.SCHEMA, map(_bytes, self._schemas.values())),
+            (Opcode.CHANNEL, map(_bytes, self._channels.values())),
+            (Opcode.STATISTICS, [_bytes(statistics)]),
+            (Opcode.CHUNK_INDEX, self._index.parts()),
         ]
-        summary, offsets = bytearray(), bytearray()
-        for opcode, records in groups:
-            begin = len(summary)
-            for record in records:
-                summary += _bytes(record)
-            if len(summary) > begin:
-                offsets += _bytes(SummaryOffset(opcode, start + begin, len(summary) - begin))
-        offsets_start = start + len(summary)
-        summary += offsets
-        footer = _bytes(Footer(start, offsets_start, 0))
-        crc = zlib.crc32(bytes(summary) + footer[:-4])
-        return bytes(summary) + _bytes(Footer(start, offsets_start, crc)) + MAGIC
+        at, crc, offsets = start, 0, b""
+        for opcode, parts in groups:
+            begin = at
+            for part in parts:
+                at, crc = at + len(part), zlib.crc32(part, crc)
+                yield part
+            if at > begin:
+                offsets += _bytes(SummaryOffset(opcode, begin, at - begin))
+        footer = _bytes(Footer(start, at, 0))
+        yield offsets
+        yield _bytes(Footer(start, at, zlib.crc32(offsets + footer[:-4], crc)))
+        yield MAGIC
 
-    def _append(self, data: bytes) -> None:
+    def _append(self, parts: Iterable[bytes]) -> None:
         """All of it, or nothing."""
-        rest = memoryview(data)
+        size = self.size
         try:
-            while rest:
-                rest = rest[os.write(self._fd, rest) :]
+            for part in parts:
+                rest = memoryview(part)
+                while rest:
+                    rest = rest[os.write(self._fd, rest) :]
+                size += len(part)
         except OSError as error:
             os.ftruncate(self._fd, self.size)
             os.lseek(self._fd, self.size, os.SEEK_SET)
             raise OSError(error.errno, error.strerror, str(self.path)) from None
-        self.size += len(data)
+        self.size = size
+
+
+class _Spool:
+    """Records of a summary, which wait in a file without a name beside the one that they are for, not in memory.
+
+    Args:
+        folder: of the file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file: BinaryIO | None = None
+        self._waiting = bytearray()
+        self._saved = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes in it."""
+        return self._saved + len(self._waiting)
+
+    def add(self, record: bytes) -> None:
+        """Add a record."""
+        self._waiting += record
+
+    def save(self) -> None:
+        """Write what waits, if it is much.
+
+        Raises:
+            OSError: it cannot be written; it waits on.
+        """
+        if len(self._waiting) < _SPOOL_BYTES:
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(buffering=0, dir=self._folder)  # noqa: SIM115
+        self._file.seek(self._saved)
+        rest = memoryview(self._waiting)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        self._saved += len(self._waiting)
+        self._waiting = bytearray()
+
+    def parts(self) -> Iterator[bytes]:
+        """All records, in pieces."""
+        if self._file is not None:
+            self._file.seek(0)
+            for begin in range(0, self._saved, _SPOOL_BYTES):
+                yield self._file.read(min(_SPOOL_BYTES, self._saved - begin))
+        yield bytes(self._waiting)
+
+    def close(self) -> None:
+        """Let go of them. Idempotent."""
+        if self._file is not None:
+            self._file.close()
+        self._file, self._waiting, self._saved = None, bytearray(), 0
 
 
 def _bytes(record: McapRecord) -> bytes:

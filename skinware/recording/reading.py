@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
+
+import msgspec
 
 from skinware.errors import BadRecording, ConfigurationError
+from skinware.limits import LIMITS, read_json
+from skinware.memory.namespace import is_name
 from skinware.realtime import NS_PER_S
-from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource
+from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, McapSource, Message
 from skinware.recording.timeline import GONE, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
@@ -31,6 +34,47 @@ class _Service:
     generations: dict[int, Generation] = field(default_factory=dict)
 
 
+_Int = Annotated[int, msgspec.Meta(ge=-LIMITS.time_ns, le=LIMITS.time_ns)]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=LIMITS.time_ns)]
+
+
+class _Event(msgspec.Struct):
+    """What must be so of an event, if it has it."""
+
+    event: str = ""
+    service: str = ""
+    time_ns: _Int = 0
+    count: _Count = 0
+    before: Annotated[int, msgspec.Meta(ge=0)] = 0
+    why: str = ""
+
+
+class _Clock(msgspec.Struct):
+    """What must be so of a reading of the clocks."""
+
+    monotonic_ns: _Int = 0
+    realtime_ns: _Int = 0
+    boottime_ns: _Int = 0
+    boot: str = ""
+
+
+class _AboutBus(msgspec.Struct):
+    medium: str = ""
+    options: dict[str, Any] = {}
+
+
+class _About(msgspec.Struct):
+    """What must be so of what a driver says of itself."""
+
+    driver_type: str = ""
+    listen_only: bool = False
+    versions: dict[str, Any] = {}
+    buses: dict[str, _AboutBus] = {}
+
+
+_FORMS: dict[str, type] = {EVENTS: _Event, CLOCK: _Clock}
+
+
 class Recording:
     """A recording. Not for several threads at once.
 
@@ -42,7 +86,8 @@ class Recording:
     Attributes:
         path: of the file.
         is_whole: it was ended in good order; others are read too, only more slowly (``skin-recover``).
-        start_ns, end_ns: time of its first and last message, wall clock.
+        start_ns, end_ns: time of its first and last message, ns since 1970. All between them is on the axis of
+            CLOCK_MONOTONIC: how the wall clock was set meanwhile is in ``clock``.
 
     Raises:
         BadRecording: it is not a recording, or one of a newer version.
@@ -60,6 +105,7 @@ class Recording:
         self._abouts: dict[str, int] = {}
         self._problems: dict[str, None] = {}
         self._damaged: set[int] = set()
+        self._unread: set[str] = set()
         try:
             self._services = self._find_services()
         except BaseException:
@@ -82,6 +128,11 @@ class Recording:
         return tuple(self._wires[key] for key in sorted(self._wires))
 
     @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._source.size
+
+    @property
     def recorded_by(self) -> str:
         """Program and version that wrote the file, as it says: ``skinware 0.1.0``; empty where that is damaged."""
         return self._source.library
@@ -98,20 +149,20 @@ class Recording:
 
     @property
     def clock(self) -> list[dict[str, Any]]:
-        """Both clocks of the machine at the same moments, once a second."""
+        """The clocks of the machine at the same moments, once a second: see "Recordings" in the documentation."""
         return list(self._json(CLOCK))
 
     @property
     def lost(self) -> int:
         """Frames that were published meanwhile, and could not be recorded."""
-        return sum(int(event.get("count", 0)) for event in self._json(EVENTS) if event.get("event") == "lost")
+        return sum(event.get("count", 0) for event in self._json(EVENTS) if event.get("event") == "lost")
 
     @property
     def problems(self) -> list[str]:
         """What was found to be wrong with the file so far; all of it after all of it was read."""
         damaged = self._source.damaged + len(self._damaged)
         told = [f"{damaged} chunk{'s' * (damaged > 1)} damaged and left out"] if damaged else []
-        return [*told, *self._problems]
+        return [*told, *self._source.refused, *self._problems]
 
     def __getitem__(self, name: str) -> Track:
         """What was recorded of a service.
@@ -232,7 +283,7 @@ class Recording:
             if message.channel_id in channels:
                 next_s[channels[message.channel_id]] = time_s
             elif message.channel_id == self._topics.get(EVENTS):
-                event = _event(message.data)
+                event = self._told(EVENTS, message) or {}
                 name, what = str(event.get("service")), str(event.get("event"))
                 if name in services and what in (PAUSED, LIVE, *GONE):
                     next_s[name] = min(time_s, next_s.get(name, time_s))
@@ -262,13 +313,15 @@ class Recording:
             if wire is not None:
                 self._wires[wire] = WireTrack(self, *wire, channel.id)
             found = service_of(channel)
-            if found is not None:
+            if found is not None and not is_name(found[0]):
+                self.note(f"a service {found[0][:48]!r} left out: no service can have this name")
+            elif found is not None:
                 service = services.setdefault(found[0], _Service())
                 if found[1] == FRAME:
                     service.frame_channel = channel.id
                 elif found[1] == GENERATION:
                     service.head_channel = channel.id
-        if self._source.channels and not services and CLOCK not in self._topics:
+        if self._source.channels and not services and not self._problems and CLOCK not in self._topics:
             raise BadRecording(f"{self.path}: an MCAP file, but not a recording of a skin")
         self._read_heads(services)
         return {name: service for name, service in services.items() if service.frame_channel}
@@ -295,20 +348,34 @@ class Recording:
         Args:
             driver: its name.
         """
-        told: dict[str, Any] = {}
+        about: dict[str, Any] = {}
         channel = self._abouts.get(driver)
         for contents in self.chunks({channel} if channel is not None else ()):
             for message in contents.messages:
                 if message.channel_id == channel:
-                    told = _event(message.data)
-        return told
+                    about = self._told(f"/wire/{driver}", message) or about
+        return about
 
     def _json(self, topic: str) -> Iterator[dict[str, Any]]:
         channel = self._topics.get(topic, 0)
         for contents in self.chunks({channel}):
             for message in contents.messages:
-                if message.channel_id == channel:
-                    yield {**_event(message.data), "time_s": self.time_s(message.time_ns)}
+                told = self._told(topic, message) if message.channel_id == channel else None
+                if told is not None:
+                    yield {**told, "time_s": self.time_s(message.time_ns)}
+
+    def _told(self, topic: str, message: Message) -> dict[str, Any] | None:
+        """What a message in JSON has; None if it cannot be read."""
+        try:
+            told = read_json(message.data, dict[str, Any])
+            msgspec.convert(told, _FORMS.get(topic, _About))
+        except ValueError as error:
+            if topic not in self._unread:
+                self._unread.add(topic)
+                where = f"the first at {self.time_s(message.time_ns):.3f} s"
+                self.note(f"{topic}: unreadable messages left out, {where} ({error})")
+            return None
+        return told
 
     def __enter__(self) -> Self:
         return self
@@ -326,11 +393,3 @@ def _layout(newest: dict[str, RecordedDriverFrame], before: SkinLayout) -> SkinL
     structures = tuple(newest[name].structure for name in drivers)
     same = drivers == before.drivers and all(a is b for a, b in zip(structures, before.structures, strict=True))
     return before if same else SkinLayout(drivers, structures)
-
-
-def _event(data: memoryview) -> dict[str, Any]:
-    try:
-        event = json.loads(bytes(data))
-    except ValueError:
-        return {}
-    return event if isinstance(event, dict) else {}

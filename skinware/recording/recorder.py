@@ -11,33 +11,37 @@ import json
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from mcap.records import Schema
+from mcap.records import Channel, Schema
 
 from skinware.errors import BadRecording
+from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
+from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Head, Target
 from skinware.recording.mcap_writing import OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire_tracks import message_of
 from skinware.transfer.codec import CodedColumn, Encoder
-from skinware.transfer.collecting import Collector
+from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
 """A chunk is closed so long after its first message: that much is lost with a killed recorder."""
 _CHUNK_BYTES = 8 << 20
-_CLOCK_NS = NS_PER_S
+_CLOCK_NS = _TELL_NS = NS_PER_S
 _MOST_WAITING = 128 << 20
 """Bytes of frames that wait to be written."""
 _LONGEST_REST_NS = 10_000_000
+_MOST_NEWS = 100
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Beside(Protocol):
             service: whose frame.
             generation: of it.
             frame: it.
-            time_ns: when it was published, wall clock.
+            time_ns: when it was published, ns since 1970, on the axis of the recording.
         """
 
 
@@ -91,6 +95,7 @@ class Recorder:
         with_wires: record also what goes over the wires of the drivers.
         disguise: gives what is written in the place of names of buses and of texts of options; None: they are.
         beside: makes messages that are recorded beside frames.
+        clocks: reads the clocks of the machine.
     """
 
     def __init__(
@@ -102,11 +107,12 @@ class Recorder:
         with_wires: bool = False,
         disguise: Callable[[str], str] | None = None,
         beside: Beside | None = None,
+        clocks: Callable[[], Clocks] = read_clocks,
     ) -> None:
         self._target = target
         self._jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End] = queue.SimpleQueue()
         self._bytes_given = 0
-        self._coder = _Coder(target, self._jobs, disguise, beside)
+        self._coder = _Coder(target, self._jobs, disguise, beside, TimeAxis(clocks))
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # what comes later is recorded from its first frame on
         self._stopping = False
@@ -127,6 +133,11 @@ class Recorder:
         names = self._coder.channels.names()
         return {names[channel]: count for channel, count in sorted(self._target.counts.items())}
 
+    def news(self) -> list[dict[str, Any]]:
+        """Return the events of the machine since the last call: suspended, or its wall clock was set."""
+        news = self._coder.news
+        return [news.popleft() for _ in range(len(news))]
+
     def run(self, duration_s: float | None = None, tell: Callable[[], object] = lambda: None) -> None:
         """Record until ``stop``, until the time is over, or until the target is full.
 
@@ -135,10 +146,11 @@ class Recorder:
             tell: called once a second.
 
         Raises:
-            OSError: the recording cannot be written any more. What was written is complete.
+            OSError: the recording cannot be written any more, or its file was deleted, replaced, moved or changed. What
+                was written is complete.
         """
         end_ns = None if duration_s is None else now_ns() + round(duration_s * NS_PER_S)
-        tell_ns = now_ns() + NS_PER_S
+        tell_ns = now_ns() + _TELL_NS
         self._coder.start()
         try:
             with short_turns():
@@ -146,7 +158,7 @@ class Recorder:
                     if end_ns is not None and now_ns() >= end_ns:
                         break
                     if now_ns() >= tell_ns:
-                        tell_ns = max(tell_ns + NS_PER_S, now_ns())
+                        tell_ns = max(tell_ns + _TELL_NS, now_ns())
                         tell()
                     taken = self._bytes_waiting < _MOST_WAITING and self._collector.take()
                     if taken:  # those that come soon are taken together
@@ -216,19 +228,22 @@ class _Coder(threading.Thread):
         jobs: queue.SimpleQueue[_Began | _Took | _Happened | _Save | _End],
         disguise: Callable[[str], str] | None,
         beside: Beside | None,
+        axis: TimeAxis,
     ) -> None:
         super().__init__(name="skinware recorder")
         self.channels = Channels()
         self.bytes_done = 0
         self.failure: Exception | None = None
         self._target, self._jobs, self._disguise, self._beside = target, jobs, disguise, beside
-        self._streams: dict[str, _Stream | _WireStream] = {}
+        self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
         self._chunk = OpenChunk()
+        self._frames_size = 0  # of the chunk, decoded
         self._heads: set[Head] = set()
         self._abouts = 0
         self._due_ns = 0
         self._next_clock_ns = now_ns()
-        self._offset_ns = 0
+        self._axis = axis
+        self.news: deque[dict[str, Any]] = deque(maxlen=_MOST_NEWS)
 
     def run(self) -> None:
         """Until there is nothing more to do, or nothing can be done."""
@@ -246,8 +261,9 @@ class _Coder(threading.Thread):
     def _work(self) -> bool:
         """One job; False: that was the last."""
         if now_ns() >= self._next_clock_ns:
-            self._tell_time()
-        if not self._chunk.is_empty and (now_ns() >= self._due_ns or self._chunk.size > _CHUNK_BYTES):
+            self._look_around()
+        is_large = self._chunk.size > _CHUNK_BYTES or self._frames_size > LIMITS.frames_size // 2
+        if not self._chunk.is_empty and (now_ns() >= self._due_ns or is_large):
             self._close_chunk()
         until_ns = self._next_clock_ns if self._chunk.is_empty else min(self._due_ns, self._next_clock_ns)
         try:
@@ -260,6 +276,7 @@ class _Coder(threading.Thread):
                     case _WireStream() as stream:
                         self._add_wire(stream, frame)
                     case _Stream() as stream:
+                        self._frames_size += len(frame.slot)
                         self._add_frame(stream, service, frame)
                 self.bytes_done += len(frame.slot)
             case _Began(service, head):
@@ -275,6 +292,14 @@ class _Coder(threading.Thread):
 
     def _begin(self, service: str, head: bytes) -> None:
         segment = segments.recorded(head, service)
+        stride = segment.layout.slot_stride
+        if stride > LIMITS.slot_size:
+            why = f"frames of {stride} bytes; at most {LIMITS.slot_size} are recorded"
+            event = {"event": UNREADABLE, "service": service, "time_ns": now_ns(), "why": why}
+            self._streams[service] = None
+            self._add_json(EVENTS, event)
+            self.news.append(event)
+            return
         wires = _wires_of(segment)
         if wires is not None:
             self._begin_wires(service, wires)
@@ -310,39 +335,44 @@ class _Coder(threading.Thread):
         if not self._chunk.has(channel):
             stream.encoder.next_is_key()
         self._heads.add(stream.head)
-        time_ns = frame.published_ns + self._offset_ns
-        self._add(channel, schema, frame.sequence, time_ns, stream.encoder.encode(frame))
+        self._add(channel, schema, frame.sequence, frame.published_ns, stream.encoder.encode(frame))
         if self._beside is not None and stream.generation is not None:
+            time_ns = self._axis.log_ns(frame.published_ns)
             for topic, encoding, known, data in self._beside.messages(service, stream.generation, frame, time_ns):
-                self._add(*self.channels.of(topic, encoding, known), frame.sequence, time_ns, data)
+                self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
 
     def _add_wire(self, stream: _WireStream, frame: Frame) -> None:
         bus = int(frame.column("bus")[()])
         if bus >= len(stream.buses):
             return
         channel, schema = self.channels.of_wire(stream.driver, stream.buses[bus])
-        self._add(channel, schema, frame.sequence, frame.published_ns + self._offset_ns, message_of(frame))
+        self._add(channel, schema, frame.sequence, frame.published_ns, message_of(frame))
 
-    def _add_json(self, topic: str, data: dict[str, Any]) -> None:
+    def _add_json(self, topic: str, data: dict[str, Any], monotonic_ns: int | None = None) -> None:
         channel, schema = self.channels.of_all(topic)
-        self._add(channel, schema, 0, now_ns() + self._offset_ns, json.dumps(data).encode())
+        self._add(channel, schema, 0, now_ns() if monotonic_ns is None else monotonic_ns, json.dumps(data).encode())
 
-    def _add(self, channel: Any, schema: Any, sequence: int, time_ns: int, data: bytes) -> None:
+    def _add(self, channel: Channel, schema: Schema, sequence: int, monotonic_ns: int, data: bytes) -> None:
         if self._chunk.is_empty:
             self._due_ns = now_ns() + _CHUNK_NS
-        self._chunk.add(channel, schema, sequence, time_ns, data)
+        axis = self._axis
+        self._chunk.add(channel, schema, sequence, axis.log_ns(monotonic_ns), data, axis.wall_ns(monotonic_ns))
 
-    def _tell_time(self) -> None:
+    def _look_around(self) -> None:
+        """Once a second: record what the clocks are, and make sure that the target is still there."""
         self._next_clock_ns = now_ns() + _CLOCK_NS
-        monotonic_ns, realtime_ns = now_ns(), time.time_ns()
-        self._offset_ns = realtime_ns - monotonic_ns
-        self._add_json(CLOCK, {"monotonic_ns": monotonic_ns, "realtime_ns": realtime_ns, "boot": boot()})
+        for event in self._axis.look():
+            self.news.append(event)
+            self._add_json(EVENTS, event, event["time_ns"])
+        clocks = self._axis.clocks
+        self._add_json(CLOCK, {**clocks._asdict(), "boot": boot()}, clocks.monotonic_ns)
+        self._target.check()
 
     def _close_chunk(self) -> None:
         if self._chunk.is_empty:
             return
         chunk, heads = self._chunk.close(), self._heads
-        self._chunk, self._heads = OpenChunk(), set()
+        self._chunk, self._heads, self._frames_size = OpenChunk(), set(), 0
         self._target.add(chunk, heads)
 
 

@@ -9,6 +9,8 @@ from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+from skinware.errors import BadRecording
+from skinware.limits import LIMITS
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.recording.reading import Recording
@@ -45,6 +47,10 @@ class Replayer:
 
     Attributes:
         late: frames that were published more than 10 ms after their time.
+
+    Raises:
+        BadRecording: its services need more shared memory than the limits allow.
+        ConfigurationError: nothing was recorded of one of them.
     """
 
     def __init__(
@@ -62,6 +68,7 @@ class Replayer:
         keeps_times: bool = False,
     ) -> None:
         self._recording = recording
+        _check_rings(recording, recording.services if names is None else names)
         self._ahead = ThreadPoolExecutor(1, "skinware replay")
         self._timeline = recording.timeline(names, ahead=self._ahead)
         self._first_s = self._timeline.first_s()
@@ -326,6 +333,16 @@ class Replayer:
             for moment in moments:
                 self._apply(moment._replace(time_s=self._reached_s))
             self._jumped.add(name)
+
+
+def _check_rings(recording: Recording, names: Collection[str]) -> None:
+    whole = 0
+    for name in names:
+        ring = max((generation.ring_size for generation in recording[name].generations), default=0)
+        whole += ring
+        if ring > LIMITS.ring_size or whole > LIMITS.robot_size:
+            most = f"{LIMITS.ring_size} bytes, and {LIMITS.robot_size} of all services together"
+            raise BadRecording(f"{recording.path}: {name!r} needs a ring of {ring} bytes; at most {most} are published")
 
 
 def _number(value: Any, name: str) -> float:

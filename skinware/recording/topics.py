@@ -19,19 +19,22 @@ WIRE_ENCODING = "skinware-wire/1"
 _EVENT = {
     "type": "object",
     "properties": {
-        "event": {"type": "string", "description": "found, live, paused, closed, dead, restarted, lost, unreadable"},
+        "event": {"type": "string", "description": "found, live, ... see Recordings in the documentation"},
         "service": {"type": "string"},
         "time_ns": {"type": "integer", "description": "CLOCK_MONOTONIC"},
         "count": {"type": "integer", "description": "of lost: how many frames"},
         "before": {"type": "integer", "description": "of lost: sequence of the frame after them"},
         "why": {"type": "string", "description": "of unreadable"},
+        "for_ns": {"type": "integer", "description": "of suspended: how long the machine was"},
+        "by_ns": {"type": "integer", "description": "of clock_stepped: by how much the wall clock was set"},
     },
 }
 _CLOCK = {
     "type": "object",
     "properties": {
         "monotonic_ns": {"type": "integer", "description": "CLOCK_MONOTONIC, the time of frames"},
-        "realtime_ns": {"type": "integer", "description": "CLOCK_REALTIME at the same moment, the time of messages"},
+        "realtime_ns": {"type": "integer", "description": "CLOCK_REALTIME at the same moment"},
+        "boottime_ns": {"type": "integer", "description": "CLOCK_BOOTTIME, likewise: monotonic_ns and suspended time"},
         "boot": {"type": "string", "description": "which start of the machine the first one counts from"},
     },
 }

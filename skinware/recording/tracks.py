@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from skinware._columns import as_index
 from skinware.errors import BadRecording, StructureError
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import ChunkContents
 from skinware.recording.series import Series
@@ -27,6 +28,10 @@ class ChunkSource(Protocol):
 
     path: Path
     start_ns: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
 
     def chunks(
         self, channels: Collection[int], start_s: float = 0.0, end_s: float | None = None
@@ -140,9 +145,17 @@ class Track:
             StructureError: the columns or tables changed in between: read the ``parts`` one by one; or there are no
                 such sensors.
             KeyError: no such column.
+            BadRecording: a small file becomes more than the limits allow (:meth:`skinware.limits.Limits.room`).
         """
         asked = self._asked(columns, type_name, sensors)
-        return Series.joined([_nothing(asked), *self._blocks(asked, start_s, end_s)])
+        parts, room = [_nothing(asked)], LIMITS.room(self._recording.size)
+        for part in self._blocks(asked, start_s, end_s):
+            room -= sum(column.nbytes for column in part.columns.values())
+            if room < 0:
+                what = f"{self.name!r} becomes more than {LIMITS.room(self._recording.size)} bytes"
+                raise BadRecording(f"{self._recording.path}: {what}: read fewer columns, a shorter time, or its blocks")
+            parts.append(part)
+        return Series.joined(parts)
 
     def blocks(
         self,
@@ -209,11 +222,17 @@ class Track:
     def _decodable(self, contents: ChunkContents) -> Iterator[_PartOfChunk]:
         """The frames of this service in a chunk, as far as their generation is known."""
         messages = [message for message in contents.messages if message.channel_id == self.channel]
+        left = LIMITS.frames_size
         for number, which in runs([message.data for message in messages]):
             generation = self._generations.get(number)
             if generation is None:
                 if number not in self._told:
                     self._recording.note(f"frames of {self.name!r} left out: what they are made of is lost")
+                continue
+            left -= generation.slot_stride * (which.stop - which.start)
+            if left < 0:
+                what = f"frames that become more than {LIMITS.frames_size} bytes in one chunk"
+                self._recording.note(f"{self.name}: {what} left out")
                 continue
             try:
                 run = Run([message.data for message in messages[which]], generation.coded)

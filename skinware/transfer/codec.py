@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BadRecording
+from skinware.limits import LIMITS
 from skinware.memory.file_layout import SLOT, Column
 from skinware.memory.ring import Frame
 
@@ -187,6 +188,9 @@ class Run:
             raise BadRecording("a frame is shorter than its header")
         starts = np.frombuffer(b"".join([message[: fixed.itemsize] for message in messages]), fixed)
         self.headers: npt.NDArray[np.void] = starts["header"].copy()
+        for name in ("acquired_ns", "published_ns"):
+            if (self.headers[name] > LIMITS.time_ns).any() or (self.headers[name] < -LIMITS.time_ns).any():
+                raise BadRecording("a frame has a time that no clock has")
         self._codes = starts["codes"]
         self._sizes = starts["sizes"].astype(np.int64)
         self._ends = fixed.itemsize + np.cumsum(self._sizes, axis=1)

@@ -19,6 +19,8 @@ _DISCOVERY_NS = NS_PER_S // 50
 """Between two looks for new services: of a ring of 8 slots at 100 Hz nothing is lost meanwhile."""
 PAUSED, LIVE, CLOSED, DEAD = "paused", "live", "closed", "dead"
 """How a service can be said to be."""
+UNREADABLE = "unreadable"
+"""Event of a service that cannot be recorded."""
 _LIFE_NS = NS_PER_S // 5
 """Between two looks at who lives."""
 _MOST_AT_ONCE = 64
@@ -272,4 +274,4 @@ class Collector:
         """That a service cannot be read, once."""
         if self._trouble.get(name) != text:
             self._trouble[name] = text
-            self._tell("unreadable", name, why=text)
+            self._tell(UNREADABLE, name, why=text)

@@ -11,11 +11,14 @@ import numpy.typing as npt
 
 from skinware import driver_service
 from skinware.errors import BadRecording, BadServiceFile, StructureError
+from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.schema import STATIC_NAME, Schema
 from skinware.structure import OF_GROUPS, Index, Structure
 from skinware.transfer.codec import CodedColumn
 
+_SHORTEST_NS = 10_000
+"""Period of a service; see :func:`skinware.realtime.period_ns`."""
 PER_SENSOR = ("values", "status")
 """Columns of a driver that have a number for each sensor."""
 
@@ -34,16 +37,24 @@ class Generation:
         context: what its frames carry: the structure of a driver; None of other services.
 
     Raises:
-        BadRecording: the head cannot be read.
+        BadRecording: the head cannot be read, or asks for more than :data:`skinware.limits.LIMITS` allow.
     """
 
     def __init__(self, head: bytes, name: str) -> None:
         self.head, self.name = head, name
+        if len(head) > LIMITS.head_size:
+            raise BadRecording(f"service {name!r}: tables of {len(head)} bytes; at most {LIMITS.head_size} are read")
         try:
             self._segment = segments.recorded(head, f"service {name!r}")
             self.context: object = driver_service.structure_of(self._segment) if self.is_driver else None
         except BadServiceFile as error:
             raise BadRecording(str(error).removesuffix("; not attached")) from None
+        if self.slot_stride > LIMITS.slot_size:
+            raise BadRecording(
+                f"service {name!r}: frames of {self.slot_stride} bytes; at most {LIMITS.slot_size} are read"
+            )
+        if self.period_ns and not _SHORTEST_NS <= self.period_ns <= LIMITS.time_ns:
+            raise BadRecording(f"service {name!r}: a period of {self.period_ns} ns, which no writer has")
         self.coded: tuple[CodedColumn, ...] = tuple(CodedColumn.of(column) for column in self._segment.layout.slot)
         self._columns = self._segment.slot_formats()
 
@@ -118,6 +129,11 @@ class Generation:
     def slot_stride(self) -> int:
         """Bytes of a slot."""
         return self._segment.layout.slot_stride
+
+    @property
+    def ring_size(self) -> int:
+        """Bytes of the slots of its ring."""
+        return self.slot_count * self.slot_stride
 
     @property
     def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:

@@ -135,7 +135,7 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
             "the wall clock was set, or the machine slept",
             f"{recording.name} at {age_text(jump.time_s * 1e9)}",
             f"by {jump.by_s:+.2f} s",
-            "times of data are of another clock and are right; the times of the file's messages jump there",
+            "times of data and of the file are of another clock and go on as before; only publish_time jumps there",
             see="explanation/time.md",
         )
     if recording.boots > 1:

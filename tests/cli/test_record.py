@@ -64,6 +64,20 @@ def test_a_recording_of_nothing_is_whole_too(tmp_path: Path) -> None:
         assert opened.services == ()
 
 
+def test_a_deleted_file_is_said_at_once(tmp_path: Path, namespace: Namespace) -> None:
+    del namespace
+    file = tmp_path / "skin.mcap"
+    with publishing(FakeSkin("torso")), running("skin-record", "-o", str(file)) as recorder:
+        recorder.wait_for("status", lambda status: status["messages"].get("/skin/torso/frame", 0) > 5)
+        file.unlink()
+        stopped = recorder.wait_for("stopped")
+        assert recorder.process.wait(PATIENCE_S) == 1
+        recorder.stop()
+        assert recorder.errors == f"skin-record: {file}: deleted while it was recorded: what was in it is gone\n"
+    assert (stopped["is_complete"], stopped["files"], stopped["file"]) == (False, [], "")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with publishing(FakeSkin("torso")):

@@ -32,7 +32,7 @@ from skinware.conversion.learning import (
     read_intervals,
     statistics,
 )
-from skinware.conversion.learning.joined import matched
+from skinware.conversion.learning.joined import Joined, matched
 from skinware.conversion.learning.statistics import Moments, Statistics
 from skinware.conversion.tables import Table
 from skinware.conversion.to_recording import write_recording
@@ -360,6 +360,23 @@ def test_images_and_rows_at_their_times(made: Made, tmp_path: Path) -> None:
 
 
 # -- what is wrong ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", ["time_ns", "monotonic_ns"])
+def test_what_is_joined_finds_its_frames_over_a_step_of_the_wall_clock(tmp_path: Path, base: str) -> None:
+    hour_ns = 3600 * 10**9
+    source = MadeSource([])
+    source.clock = [
+        {"monotonic_ns": MONOTONIC_NS + ns, "realtime_ns": START_NS + ns + step_ns, "log_time_ns": START_NS + ns}
+        for ns, step_ns in ((0, 0), (10**9, hour_ns), (2 * 10**9, hour_ns))
+    ]
+    seconds = [0.25, 1.5]
+    stepped = {"time_ns": [0, hour_ns], "monotonic_ns": [0, 0]}[base]
+    times = [int(TIME_BASES[base](each)) + later_ns for each, later_ns in zip(seconds, stepped, strict=True)]
+    arrays: dict[str, Any] = {base: np.array(times), "angle": np.zeros((2, 1))}
+    np.savez(tmp_path / "joints.npz", **arrays)
+    rows = Joined(Join("action", tmp_path / "joints.npz", ()))
+    assert rows.times_ns(source, is_only=True).tolist() == [START_NS + round(each * 1e9) for each in seconds]
 
 
 def joined(tmp_path: Path, text: str, name: str = "joints.csv", feature: str = "action") -> LearningSet:

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
+import shutil
+import subprocess
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 import skinware.recording
 from skinware import Namespace
 from skinware.errors import StructureError
+from skinware.realtime import NS_PER_S
 from skinware.recording.files import Files, Past
+from skinware.recording.mcap_reading import McapSource
+from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.recorder import Recorder
+from skinware.recording.topics import CLOCK, Channels
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
+from tests.commands import BIN, PATIENCE_S
 from tests.recording.rig import Contents, contents_of, has, pose_service, publish, publish_pose, recording
 
 
@@ -205,3 +216,123 @@ def test_a_full_disk_costs_nothing_that_was_written(path: Path, monkeypatch: pyt
             assert opened.is_whole == (how == "nearly full")
         assert len(opened["torso"].read(["values"])) == recorder.messages["/skin/torso/frame"] > 20
         assert opened.problems == []
+
+
+def _delete(path: Path) -> None:
+    path.unlink()
+
+
+def _replace(path: Path) -> None:
+    path.with_name("other").write_bytes(b"another file")
+    path.with_name("other").rename(path)
+
+
+def _move(path: Path) -> None:
+    path.rename(path.with_name("moved.mcap"))
+
+
+def _truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+@pytest.mark.parametrize(
+    ("disturb", "says"),
+    [
+        (_delete, "deleted while it was recorded"),
+        (_replace, "deleted while it was recorded"),
+        (_move, r"all until then is in .*/moved\.mcap"),
+        (_truncate, "changed by another program"),
+    ],
+)
+@pytest.mark.parametrize("comes", [True, False], ids=["frames come", "nothing comes"])
+def test_a_file_that_is_disturbed_ends_the_recording(
+    path: Path, monkeypatch: pytest.MonkeyPatch, disturb: Callable[[Path], None], says: str, *, comes: bool
+) -> None:
+    monkeypatch.setattr("skinware.recording.recorder._CLOCK_NS", NS_PER_S // 5)
+    target = Files(path)
+    disturbed = False
+
+    def tell() -> None:
+        nonlocal disturbed
+        if not disturbed and target.counts.total() > 4:
+            disturb(path)
+            disturbed = True
+
+    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    with publishing(FakeSkin("torso")) if comes else nullcontext(), pytest.raises(OSError, match=says) as raised:
+        Recorder(target).run(tell=tell)
+    assert raised.value.filename == str(path)
+    assert target.paths == [path] * (disturb is _truncate)  # nothing else of ours is there
+    if disturb is _move:
+        with skinware.recording.open(path.with_name("moved.mcap")) as opened:
+            assert opened.is_whole
+    if disturb is _replace:
+        assert path.read_bytes() == b"another file"
+
+
+def test_what_a_program_left_of_a_file_is_recovered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skinware.recording.recorder._TELL_NS", NS_PER_S // 50)
+    target = Files(path)
+
+    def tell() -> None:
+        if target.counts.total() > 100 and path.stat().st_size == target.size:  # once
+            _truncate(path)
+
+    with publishing(FakeSkin("torso")), pytest.raises(OSError, match="changed by another program"):
+        Recorder(target).run(tell=tell)
+    with skinware.recording.open(path) as opened:
+        assert not opened.is_whole
+        sequence = opened["torso"].read(["status"]).sequence
+        assert sequence.tolist() == list(range(1, len(sequence) + 1))
+
+
+def test_a_long_file_needs_no_more_memory_than_a_short_one(path: Path) -> None:
+    file, channels = McapFile(path), Channels()
+    for number in range(2000):
+        chunk = OpenChunk()
+        chunk.add(*channels.of_all(CLOCK), number, number, b"{}")
+        file.add(chunk.close())
+        assert len(file._index._waiting) < 1 << 17
+    file.finish()
+    assert [entry for entry in path.parent.iterdir() if entry != path] == []
+    with McapSource(path) as source:
+        assert source.is_whole
+        assert len(source.chunks) == 2000
+    with path.open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages()) == 2000
+
+
+def test_a_summary_that_cannot_wait_on_the_disk_ends_the_recording(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(**_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("skinware.recording.mcap_writing._SPOOL_BYTES", 200)
+    monkeypatch.setattr("skinware.recording.mcap_writing.tempfile.TemporaryFile", full)
+    with publishing(FakeSkin("torso")), pytest.raises(OSError, match="No space left on device") as raised:
+        Recorder(Files(path)).run()
+    assert raised.value.filename == str(path)
+    with skinware.recording.open(path) as opened:
+        assert opened.is_whole
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("unshare") is None, reason="only root may mount a small disk")
+def test_a_real_full_disk(path: Path) -> None:
+    disk = path.parent / "disk"
+    disk.mkdir()
+    script = f"""
+        mount --make-rprivate / && mount -t tmpfs -o size=1m small {disk} || exit 77
+        {BIN}/skin-record --json -o {disk}/full.mcap; status=$?
+        cp {disk}/full.mcap {path}; exit $status
+    """
+    with publishing(FakeSkin("torso", fake_structure(200))):
+        done = subprocess.run(
+            ["unshare", "-m", "sh", "-c", script], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
+    if done.returncode == 77 or "unshare failed" in done.stderr:
+        pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
+    stopped = json.loads(done.stdout.splitlines()[-1])
+    assert (done.returncode, stopped["event"], stopped["is_complete"]) == (1, "stopped", False)
+    assert done.stderr == f"skin-record: {disk}/full.mcap: No space left on device\n"
+    with skinware.recording.open(path) as opened:
+        assert opened.is_whole
+        assert len(opened["torso"].read(["status"])) == stopped["messages"]["/skin/torso/frame"] > 0

@@ -70,7 +70,7 @@ class Joined:
         return bool(self.rows.ndim == 1)
 
     def times_ns(self, source: Source, *, is_only: bool) -> npt.NDArray[np.int64]:
-        """(m,) wall clock, ns since 1970.
+        """(m,) ns since 1970, on the axis of the recording.
 
         Args:
             source: the recording to whose time they belong.
@@ -84,25 +84,31 @@ class Joined:
                 f"{self.path}: {self._time} is of one recording: with several, give time_ns or unix_s"
             )
         if self._time == "time_ns":
-            return self._times.astype(np.int64)
+            return self._on_axis(self._times.astype(np.int64), source)
         if self._time == "monotonic_ns":
             return self._times.astype(np.int64) + self._ahead_ns(source)
         if self._time == "unix_s":  # floats have it to a quarter of a microsecond
-            since_ns = np.rint(self._times * 1e6).astype(np.int64) * 1000
+            since_ns = self._on_axis(np.rint(self._times * 1e6).astype(np.int64) * 1000, source)
         else:
             since_ns = source.start_ns + np.rint(self._times * NS_PER_S).astype(np.int64)
         return since_ns
 
-    def _ahead_ns(self, source: Source) -> npt.NDArray[np.int64]:
-        """(m,) how far the wall clock was ahead at each time, as both clocks tell that were recorded."""
-        told = sorted((each["monotonic_ns"], each["realtime_ns"]) for each in source.clock)
-        if not told:
+    def _ahead_ns(self, source: Source) -> int:
+        """How far the axis of the recording is ahead of CLOCK_MONOTONIC."""
+        ahead = [each["log_time_ns"] - each["monotonic_ns"] for each in source.clock if "monotonic_ns" in each]
+        if not ahead:
             raise ConfigurationError(f"{source.path}: does not tell both clocks: {self.path} needs time_ns or unix_s")
-        monotonic = np.array([each[0] for each in told], np.int64)
-        ahead = np.array([each[1] - each[0] for each in told], np.int64)
-        change = np.interp(self._times - monotonic[0], monotonic - monotonic[0], ahead - ahead[0])
-        ahead_ns: npt.NDArray[np.int64] = ahead[0] + np.rint(change).astype(np.int64)
-        return ahead_ns
+        return int(ahead[0])
+
+    def _on_axis(self, wall_ns: npt.NDArray[np.int64], source: Source) -> npt.NDArray[np.int64]:
+        """(m,) times of the wall clock, as it was set then, on the axis of the recording."""
+        told = sorted((each["realtime_ns"], each["log_time_ns"]) for each in source.clock if "realtime_ns" in each)
+        if not told:
+            return wall_ns
+        wall, axis = np.array(told, np.int64).T
+        at = np.maximum(np.searchsorted(wall, wall_ns, side="right") - 1, 0)
+        on_axis: npt.NDArray[np.int64] = wall_ns + (axis - wall)[at]
+        return on_axis
 
     def _time_column(self, columns: Columns) -> str:
         found = [name for name in TIMES if name in columns]

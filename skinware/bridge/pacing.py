@@ -26,6 +26,9 @@ _PROBES = 3
 """The fastest of so many counts: others had to wait for something else."""
 _OF_ROUND_TRIP = 0.25
 """Of a round trip, what frames may wait: on a long link they come unevenly."""
+_MOST_SPARE_NS = 300_000_000
+"""Questions that wait on the robot end after half a second there."""
+_FEW = 8
 _KEPT_NS = 30 * NS_PER_S
 """For how long the least age is remembered: clocks drift, and routes change."""
 MOST_OPEN, _LEAST_PERIOD_NS = 512, 1_000_000
@@ -58,12 +61,16 @@ class _Waits:
             self._ages.popleft()
 
     def look(self, at_ns: int) -> int:
-        """The median wait of the frames that are counted."""
+        """How long all but a few of the frames that are counted waited.
+
+        In a queue that stands all frames wait. Behind a packet that TCP sends once more only some do, and fewer
+        questions would not help them.
+        """
         ages = sorted(age for _, age in self._ages)
         self._least.append((at_ns, ages[0]))
         while at_ns - self._least[0][0] > _KEPT_NS:
             self._least.popleft()
-        return ages[len(ages) // 2] - min(age for _, age in self._least)
+        return ages[len(ages) // _FEW] - min(age for _, age in self._least)
 
     def forget_ages(self) -> None:
         """Only what comes from now on counts at the next look."""
@@ -146,11 +153,15 @@ class Pacing:
         return True
 
     def _saw_pulled(self, at_ns: int, age_ns: int, round_trip_ns: int) -> None:
-        """As many questions at once as a round trip has periods, unless frames wait in queues then."""
+        """As many questions at once as a round trip has periods, unless frames wait in queues then.
+
+        As many more wait on the robot for frames to come, since TCP may hold them back for a round trip.
+        """
         period_ns = self._period_ns or _WITHOUT_PERIOD_NS
         every_ns = max(_EVERY_NS, 5 * round_trip_ns // 4)
         self._waits.add(at_ns, age_ns, every_ns)
-        wanted = min(MOST_OPEN, math.ceil(round_trip_ns / max(period_ns, _LEAST_PERIOD_NS)) + 2)
+        wanted = math.ceil((round_trip_ns + min(round_trip_ns, _MOST_SPARE_NS)) / max(period_ns, _LEAST_PERIOD_NS)) + 2
+        wanted = min(MOST_OPEN, wanted)
         self.open = min(self.open, wanted)
         if at_ns - self._looked_ns < every_ns:
             return

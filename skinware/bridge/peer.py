@@ -236,6 +236,7 @@ class Peer:
         if not self.is_connected:
             return
         self.is_connected, self.since_ns = False, now_ns()
+        self._next_why_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve it
         self._watcher.lost()
         self.tell({"event": "disconnected", "robot": self.robot, "why": why})
 

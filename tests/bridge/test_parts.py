@@ -190,7 +190,7 @@ def asked_at_once(pacing: Pacing, until_ns: int, wait_of: Callable[[int], int], 
         yield pacing.open
 
 
-@pytest.mark.parametrize(("round_trip_ns", "wanted"), [(MS // 5, 3), (40 * MS, 6), (600 * MS, 62)])
+@pytest.mark.parametrize(("round_trip_ns", "wanted"), [(MS // 5, 3), (40 * MS, 10), (600 * MS, 92)])
 def test_as_many_questions_are_open_as_a_round_trip_has_periods(round_trip_ns: int, wanted: int) -> None:
     assert list(asked_at_once(Pacing(PERIOD_NS, "pull"), 20 * NS_PER_S, lambda _: 0, round_trip_ns))[-1] == wanted
 
@@ -202,6 +202,20 @@ def test_no_more_questions_are_open_than_the_link_takes() -> None:
     later = seen[len(seen) // 2 :]
     assert 4 <= np.mean(later) <= 7
     assert max(later) <= 9
+
+
+@pytest.mark.parametrize("mode", ["push", "pull"])
+def test_frames_behind_a_lost_packet_are_no_queue(mode: str) -> None:
+    """Each second some frames in a row come a round trip late, at once."""
+    pacing, at_ns = Pacing(PERIOD_NS, "pull" if mode == "pull" else None), 0
+    if mode == "push":
+        assert pacing.probed(0, MS)
+    for number in range(4000):
+        late_ns = max(0, 120 * MS - number % 20 * PERIOD_NS)
+        pacing.saw(at_ns, 50 * MS + late_ns, 100 * MS)
+        at_ns += PERIOD_NS
+    assert pacing.mode == mode
+    assert mode == "push" or pacing.open == 22
 
 
 def test_a_moment_of_waiting_changes_little() -> None:

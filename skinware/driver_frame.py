@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.memory.ring import Frame
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
@@ -42,8 +42,26 @@ class DriverFrame(Frame):
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:
-        """(n_modules,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each module; 0 = never seen."""
+        """(n_modules,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each module; 0 = some never seen."""
         return self.column("module_time_ns")
+
+    @property
+    def group_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_groups,) int64, CLOCK_MONOTONIC ns of the oldest data shown for each update group; 0 = never seen."""
+        return self.column("group_time_ns" if "group_time_ns" in self._columns else "module_time_ns")
+
+    @property
+    def sensor_time_ns(self) -> npt.NDArray[np.int64]:
+        """(n_sensors,) int64: ``group_time_ns`` of the update group of each sensor."""
+        return self.group_time_ns[self.structure.sensor_group]
+
+    @property
+    def module_untouched(self) -> npt.NDArray[np.bool_]:
+        """(n_modules,) bool: modules that have sent nothing but 0 so far: not touched yet, or dead.
+
+        Their values are fresh all the same. All False where the driver does not look for that.
+        """
+        return self._told("module_untouched", (self.structure.n_modules,), np.uint8).astype(bool)
 
     @property
     def patch_state(self) -> npt.NDArray[np.uint8]:
@@ -134,8 +152,9 @@ class DriverFrame(Frame):
         return self.status[self.structure.index(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n,) int64: ``module_time_ns`` of the module of each sensor of a type."""
-        return self.module_time_ns[self.structure.module_of(type_name)]
+        """(n,) int64: ``group_time_ns`` of the update group of each sensor of a type."""
+        structure = self.structure
+        return self.group_time_ns[structure.sensor_group[structure.index(type_name)]]
 
     def fresh(
         self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
@@ -146,14 +165,17 @@ class DriverFrame(Frame):
 
         Args:
             type_name: which sensors.
-            max_age_s: the age beyond which nothing is fresh. Default: three of the driver's periods and at least
-                0.2 s; 1 s where it has no period.
+            max_age_s: the age beyond which nothing is fresh. Default: three periods of each sensor (of its update
+                group, or else of the driver) and at least 0.2 s; 1 s where there is no period.
             at_ns: the moment at which to look, CLOCK_MONOTONIC ns; default: now.
         """
+        limits_ns = self.structure.age_limits_ns(self.period_ns)
         return is_fresh(
             self.status_of(type_name),
             self.time_ns(type_name),
             at_ns=now_ns() if at_ns is None else at_ns,
-            max_age_ns=age_limit_ns(self.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S),
+            max_age_ns=(
+                limits_ns[self.structure.index(type_name)] if max_age_s is None else round(max_age_s * NS_PER_S)
+            ),
             alive=not self.stale,
         )

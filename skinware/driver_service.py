@@ -1,8 +1,9 @@
 """A driver's end and a user's end of one skin: a service whose frames are sensor values, with their structure.
 
-Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``patch_state``, ``bus_state``, ``bus_reason``,
-``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``, ``patch_interval_counts``,
-``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``.
+Columns of a frame: ``values``, ``status``, ``module_time_ns``, ``module_untouched``, ``patch_state``, ``bus_state``,
+``bus_reason``, ``bus_since_ns``, ``bus_load``, ``bus_samples``, ``bus_counters``, ``patch_counters``,
+``patch_interval_counts``, ``patch_age_counts``, ``latency_ns``, ``data_path``, ``bus_data_path``; and
+``group_time_ns`` where a module has several update groups.
 Static columns: the structure's tables, ``driver_type`` and the names of the counters.
 """
 
@@ -250,8 +251,10 @@ def structure_of(segment: segments.Segment) -> Structure:
         structure = Structure.from_columns(tables, columns["values"].dtype)
         _names(tables, "driver_type")
         counters = [len(_names(tables, f"{what}_counter_name")) for what in ("bus", "patch")]
-        for name, (dtype, count) in _frame_columns(structure, *counters).items():
-            if name not in columns and name not in _REQUIRED:
+        expected = {"group_time_ns": ("<i8", structure.n_groups), **_frame_columns(structure, *counters)}
+        for name, (dtype, count) in expected.items():
+            is_required = name in _REQUIRED or (name == "group_time_ns" and not structure.groups_are_modules)
+            if name not in columns and not is_required:
                 continue
             column = columns[name]
             if column.count != count or column.dtype != dtype:
@@ -271,6 +274,8 @@ def _frame_columns(
         "values": (structure.dtype, structure.n_sensors),
         "status": ("u1", structure.n_sensors),
         "module_time_ns": ("<i8", structure.n_modules),
+        **({} if structure.groups_are_modules else {"group_time_ns": ("<i8", structure.n_groups)}),
+        "module_untouched": ("u1", structure.n_modules),
         "patch_state": ("u1", n_patches),
         "bus_state": ("u1", n_buses),
         "bus_reason": ("u1", n_buses),

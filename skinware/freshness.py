@@ -11,15 +11,18 @@ import numpy.typing as npt
 _PERIODS = 3
 _LEAST_NS = 200_000_000
 _WITHOUT_PERIOD_NS = 1_000_000_000
+LONGEST_PERIOD_S = 86_400.0
+"""That anything may have: a day."""
 
 
 def age_limit_ns(period_ns: int) -> int:
     """How old data may be and still count as fresh: three periods, and at least 0.2 s.
 
-    A driver marks a module ``STALE`` after the same time.
+    A driver marks sensors ``STALE`` after the same time. :meth:`skinware.Structure.age_limits_ns` has that of each
+    sensor.
 
     Args:
-        period_ns: the driver's nominal period; 0 if it has none: then 1 s.
+        period_ns: nominal time between two updates of the data; 0 if it has none: then 1 s.
     """
     return max(_PERIODS * period_ns, _LEAST_NS) if period_ns > 0 else _WITHOUT_PERIOD_NS
 
@@ -29,16 +32,16 @@ def is_fresh(
     time_ns: npt.NDArray[np.int64],
     *,
     at_ns: int | npt.NDArray[np.int64],
-    max_age_ns: int,
+    max_age_ns: int | npt.NDArray[np.int64],
     alive: bool = True,
 ) -> npt.NDArray[np.bool_]:
     """Which of n sensors are fresh.
 
     Args:
         status: (..., n) bits of :class:`skinware.Status`.
-        time_ns: (..., n) time of each sensor's data (that of its module), 0: never seen.
+        time_ns: (..., n) time of each sensor's data (that of its update group), 0: never seen.
         at_ns: the moment at which they are looked at, on the clock of ``time_ns``.
-        max_age_ns: the age beyond which nothing is fresh; see ``age_limit_ns``.
+        max_age_ns: the age beyond which nothing is fresh, or (n,) that of each sensor; see ``age_limit_ns``.
         alive: the driver lived when the frame was taken.
 
     Returns:

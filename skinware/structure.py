@@ -12,8 +12,10 @@ import numpy.typing as npt
 from skinware import _names
 from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
 from skinware.errors import StructureError
+from skinware.freshness import LONGEST_PERIOD_S, age_limit_ns
 from skinware.geometry import Geometry
 from skinware.matrices import Matrices
+from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 
 __all__ = ["VALUE_DTYPES", "Index", "Structure"]
@@ -38,10 +40,15 @@ _COLUMNS: tuple[tuple[str, str], ...] = (
     ("sensor_uid", "<u8"),
     ("sensor_type", "<u4"),
     ("sensor_module", "<u4"),
+    ("sensor_group", "<u4"),
+    ("group_module", "<u4"),
+    ("group_period_ns", "<i8"),
 )
 _OWN_COLUMNS = tuple(name for name, _ in _COLUMNS if not name.startswith(("type_", "bus_")))
-_OPTIONAL = ("module_name",)
-"""Columns that files of earlier versions do not have."""
+OF_GROUPS = ("sensor_group", "group_module", "group_period_ns")
+"""Columns that a file has only where a module has several update groups, or a group a period of its own."""
+_OPTIONAL = ("module_name", *OF_GROUPS)
+"""Columns that files need not have: of earlier versions, or where every module is one update group."""
 
 
 def _column(name: str, data: npt.ArrayLike) -> npt.NDArray[Any]:
@@ -62,6 +69,10 @@ class Structure:
         sensor_uid: (n_sensors,) uint64, unique per type.
         sensor_type: (n_sensors,) uint32, id of a type in ``types``.
         sensor_module: (n_sensors,) uint32, index of the sensor's module.
+        sensor_group: (n_sensors,) uint32, index of the sensor's update group: sensors of a module that arrive together,
+            and so have one time and one age.
+        group_module: (n_groups,) uint32, ascending, index of the group's module. By default, each module is one group.
+        group_period_ns: (n_groups,) int64, nominal time between two updates of a group; 0: the driver's period.
         dtype: dtype of the values, one of :data:`VALUE_DTYPES`.
         geometry: positions of the n_sensors sensors, in the same order; None if the driver does not publish them.
 
@@ -83,6 +94,9 @@ class Structure:
         sensor_module: npt.ArrayLike,
         dtype: npt.DTypeLike,
         module_name: npt.ArrayLike | None = None,
+        sensor_group: npt.ArrayLike | None = None,
+        group_module: npt.ArrayLike | None = None,
+        group_period_ns: npt.ArrayLike | None = None,
         geometry: Geometry | None = None,
     ) -> None:
         self.types: tuple[SensorType, ...] = tuple(types)
@@ -97,6 +111,16 @@ class Structure:
         self.sensor_uid: npt.NDArray[np.uint64] = _column("sensor_uid", sensor_uid)
         self.sensor_type: npt.NDArray[np.uint32] = _column("sensor_type", sensor_type)
         self.sensor_module: npt.NDArray[np.uint32] = _column("sensor_module", sensor_module)
+        self.sensor_group: npt.NDArray[np.uint32] = _column(
+            "sensor_group", self.sensor_module if sensor_group is None else sensor_group
+        )
+        self.group_module: npt.NDArray[np.uint32] = _column(
+            "group_module", np.arange(len(self.module_patch)) if group_module is None else group_module
+        )
+        self.group_period_ns: npt.NDArray[np.int64] = _column(
+            "group_period_ns",
+            np.zeros(len(self.group_module), np.int64) if group_period_ns is None else group_period_ns,
+        )
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self.geometry: Geometry | None = geometry
         self._check()
@@ -123,6 +147,7 @@ class Structure:
             sensor_uid=self.sensor_uid[positions],
             sensor_type=self.sensor_type[positions],
             sensor_module=self.sensor_module[positions],
+            sensor_group=self.sensor_group[positions],
             geometry=None if self.geometry is None else self.geometry[positions],
         )
 
@@ -146,6 +171,39 @@ class Structure:
     def n_patches(self) -> int:
         """Number of patches."""
         return len(self.patch_name)
+
+    @property
+    def n_groups(self) -> int:
+        """Number of update groups."""
+        return len(self.group_module)
+
+    @cached_property
+    def groups_are_modules(self) -> bool:
+        """Whether every module is one update group, so that frames need no times of groups beside those of modules."""
+        return np.array_equal(self.group_module, np.arange(self.n_modules))
+
+    @cached_property
+    def group_patch(self) -> npt.NDArray[np.uint32]:
+        """(n_groups,) uint32, index of the patch that each update group belongs to."""
+        return frozen(self.module_patch[self.group_module])
+
+    def age_limits_ns(self, period_ns: int) -> npt.NDArray[np.int64]:
+        """(n_sensors,) int64: how old the data of each sensor may be and still count as fresh.
+
+        Args:
+            period_ns: the driver's nominal period, for groups that have none of their own; 0 if it has none.
+        """
+        if period_ns not in self._age_limits_ns:
+            self._age_limits_ns[period_ns] = frozen(self.group_age_limits_ns(period_ns)[self.sensor_group])
+        return self._age_limits_ns[period_ns]
+
+    def group_age_limits_ns(self, period_ns: int) -> npt.NDArray[np.int64]:
+        """(n_groups,) int64: the same for each update group."""
+        return np.array([age_limit_ns(own or period_ns) for own in self.group_period_ns.tolist()], np.int64)
+
+    @cached_property
+    def _age_limits_ns(self) -> dict[int, npt.NDArray[np.int64]]:
+        return {}
 
     @cached_property
     def _index_by_type(self) -> dict[str, Index]:
@@ -331,8 +389,11 @@ class Structure:
             "type_maximum": [t.maximum for t in types],
             "bus_name": [name.encode()[:64] for name in self.buses],
         }
+        is_plain = self.groups_are_modules and not self.group_period_ns.any()
         tables = {
-            name: np.asarray(data[name], dtype=code) if name in data else getattr(self, name) for name, code in _COLUMNS
+            name: np.asarray(data[name], dtype=code) if name in data else getattr(self, name)
+            for name, code in _COLUMNS
+            if not (is_plain and name in OF_GROUPS)
         }
         return tables | (self.geometry.to_columns() if self.geometry is not None else {})
 
@@ -397,6 +458,7 @@ class Structure:
         within("patch", "bus", self.patch_bus, len(self.buses))
         within("module", "patch", self.module_patch, self.n_patches)
         within("sensor", "module", self.sensor_module, self.n_modules)
+        self._check_groups()
         ids = [t.id for t in self.types]
         if len(set(ids)) < len(ids) or len({t.name for t in self.types}) < len(ids):
             raise StructureError("two sensor types share a name or an id")
@@ -410,6 +472,20 @@ class Structure:
                 if pair in seen:
                     raise StructureError(f"sensor {row}: uid {pair[1]:#x} appears twice for type {pair[0]}")
                 seen.add(pair)
+
+    def _check_groups(self) -> None:
+        same_length("group", self.group_module, self.group_period_ns)
+        if self.group_period_ns.size and self.group_period_ns.max() > LONGEST_PERIOD_S * NS_PER_S:
+            raise StructureError(f"a period of {int(self.group_period_ns.max())} ns: give at most a day")
+        same_length("sensor", self.sensor_uid, self.sensor_group)
+        within("group", "module", self.group_module, self.n_modules)
+        within("sensor", "group", self.sensor_group, self.n_groups)
+        if (self.group_module[1:] < self.group_module[:-1]).any():
+            raise StructureError("groups come in the order of their modules")
+        foreign = self.group_module[self.sensor_group] != self.sensor_module
+        if foreign.any():
+            row = int(np.argmax(foreign))
+            raise StructureError(f"sensor {row} is in a group of another module")
 
 
 def _equal(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic]) -> bool:

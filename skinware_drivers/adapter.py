@@ -23,6 +23,11 @@ from skinware_drivers.options import HasOptions, NoOptions, OptionsT
 from skinware_drivers.polling import Poll
 from skinware_drivers.watch import Watch
 
+_COMMAND_OPTIONS = (
+    "bus capture config cpus driver geometry group help json latency listen_only name namespace publish realtime slots"
+    " systemd verbose version wait"
+)
+
 
 class Adapter(HasOptions[OptionsT], ABC):
     """One bus of a driver: what is attached to it, what its frames mean, and how to start it.
@@ -61,6 +66,8 @@ class Adapter(HasOptions[OptionsT], ABC):
         heard_by: receives the notices of ``tell``; the runner sets it.
     """
 
+    options_command = "skin-driver"
+    reserved_options = frozenset(_COMMAND_OPTIONS.split())
     medium: ClassVar[str]
     elsewhere: ClassVar[Sequence[type[AnyAdapter]]] = ()
     Options: ClassVar[type[msgspec.Struct]] = NoOptions

@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import StructureError
+from skinware.freshness import LONGEST_PERIOD_S
 from skinware.geometry import Geometry
+from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
 
@@ -38,12 +40,15 @@ class Module:
         key: the number by which frames name it within its patch.
         kind: hardware-specific, for people and geometry.
         name: within its patch, for people (``triangle 3``); default: its kind, numbered if the patch has several.
+        period_s: nominal time between two of its updates, if it is not that of its frames (or else of the driver): a
+            thermometer that sends once a second is fresh for three seconds.
     """
 
     channels: Sequence[Sensor | None]
     key: int = 0
     kind: str = ""
     name: str = ""
+    period_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -75,12 +80,14 @@ class SkinTables:
         patch_key: (bus, key) -> patch.
         module_key: (patch, key) -> module.
         channel_to_sensor: (n_modules, n_channels) int64, sensor of each channel; ``n_sensors`` = none.
+        module_period_ns: (n_modules,) int64, declared nominal time between two updates of each module; 0: none.
     """
 
     structure: Structure
     patch_key: dict[tuple[int, int], int] = field(repr=False)
     module_key: dict[tuple[int, int], int] = field(repr=False)
     channel_to_sensor: npt.NDArray[np.int64] = field(repr=False)
+    module_period_ns: npt.NDArray[np.int64] = field(repr=False)
 
     def with_buses(self, names: Sequence[str]) -> SkinTables:
         """The same sensors on buses of other names, or on some of more buses."""
@@ -120,7 +127,7 @@ def assemble(
     """Put the patches of all buses into one structure; uid = bus index << 32 | the driver's uid.
 
     Raises:
-        StructureError: no sensor at all, two patches or modules of one key, or an unknown type.
+        StructureError: no sensor at all, two patches or modules of one key, an unknown type, or no possible period.
     """
     type_ids = {t.name: t.id for t in types}
     patch_key: dict[tuple[int, int], int] = {}
@@ -130,6 +137,7 @@ def assemble(
     module_patch: list[int] = []
     module_kind: list[str] = []
     module_name: list[str] = []
+    period_ns: list[int] = []
     uids: list[int] = []
     sensor_type: list[int] = []
     sensor_module: list[int] = []
@@ -157,6 +165,7 @@ def assemble(
                 module_patch.append(len(patch_name))
                 module_kind.append(module.kind)
                 module_name.append(module.name)
+                period_ns.append(_period_ns(f"{patch.name}, module {module.key:#x}", module.period_s))
             patch_name.append(patch.name)
             patch_bus.append(bus)
     structure = Structure(
@@ -170,10 +179,17 @@ def assemble(
         sensor_uid=np.array(uids, np.uint64),
         sensor_type=sensor_type,
         sensor_module=sensor_module,
+        group_period_ns=period_ns,
         dtype=dtype,
     )
     table = np.full((len(channels), max(map(len, channels))), -1, np.int64)
     for module_index, row in enumerate(channels):
         table[module_index, : len(row)] = row
     table[table < 0] = structure.n_sensors
-    return SkinTables(structure, patch_key, module_key, table)
+    return SkinTables(structure, patch_key, module_key, table, structure.group_period_ns)
+
+
+def _period_ns(name: str, period_s: float | None) -> int:
+    if period_s is not None and not 0 < period_s <= LONGEST_PERIOD_S:
+        raise StructureError(f"{name}: period_s = {period_s}: give more than 0, at most {LONGEST_PERIOD_S:g}")
+    return 0 if period_s is None else max(1, round(period_s * NS_PER_S))

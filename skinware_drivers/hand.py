@@ -49,7 +49,14 @@ class Grid:
     columns: int
     pitch_m: float = PITCH_M
 
-    def at(self, centre_m: Triple, type_names: Sequence[str], uid: Sequence[int], frame: str = FRAME) -> Geometry:
+    def at(
+        self,
+        centre_m: Triple,
+        type_names: Sequence[str],
+        uid: Sequence[int],
+        frame: str = FRAME,
+        cells: Sequence[int] | None = None,
+    ) -> Geometry:
         """The places of a grid's taxels.
 
         Args:
@@ -57,6 +64,7 @@ class Grid:
             type_names: types of the sensors that each taxel has (``["pressure"]``, or its axes).
             uid: of the taxels, row by row; the last ones may be missing.
             frame: in which they are, if not that of a hand.
+            cells: the cell of each taxel, counted row by row; default: they fill the grid in this order.
 
         Raises:
             ValueError: more taxels than the grid has places.
@@ -64,7 +72,7 @@ class Grid:
         n = len(uid)
         if n > self.rows * self.columns:
             raise ValueError(f"{n} taxels have no place in a grid of {self.rows} x {self.columns}")
-        row, column = np.divmod(np.arange(n), self.columns)
+        row, column = np.divmod(np.arange(n) if cells is None else np.array(cells), self.columns)
         place = np.zeros((n, 3))
         place[:, 0] = (column - (self.columns - 1) / 2) * self.pitch_m
         place[:, 1] = ((self.rows - 1) / 2 - row) * self.pitch_m

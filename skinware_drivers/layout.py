@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.freshness import LONGEST_PERIOD_S
 from skinware.status import Status
 from skinware_drivers.bus import check_identifier
 from skinware_drivers.conditions import Bits, Byte, Condition, Identifier
@@ -139,12 +140,18 @@ class Expand:
 
     It gets whatever comes over the wire, also garbage. A frame for which it raises, or returns a value that the dtype
     cannot hold, is counted as bad content and not shown.
+
+    Attributes:
+        function: see above.
+        to: the channels that it can return; None: any. Where other frames fill the same module, it says which sensors
+            this kind of frame keeps fresh.
     """
 
     function: Callable[
         [npt.NDArray[np.uint8], npt.NDArray[np.uint8]],
         tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]],
     ]
+    to: Sequence[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +170,8 @@ class Frame:
         flags: what sets status bits.
         sequence: sequence number, if there is one that the frames of a cycle do not share (see :class:`Cycle`).
         time: the device's own time, if the frame has it.
+        period_s: nominal time between two of these frames of a module, if it is longer than the driver's: their sensors
+            are stale after three of these periods.
         stamp: the old name of ``sequence``; to be removed in release 0.2.
     """
 
@@ -175,6 +184,7 @@ class Frame:
     flags: Sequence[AnyFlag] = ()
     sequence: SequenceNumber | None = None
     time: DeviceTime | None = None
+    period_s: float | None = None
     stamp: InitVar[SequenceNumber | None] = None
 
     def __post_init__(self, stamp: SequenceNumber | None) -> None:
@@ -350,6 +360,8 @@ def _check_frame(frame: Frame) -> None:
             raise refuse(
                 f"a flag's `mask`, `each` and `normal` are bits of an unsigned word, not of {flag.dtype!r}: {flag}"
             )
+    if frame.period_s is not None and not 0 < frame.period_s <= LONGEST_PERIOD_S:
+        raise refuse(f"period_s = {frame.period_s}: give more than 0, at most {LONGEST_PERIOD_S:g}")
     if frame.time is not None and frame.time.end > min(frame.length):
         raise refuse("the device's time is not in every right payload")
 

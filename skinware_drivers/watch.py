@@ -15,6 +15,8 @@ class Watch:
 
     Attributes:
         module_status: (n_modules,) uint8, status bits added to every sensor of a module at publication.
+        module_untouched: (n_modules,) bool, modules of which nothing shows yet that they live; for people, their values
+            count as fresh.
         sees_all: ``look`` is called with all updates; it may be set to False as soon as that is not needed any more.
     """
 
@@ -23,6 +25,7 @@ class Watch:
     def __init__(self, tables: SkinTables) -> None:
         self.tables = tables
         self.module_status: npt.NDArray[np.uint8] = np.zeros(tables.structure.n_modules, np.uint8)
+        self.module_untouched: npt.NDArray[np.bool_] = np.zeros(tables.structure.n_modules, bool)
 
     def look(self, updates: Updates) -> None:
         """Called with updates that were just shown, if the wire may have flagged one of them, or it ``sees_all``.

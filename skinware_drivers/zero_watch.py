@@ -1,4 +1,4 @@
-"""Modules of which nobody knows whether they live: a matrix whose wire is broken tells the same as an untouched one."""
+"""Modules that nothing has touched so far: a matrix whose wire is broken sends the same as an untouched one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.status import Status
 from skinware_drivers.decoding.skin_state import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.watch import Watch
@@ -19,13 +18,13 @@ _MOST_NAMES = 6
 
 
 class ZeroWatch(Watch):
-    """Holds all values of a module for suspect that has told nothing but 0 since it was first heard.
+    """Knows which modules have sent nothing but 0 since they were first heard: not touched yet, or dead.
 
-    After the first other value, a module is believed for good: where taxels rest at 0, a module is suspect until it is
-    touched for the first time.
+    Their values are good and fresh: hands whose taxels rest at exactly 0 are usual. What is known is published as
+    :attr:`skinware.DriverFrame.module_untouched`. After the first other value, a module counts as alive for good.
 
     Attributes:
-        patience_s: how long 0 is believed.
+        patience_s: for how long 0 comes before the log names a module.
     """
 
     patience_s: float = 10.0
@@ -39,37 +38,32 @@ class ZeroWatch(Watch):
         self.sees_all = True
 
     def look(self, updates: Updates) -> None:
-        """See which modules told something, and hold the others for suspect when the time has come."""
+        """See which modules sent another value than 0."""
         time_ns, whole = int(updates.newest_ns.max()), updates.module[updates.whole]
         self._since_ns[whole] = np.where(self._since_ns[whole] == 0, time_ns, self._since_ns[whole])
         lit = ((updates.values != 0) & (updates.sensors < self.tables.structure.n_sensors)).any(axis=1)
-        believed = updates.module[lit & self._is_dark[updates.module]]
-        self._is_dark[believed] = False
-        self.module_status[believed] &= np.uint8(~int(Status.SUSPECT) & 0xFF)
-        self._doubt(time_ns)
+        self._is_dark[updates.module[lit]] = False
+        self.module_untouched[:] = self._is_dark & (self._since_ns > 0)
+        self._name(time_ns)
         self.sees_all = bool(self._is_dark.any())
 
     def forget(self, patch: int) -> None:
-        """The patch was set up anew: its modules have to show again that they live."""
+        """The patch was set up again: its modules have to show again that they live."""
         super().forget(patch)
         modules = self.tables.structure.module_patch == patch
         self._is_dark[modules], self._since_ns[modules], self._is_told[modules] = True, 0, False
+        self.module_untouched[modules] = False
         self.sees_all = True
 
-    def _doubt(self, time_ns: int) -> None:
-        dark = self._is_dark & (self._since_ns > 0)
-        doubted = dark & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
-        self.module_status[doubted] |= np.uint8(Status.SUSPECT)
-        untold = np.flatnonzero(doubted & ~self._is_told)
-        if len(untold) and (doubted == dark).all():  # not one by one
+    def _name(self, time_ns: int) -> None:
+        """Log the untouched modules once, when all that there are have been so for long."""
+        has_waited = self.module_untouched & (time_ns - self._since_ns >= self.patience_s * NS_PER_S)
+        untold = np.flatnonzero(has_waited & ~self._is_told)
+        if len(untold) and (has_waited == self.module_untouched).all():  # not one by one
             self._is_told[untold] = True
             names = [self.tables.structure.module_names[module] for module in untold[:_MOST_NAMES].tolist()]
             more = f" and {len(untold) - len(names)} more" if len(untold) > len(names) else ""
-            log.warning(
-                "nothing but 0 comes from %s%s: broken, or not touched yet; suspect until something else comes",
-                "; ".join(names),
-                more,
-            )
+            log.info("nothing but 0 has come from %s%s so far: not touched yet, or dead", "; ".join(names), more)
 
 
 __all__ = ["ZeroWatch"]

@@ -20,7 +20,8 @@ from skinware.transfer.frames import RecordedDriverFrame
 from skinware.transfer.generation import Generation
 
 _OF_SENSORS = ("values", "status")
-_OF_MODULES = ("module_time_ns",)
+_OF_MODULES = ("module_time_ns", "module_untouched")
+_OF_GROUPS = ("group_time_ns",)
 _OF_PATCHES = ("patch_state", "patch_counters", "patch_interval_counts", "patch_age_counts")
 _OF_BUSES = (
     "bus_state", "bus_reason", "bus_since_ns", "bus_load", "bus_samples", "bus_counters", "bus_data_path",
@@ -47,11 +48,13 @@ class Cut:
             raise StructureError(f"service {whole.name!r} is not a driver: it has no sensors")
         structure = whole.context
         modules = np.unique(structure.sensor_module[positions])
+        groups = np.unique(structure.sensor_group[positions])
         patches = np.unique(structure.module_patch[modules])
         buses = np.unique(structure.patch_bus[patches])
         rows_of = (
             (_OF_SENSORS, structure.n_sensors, positions),
             (_OF_MODULES, structure.n_modules, modules),
+            (_OF_GROUPS, structure.n_groups, groups),
             (_OF_PATCHES, structure.n_patches, patches),
             (_OF_BUSES, len(structure.buses), buses),
         )
@@ -65,7 +68,7 @@ class Cut:
                     self._stay.append((name, count, len(rows), as_index(rows.astype(np.int64))))
         others = columns.keys() - {name for name, *_ in self._stay}
         self._stay += [(name, 1, 1, slice(0, 1)) for name in others if math.prod(columns[name].shape)]
-        cut = _structure(structure, positions, modules, patches, buses)
+        cut = _structure(structure, positions, groups, modules, patches, buses)
         self.head = Head(whole.head_with(cut, Schema(columns, whole.schema.description)))
         self.generation: Generation = Generation(self.head.raw, whole.name)
 
@@ -82,6 +85,7 @@ class Cut:
 def _structure(
     whole: Structure,
     sensors: npt.NDArray[np.int64],
+    groups: npt.NDArray[np.uint32],
     modules: npt.NDArray[np.uint32],
     patches: npt.NDArray[np.uint32],
     buses: npt.NDArray[np.uint32],
@@ -101,6 +105,9 @@ def _structure(
         sensor_uid=whole.sensor_uid[sensors],
         sensor_type=whole.sensor_type[sensors],
         sensor_module=np.searchsorted(modules, whole.sensor_module[sensors]),
+        sensor_group=np.searchsorted(groups, whole.sensor_group[sensors]),
+        group_module=np.searchsorted(modules, whole.group_module[groups]),
+        group_period_ns=whole.group_period_ns[groups],
         geometry=None if whole.geometry is None else whole.geometry[as_index(sensors)],
     )
 

@@ -12,7 +12,7 @@ from skinware.bridge.giving import Stream
 from skinware.bridge.link import Sender
 from skinware.bridge.messages import DriverSummary, State, Summary, host_name
 from skinware.driver_service import counters_of
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
@@ -114,9 +114,9 @@ def _fresh(frame: RecordedDriverFrame, structure: Structure, time_ns: int, is_li
     """How many sensors can be trusted now."""
     fresh = is_fresh(
         frame.status,
-        frame.module_time_ns[structure.sensor_module],
+        frame.sensor_time_ns,
         at_ns=time_ns,
-        max_age_ns=age_limit_ns(frame.period_ns),
+        max_age_ns=structure.age_limits_ns(frame.period_ns),
         alive=is_live,
     )
     return int(np.count_nonzero(fresh))

@@ -50,6 +50,14 @@ if TYPE_CHECKING:
     help="A router, with --rmw zenoh: tcp/HOST:PORT.  [default: tcp/localhost:7447]",
 )
 @click.option(
+    "--interface",
+    "interfaces",
+    multiple=True,
+    metavar="NAME",
+    help="A network to use, over DDS: eth0, or an address of this machine; may be repeated.  [default: $CYCLONEDDS_URI,"
+    " else this machine alone]",
+)
+@click.option(
     "--domain",
     type=int,
     metavar="N",
@@ -67,25 +75,34 @@ if TYPE_CHECKING:
 @click.option(
     "--rate", type=float, default=20.0, show_default=True, metavar="HZ", help="Of point clouds and images, at most."
 )
-@click.option("--read-only", is_flag=True, help="Nobody of the graph may tare.")
+@click.option(
+    "--root-frame",
+    default="",
+    metavar="NAME",
+    help="Publish /tf_static: all coordinate frames of the drivers at the origin of NAME, unturned; where no other node"
+    " publishes where they are.",
+)
+@click.option("--tare", "with_tare", is_flag=True, help="Offer a service NAME/tare to everyone in the graph.")
 @namespace_option
 @json_option
 def command(
     names: tuple[str, ...],
     rmw: str,
     connect: tuple[str, ...],
+    interfaces: tuple[str, ...],
     domain: int,
     ros_namespace: str,
     distro: str,
     rate: float,
-    read_only: bool,
+    root_frame: str,
+    with_tare: bool,
     namespace: str | None,
     as_json: bool,
 ) -> None:
     """Have drivers NAME..., or all there are and come, in a ROS 2 graph. ROS need not be installed.
 
-    Of each: every frame, point clouds, images, diagnostics, and a service that tares it. Who listens there and is slow,
-    stopped or gone costs the drivers nothing.
+    The node publishes each driver's frames, point clouds, images and diagnostics. The graph can only read,
+    unless you give --tare. Subscribers that are slow, stopped or gone cost the drivers nothing.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -95,13 +112,22 @@ def command(
 
     if connect and rmw != "zenoh":
         raise click.UsageError("--connect is for --rmw zenoh: over DDS, nodes find each other without routers")
+    if interfaces and rmw != "dds":
+        raise click.UsageError("--interface is for --rmw dds: over zenoh, --connect says where the router is")
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
     identity = Identity(f"skinware_{_plain(place.name)}", ros_namespace, domain, Distro(distro))
-    with contextlib.closing(_node(rmw, identity, connect, _Router(as_json).tell)) as node:
+    with contextlib.closing(_node(rmw, identity, connect, interfaces, _Router(as_json).tell)) as node:
         server = Ros2Server(
-            node, place, names, prefix=identity.prefix, rate_hz=rate, is_read_only=read_only, trouble=warn
+            node,
+            place,
+            names,
+            prefix=identity.prefix,
+            rate_hz=rate,
+            root_frame=root_frame,
+            with_tare=with_tare,
+            trouble=warn,
         )
         with contextlib.closing(server), signals_end(server.stop):
             where = f"{identity.prefix}/{identity.name}"
@@ -114,14 +140,20 @@ def command(
             server.run(status.tell)
 
 
-def _node(rmw: str, identity: Identity, connect: tuple[str, ...], tell: Callable[[bool, str], None]) -> Node:
+def _node(
+    rmw: str,
+    identity: Identity,
+    connect: tuple[str, ...],
+    interfaces: tuple[str, ...],
+    tell: Callable[[bool, str], None],
+) -> Node:
     if rmw == "zenoh":
         from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
 
         return ZenohNode(identity, connect=connect or (ROUTER,), tell=tell)
     from skinware.ros2.dds import DdsNode
 
-    return DdsNode(identity)
+    return DdsNode(identity, interfaces)
 
 
 def _plain(name: str) -> str:

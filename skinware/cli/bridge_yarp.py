@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     "yarp",
     context_settings=CONTEXT_SETTINGS,
     epilog=examples(
-        "skin-bridge yarp torso                        then, with YARP: yarp read ... /skinware/torso",
-        "skin-bridge yarp --namespace calm --prefix /icub/skin --regions skin/left_arm.regions.toml",
-        "skin-bridge yarp --server 10.0.0.1:10000 --listen 10.0.0.7   for a robot's network",
+        "skin-bridge yarp torso --yarp 4               then, with YARP: yarp read ... /skinware/torso",
+        "skin-bridge yarp --yarp 3 --namespace calm --prefix /icub/skin --regions skin/left_arm.regions.toml",
+        "skin-bridge yarp --yarp 4 --server 10.0.0.1:10000 --listen 10.0.0.7   for a robot's network",
     ),
 )
 @click.argument("names", metavar="[NAME]...", nargs=-1)
@@ -54,6 +54,12 @@ if TYPE_CHECKING:
     "--server", metavar="HOST:PORT", help="YARP's name server.  [default: as yarp.conf says, else 127.0.0.1:10000]"
 )
 @click.option(
+    "--yarp",
+    "yarp",
+    type=click.Choice(["3", "4"]),
+    help="Major version of the YARP whose programs read in binary; without it, only readers in text are served.",
+)
+@click.option(
     "--listen", "host", default="127.0.0.1", show_default=True, metavar="HOST", help="Address at which ports listen."
 )
 @namespace_option
@@ -65,6 +71,7 @@ def command(
     full_scale: float | None,
     region_files: tuple[Path, ...],
     server: str | None,
+    yarp: str | None,
     host: str,
     namespace: str | None,
     as_json: bool,
@@ -83,7 +90,7 @@ def command(
     for name in names:
         check_name(name, "service")
     regions = tuple(read_regions(*region_files)) if region_files else ()
-    wanted = Wanted(names, prefix.rstrip("/"), type_name, full_scale, regions, host)
+    wanted = Wanted(names, prefix.rstrip("/"), type_name, full_scale, regions, host, int(yarp) if yarp else None)
     place, told = Namespace(namespace), _name_server(server)
     status = _Status(as_json)
     outlet = Outlet(place, wanted, told, status.happened)

@@ -26,7 +26,9 @@ from skinware.conversion.tables import (
 )
 from skinware.realtime import NS_PER_S
 
-_OF_DRIVERS = ("values", "status", "module_time_ns", "patch_state", "bus_state", "bus_reason", "bus_load")
+_OF_DRIVERS = (
+    "values", "status", "module_time_ns", "group_time_ns", "patch_state", "bus_state", "bus_reason", "bus_load",
+)  # fmt: skip
 """Columns of a driver that a text has; counters and histograms would be most of it."""
 
 
@@ -133,6 +135,8 @@ def _labels(table: Table, output: Output) -> list[str]:
     rows: Sequence[str] = structure.buses
     if column == "module_time_ns":
         rows = structure.module_names
+    elif column == "group_time_ns":
+        rows = [f"{structure.module_names[module]} group {n}" for n, module in enumerate(structure.group_module)]
     elif column == "patch_state":
         rows = structure.patch_names
     return list(rows)

@@ -162,7 +162,7 @@ class _Cloud:
         self, frame: DriverFrame, values: npt.NDArray[Any], status: npt.NDArray[np.uint8], time_ns: int
     ) -> Message:
         self.points["intensity"], self.points["status"] = values[self._rows], status[self._index]
-        self.points["age"] = _ages_s(frame)[frame.structure.sensor_module[self._index]]
+        self.points["age"] = _ages_s(frame)[frame.structure.sensor_group[self._index]]
         cdr = Cdr().header(time_ns, self._frame).numbers("I", 1, len(self.points), len(_FIELDS))
         for number, (name, kind) in enumerate(_FIELDS):
             cdr.text(name).numbers("I", 4 * number).numbers("B", kind).numbers("I", 1)
@@ -172,8 +172,8 @@ class _Cloud:
 
 
 def _ages_s(frame: DriverFrame) -> npt.NDArray[np.float32]:
-    """(n_modules,) how old the data of each was when the frame was published, s; NaN: never seen."""
-    seen_ns = frame.module_time_ns
+    """(n_groups,) how old the data of each was when the frame was published, s; NaN: never seen."""
+    seen_ns = frame.group_time_ns
     ages_s: npt.NDArray[np.float32] = ((frame.published_ns - seen_ns) / NS_PER_S).astype(np.float32)
     ages_s[seen_ns == 0] = np.nan
     return ages_s

@@ -294,8 +294,8 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
  * is not too old, and a driver that was running when the frame was read; else 0. The status alone is not enough: it
  * belongs to the frame, and a driver that hangs leaves it at 0.
  *
- * max_age_ns: data that is older is not fresh; 0 for the default: three of the driver's periods and at least 0.2 s, or
- * 1 s if it has no period.
+ * max_age_ns: data that is older is not fresh; 0 for the default: three periods of each sensor (of its update group, or
+ * else of the driver) and at least 0.2 s, or 1 s if there is no period.
  *
  * Returns how many are fresh; 0 also if this is no driver's frame, or a position lies outside it.
  */
@@ -772,6 +772,21 @@ static skinware_result skinware__read_types(skinware_reader *reader) {
     return SKINWARE_OK;
 }
 
+/* Update groups: a file has their tables only where they are not simply the modules. */
+static int skinware__groups_fit(const skinware_reader *reader, uint64_t modules, uint64_t sensors) {
+    const uint64_t groups = skinware__rows(reader, "group_module");
+    const skinware_column *times = skinware_find_column(reader, "group_time_ns");
+    const unsigned char *sensor_group, *group_module;
+    if (skinware_find_table(reader, "sensor_group") == NULL)
+        return times == NULL || skinware__is(times, 'i', 8, modules);
+    sensor_group = skinware__table(reader, "sensor_group", 'u', 4, sensors);
+    group_module = skinware__table(reader, "group_module", 'u', 4, groups);
+    return sensor_group && group_module && skinware__table(reader, "group_period_ns", 'i', 8, groups) &&
+           (times != NULL ? skinware__is(times, 'i', 8, groups) : groups == modules) &&
+           skinware__points_within(sensor_group, sensors, groups) &&
+           skinware__points_within(group_module, groups, modules);
+}
+
 static skinware_result skinware__read_driver(skinware_reader *reader) {
     const uint64_t buses = skinware__rows(reader, "bus_name");
     const uint64_t patches = skinware__rows(reader, "patch_name");
@@ -799,6 +814,8 @@ static skinware_result skinware__read_driver(skinware_reader *reader) {
         !skinware__is(skinware_find_column(reader, "patch_state"), 'u', 1, patches) ||
         !skinware__is(skinware_find_column(reader, "bus_state"), 'u', 1, buses))
         return skinware__fail(SKINWARE_BAD_FILE, "the driver's columns do not fit its structure");
+    if (!skinware__groups_fit(reader, modules, sensors))
+        return skinware__fail(SKINWARE_BAD_FILE, "the update groups of the driver do not fit its structure");
     if (!skinware__points_within(patch_bus, patches, buses) ||
         !skinware__points_within(module_patch, modules, patches) ||
         !skinware__points_within(sensor_module, sensors, modules))
@@ -1235,27 +1252,39 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
     return count;
 }
 
+static int64_t skinware__age_limit_ns(int64_t period_ns) {
+    const int64_t most_ns = (int64_t)86400 * 1000000000; /* of a forged file */
+    if (period_ns <= 0)
+        return 1000000000;
+    return period_ns < 200000000 / 3 ? 200000000 : 3 * (period_ns < most_ns ? period_ns : most_ns);
+}
+
 size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame, int64_t max_age_ns,
                       const uint32_t *positions, size_t count, unsigned char *out) {
+    const skinware_column *own_times = skinware_find_column(reader, "group_time_ns");
+    const skinware_column *groups = skinware_find_table(reader, "sensor_group");
+    const skinware_column *periods = skinware_find_table(reader, "group_period_ns");
     const skinware_column *status = skinware_find_column(reader, "status");
-    const skinware_column *times = skinware_find_column(reader, "module_time_ns");
-    const skinware_column *modules = skinware_find_table(reader, "sensor_module");
+    const skinware_column *times = own_times != NULL ? own_times : skinware_find_column(reader, "module_time_ns");
+    const skinware_column *owners = groups != NULL ? groups : skinware_find_table(reader, "sensor_module");
     const unsigned char *bits = status == NULL ? NULL : (const unsigned char *)skinware_data(frame, status);
     const int64_t *time_ns = times == NULL ? NULL : (const int64_t *)skinware_data(frame, times);
-    const uint32_t *module = modules == NULL ? NULL : (const uint32_t *)skinware_table_data(reader, modules);
+    const uint32_t *group = owners == NULL ? NULL : (const uint32_t *)skinware_table_data(reader, owners);
+    const int64_t *own_period_ns = periods == NULL ? NULL : (const int64_t *)skinware_table_data(reader, periods);
     const int64_t period_ns = skinware_period_ns(reader);
     const int64_t now_ns = skinware_now_ns();
     size_t i, fresh = 0;
-    if (!skinware_is_driver(reader) || bits == NULL || time_ns == NULL || module == NULL)
+    if (!skinware_is_driver(reader) || bits == NULL || time_ns == NULL || group == NULL)
         return 0;
-    if (max_age_ns == 0)
-        max_age_ns = period_ns <= 0 ? 1000000000 : period_ns < 200000000 / 3 ? 200000000 : 3 * period_ns;
     for (i = 0; i < count; i++)
-        if (positions[i] >= status->count || positions[i] >= modules->count || module[positions[i]] >= times->count)
+        if (positions[i] >= status->count || positions[i] >= owners->count || group[positions[i]] >= times->count)
             return 0;
     for (i = 0; i < count; i++) {
-        const int64_t acquired_ns = time_ns[module[positions[i]]];
-        out[i] = !frame->stale && bits[positions[i]] == 0 && acquired_ns > 0 && acquired_ns >= now_ns - max_age_ns;
+        const uint32_t own = group[positions[i]];
+        const int64_t own_ns = own_period_ns != NULL && own < periods->count ? own_period_ns[own] : 0;
+        const int64_t limit_ns = max_age_ns != 0 ? max_age_ns : skinware__age_limit_ns(own_ns > 0 ? own_ns : period_ns);
+        const int64_t acquired_ns = own < times->count ? time_ns[own] : 0;
+        out[i] = !frame->stale && bits[positions[i]] == 0 && acquired_ns > 0 && acquired_ns >= now_ns - limit_ns;
         fresh += out[i];
     }
     return fresh;

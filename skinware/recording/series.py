@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import StructureError
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.transfer.generation import Generation
@@ -108,8 +108,10 @@ class Series:
         return self.column("status")[:, self.structure.index(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
-        """(n, sensors) int64: time of the data of each sensor (of its module), 0: never seen."""
-        return self.column("module_time_ns")[:, self.structure.module_of(type_name)]
+        """(n, sensors) int64: time of the data of each sensor (of its update group), 0: never seen."""
+        structure = self.structure
+        times_ns = self.column("group_time_ns" if "group_time_ns" in self.origin.columns else "module_time_ns")
+        return times_ns[:, structure.sensor_group[structure.index(type_name)]]
 
     def fresh(self, type_name: str, *, max_age_s: float | None = None) -> npt.NDArray[np.bool_]:
         """(n, sensors) bool: which could be trusted when their frame was published.
@@ -118,7 +120,8 @@ class Series:
             type_name: which sensors.
             max_age_s: the age beyond which nothing is fresh; default: as for :meth:`skinware.DriverFrame.fresh`.
         """
-        max_age_ns = age_limit_ns(self.origin.period_ns) if max_age_s is None else round(max_age_s * NS_PER_S)
+        limits_ns = self.structure.age_limits_ns(self.origin.period_ns)[self.structure.index(type_name)]
+        max_age_ns = limits_ns if max_age_s is None else round(max_age_s * NS_PER_S)
         at_ns = self.published_ns[:, np.newaxis]
         return is_fresh(self.status_of(type_name), self.time_ns(type_name), at_ns=at_ns, max_age_ns=max_age_ns)
 

@@ -175,7 +175,12 @@ class Track:
 
     def _asked(self, columns: Collection[str] | None, type_name: str | None, sensors: Index | None) -> _Asked:
         origin = self._only_origin()
-        names = tuple(columns) if columns is not None else _FOR_DRIVERS if origin.is_driver else tuple(origin.columns)
+        if columns is not None:
+            names = tuple(columns)
+        elif origin.is_driver:
+            names = (*_FOR_DRIVERS, *({"group_time_ns"} & origin.columns.keys()))
+        else:
+            names = tuple(origin.columns)
         for name in names:
             if name not in origin.columns:
                 raise KeyError(f"no column {name!r}; there are {', '.join(origin.columns)}")

@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.util import find_spec
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
-from skinware.errors import BridgeError, MissingExtra
+from skinware.errors import BridgeError, ConfigurationError, MissingExtra
 from skinware.ros2 import discovery, types
 from skinware.ros2.transport import Cdr, Handler, Identity, MessageType, Publisher, Qos, ServiceType
 
@@ -55,6 +56,7 @@ _REQUEST_ID = {"guid": idl.uint64, "sequence": idl.int64}
 _REQUEST_ID_SIZE = 16
 """Before what is asked and answered, as rmw_cyclonedds has it."""
 _FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
+_ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
 _PLAIN = {
     "bool": bool,
     "byte": idl.uint8,
@@ -67,29 +69,33 @@ _PLAIN = {
     "uint64": idl.uint64,
 }
 
-_THIS_MACHINE = (
-    "<CycloneDDS><Domain id='any'><General><AllowMulticast>false</AllowMulticast></General><Discovery>"
+_LOOPBACK = (
+    "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General><Discovery>"
     "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
     "<Peers><Peer address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
 )
+_NETWORK = "<CycloneDDS><Domain id='any'><General><Interfaces>{}</Interfaces></General></Domain></CycloneDDS>"
 
 
 class DdsNode:
     """See :class:`skinware.ros2.transport.Node`.
 
-    ``CYCLONEDDS_URI``, ``ROS_AUTOMATIC_DISCOVERY_RANGE`` and ``ROS_LOCALHOST_ONLY`` are obeyed as by nodes of ROS.
-
     Args:
         identity: of the node.
+        interfaces: networks to use, by the name or the address of an interface of this machine. None given: those that
+            ``CYCLONEDDS_URI`` configures, and where that is not set, loopback alone.
 
     Raises:
-        BridgeError: it cannot be made; the message says why.
+        ConfigurationError: ``interfaces`` are given and ``CYCLONEDDS_URI`` is set.
+        BridgeError: the domain cannot be joined; the message says why.
     """
 
-    def __init__(self, identity: Identity) -> None:
+    def __init__(self, identity: Identity, interfaces: Sequence[str] = ()) -> None:
         self._identity = identity
+        configuration = _configuration(interfaces)
         try:
-            self._domain = Domain(identity.domain, _configuration())
+            self._domain = Domain(identity.domain, configuration)
             self._participant = DomainParticipant(identity.domain, DdsQos(Policy.Userdata(discovery.PARTICIPANT_DATA)))
         except DDSException as error:
             raise BridgeError(
@@ -336,11 +342,17 @@ def _part(name: str) -> MessageType:
     return MessageType(name.replace("/", "/msg/"), "")
 
 
-def _configuration() -> str:
-    """For Cyclone DDS; later parts overrule."""
-    of_range = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    is_local = os.environ.get("ROS_LOCALHOST_ONLY") == "1" or of_range == "LOCALHOST"
-    return ",".join(filter(None, [_THIS_MACHINE if is_local else "", os.environ.get("CYCLONEDDS_URI", "")]))
+def _configuration(interfaces: Sequence[str]) -> str:
+    """For Cyclone DDS, which adds the interfaces of several parts: exactly one part names them."""
+    given = os.environ.get("CYCLONEDDS_URI", "")
+    if given and interfaces:
+        raise ConfigurationError("--interface and CYCLONEDDS_URI both choose networks: give one of them")
+    if not interfaces:
+        return given or _LOOPBACK
+    named = (
+        f"<NetworkInterface {'address' if _ADDRESS.search(each) else 'name'}={quoteattr(each)}/>" for each in interfaces
+    )
+    return _NETWORK.format("".join(named))
 
 
 def _reason(error: DDSException) -> str:

@@ -15,6 +15,7 @@ from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_
 from skinware.ros2 import diagnostics, types
 from skinware.ros2.taring import Taring
 from skinware.ros2.topics import DriverTopics
+from skinware.ros2.transforms import Transforms
 from skinware.ros2.transport import Node, Qos
 from skinware.service._tap import wake_word_of
 from skinware.views.health import WITHOUT_NEWS, life_of
@@ -88,7 +89,8 @@ class Ros2Server:
         names: of them; none: all there are and come.
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.
-        is_read_only: nobody of the graph may tare.
+        root_frame: parent of all coordinate frames in ``/tf_static``; empty: no such topic.
+        with_tare: offer everyone in the graph a service for each driver that tares it.
         trouble: called with what cannot be told, a line each.
     """
 
@@ -100,12 +102,14 @@ class Ros2Server:
         *,
         prefix: str = "",
         rate_hz: float = RATE_HZ,
-        is_read_only: bool = False,
+        root_frame: str = "",
+        with_tare: bool = False,
         trouble: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._node, self._prefix, self._trouble = node, prefix, trouble
         self._period_ns = period_ns(rate_hz)
-        self._taring = None if is_read_only else Taring(node, namespace)
+        self._taring = Taring(node, namespace) if with_tare else None
+        self._transforms = Transforms(node, root_frame) if root_frame else None
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _Served] = {}
         self._troubles: set[str] = set()
@@ -137,6 +141,8 @@ class Ros2Server:
             served.end_tare()
             served.topics.close()
         self._diagnostics.close()
+        if self._transforms is not None:
+            self._transforms.close()
         self._live.close()
 
     def drivers(self) -> Mapping[str, Told]:
@@ -160,6 +166,8 @@ class Ros2Server:
             if self._live.poll(live) and live.frame is not None:
                 served.take(live.frame, wants_frames=wants_frames)
                 served.topics.tell(live.frame, with_pictures=is_due)
+                if self._transforms is not None:
+                    self._transforms.add(live.frame.structure)
                 if is_due:
                     served.due_ns = max(served.due_ns + self._period_ns, now_ns() + self._period_ns // 2)
             elif not served.is_over and self._is_over(live, served):

@@ -32,6 +32,13 @@ TEXTS = {
     "diagnostic_msgs/KeyValue": _KEY_VALUE,
     "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
     "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
+    ),
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "rmw_dds_common/Gid": "uint8[16] data\n",
     "rmw_dds_common/NodeEntitiesInfo": _NODE_ENTITIES,
     "rmw_dds_common/ParticipantEntitiesInfo": _PARTICIPANT_ENTITIES,
@@ -53,6 +60,9 @@ SENSORS = MessageType(
 DIAGNOSTICS = MessageType(
     "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
 )
+TRANSFORMS = MessageType(
+    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+)
 TRIGGER = ServiceType(
     "std_srvs/srv/Trigger",
     "RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
@@ -65,7 +75,7 @@ TRIGGER = ServiceType(
 )
 PARTICIPANT = MessageType(
     "rmw_dds_common/msg/ParticipantEntitiesInfo",
-    "RIHS01_e725f4a506958c79f95dd693b965722c57b19cd18e7eff984f49561b93dc985d",
+    "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e",
 )
 OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
 """Types of what is shown, by the names of their definitions."""
@@ -85,6 +95,7 @@ __all__ = [
     "SENSORS",
     "SKIN_FRAME",
     "TEXTS",
+    "TRANSFORMS",
     "TRIGGER",
     "definition",
 ]

@@ -25,7 +25,8 @@ class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         on_sigma: a touch begins above so many standard deviations of the noise.
         off_sigma: and ends below so many.
         minimum_on: and begins above this at least. None: three steps of the raw values; 0 for those that have no steps.
-        drift_max_per_min: what a baseline can lose at most under a contact, in a minute. None: one threshold of touch.
+        drift_max_per_min: what a baseline can lose at most under a contact, in a minute. None: a quarter of a
+            threshold of touch.
         release: a contact is over when less than this share of its load is left
         release_s: for so long.
         recover_s: a taxel that is as far below its baseline as a touch is above it, for so long, gets a new one.

@@ -13,7 +13,9 @@ _LEVEL_RISES_S, _LEVEL_FALLS_S = 2.0, 20.0
 """Of the level that a contact is held at: a bump of a moment must not raise it, a weaker grip may become the rule."""
 _COMES_BACK_S = 0.3
 """What sagged comes back a little after the touch has ended, and belongs to it."""
-_JUST_TOUCHED = np.float32(1.5)
+_DRIFT_PER_MIN = np.float32(0.25)
+"""Of a threshold: as much as a baseline drifts on its own in a minute. More of it makes an eased grip vanish."""
+_JUST_TOUCHED = np.float32(1.25)
 """Times the threshold: so much a taxel that drifted beyond it a moment ago may show."""
 
 
@@ -120,7 +122,8 @@ class Touches:
         if not released.any() and not too_long.any():
             return active[:0]
         self.fading_s[released] = 0
-        per_min = on if settings.drift_max_per_min is None else np.float32(settings.drift_max_per_min)
+        own = settings.drift_max_per_min
+        per_min = _DRIFT_PER_MIN * on if own is None else np.float32(own)
         is_drift = load < _JUST_TOUCHED * on + per_min * (self.contact_s / 60) + self.sunk
         let_go = (released[self._module] & usable & is_drift) | (too_long & usable)
         self._end(let_go)

@@ -13,7 +13,7 @@ from skinware import driver_service
 from skinware.errors import BadRecording, BadServiceFile, StructureError
 from skinware.memory import segments
 from skinware.memory.schema import STATIC_NAME, Schema
-from skinware.structure import Index, Structure
+from skinware.structure import OF_GROUPS, Index, Structure
 from skinware.transfer.codec import CodedColumn
 
 PER_SENSOR = ("values", "status")
@@ -71,7 +71,7 @@ class Generation:
             structure: whose tables it has.
             schema: of its columns.
         """
-        static = {name: table for name, table in self.static().items() if name != STATIC_NAME}
+        static = {name: table for name, table in self.static().items() if name not in (STATIC_NAME, *OF_GROUPS)}
         return segments.head_like(self._segment, schema, {**static, **structure.to_columns()})
 
     @property

@@ -20,7 +20,7 @@ from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
 from skinware.transfer.frames import RecordedFrame
 from skinware.transfer.generation import Generation
 
-_TIMES_OF_DRIVERS = ("module_time_ns", "bus_since_ns")
+_TIMES_OF_DRIVERS = ("module_time_ns", "group_time_ns", "bus_since_ns")
 """Columns with times of CLOCK_MONOTONIC; 0: never, or not known."""
 _OTHERS = "this is a recording"
 

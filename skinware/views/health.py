@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skinware.freshness import age_limit_ns, is_fresh
+from skinware.freshness import is_fresh
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason, BusState, PatchState, Status
 
@@ -67,7 +67,8 @@ class SkinHealth:
         rate_hz: frames per second now; None where not known yet.
         age_ns: how old its newest data is; None before the first frame.
         sensors: how many it has.
-        statuses: sensors by status, ``fresh`` and ``stale`` first; one sensor can have several.
+        statuses: sensors by status, ``fresh`` and ``stale`` first; one sensor can have several. ``untouched``: those of
+            modules that have sent nothing but 0 so far, which are fresh all the same.
         patches: patches by state (``was live``: by their last state, where nothing newer comes).
         counters: sums over all buses and patches of the counters that the driver publishes, by name.
     """
@@ -106,7 +107,7 @@ def health_of(reader: DriverReader, frame: DriverFrame | None, measured_hz: floa
         rate_hz,
         frame.age_ns,
         frame.structure.n_sensors,
-        count_statuses(status_now(life, frame)),
+        count_statuses(status_now(life, frame)) | {"untouched": int(np.count_nonzero(untouched(frame)))},
         {state: states.count(state) for state in dict.fromkeys(sorted(states))},
         counters,
     )
@@ -119,12 +120,17 @@ def status_now(life: str, frame: DriverFrame) -> npt.NDArray[np.uint8]:
         return status | stale
     fresh = is_fresh(
         status,
-        frame.module_time_ns[frame.structure.sensor_module],
+        frame.sensor_time_ns,
         at_ns=now_ns(),
-        max_age_ns=age_limit_ns(frame.period_ns),
+        max_age_ns=frame.structure.age_limits_ns(frame.period_ns),
         alive=not frame.stale,
     )
     return np.where(fresh | (status != 0), status, stale)
+
+
+def untouched(frame: DriverFrame) -> npt.NDArray[np.bool_]:
+    """(n_sensors,) bool: sensors of modules that have sent nothing but 0 so far; they are fresh all the same."""
+    return frame.module_untouched[frame.structure.sensor_module]
 
 
 def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
@@ -138,7 +144,7 @@ def count_statuses(status: npt.NDArray[np.uint8]) -> dict[str, int]:
 def patch_ages_ns(frame: DriverFrame) -> list[int | None]:
     """How old the newest data of every patch is; None for one that was never heard."""
     newest_ns = np.zeros(frame.structure.n_patches, np.int64)
-    np.maximum.at(newest_ns, frame.structure.module_patch, frame.module_time_ns)
+    np.maximum.at(newest_ns, frame.structure.group_patch, frame.group_time_ns)
     time_ns = now_ns()
     return [time_ns - newest if newest else None for newest in newest_ns.tolist()]
 

@@ -251,7 +251,7 @@ class Viewer:
         frame, structure = driver.frame, driver.structure
         of_type = next(t for t in structure.types if t.id == structure.sensor_type[position])
         raw = frame.values[position].item()
-        time_ns = int(frame.module_time_ns[structure.sensor_module[position]])
+        time_ns = int(frame.group_time_ns[structure.sensor_group[position]])
         return {
             "driver": number,
             "position": position,
@@ -260,6 +260,7 @@ class Viewer:
             "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
             "noise": abs(of_type.scale) * float(driver.past.noise([position])[0]),
             "status": int(driver.status[position]),
+            "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),
         }
 
     def _next_questions(self) -> list[operations.Names | operations.Series]:

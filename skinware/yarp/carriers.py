@@ -7,7 +7,9 @@ numbers are little-endian.
   i32, ``RP``; then the length of the sender's name with its zero byte i32, and these. The receiver answers eight bytes.
 * A message: ``YA``, 10, ``RP``; 1 block, 1 answer and eight FF; the block's length i32; 0 i32. The block begins with a
   command, here ``do``, the number of the message and its time: its length with a zero byte i32, ``~``, 0, 0, 1, it, 0.
-  Then the list: 256 + 10 i32 (a list of doubles), its length i32, the doubles.
+  Then the list: its tag i32, its length i32, the doubles. The tag of a list of float64 is 256 + 10 up to YARP 3 and
+  256 + 20 since YARP 4, where 256 + 10 is float32 (exchanges with 3.8.1 and 4.0.0): a reader of the other version
+  would show nonsense, or nothing.
 * An acknowledgement: ``YA``, length i32, ``RP``, and as many bytes.
 """
 
@@ -22,8 +24,14 @@ import numpy.typing as npt
 
 _TCP, _ACKNOWLEDGED = 7777 + 3, 128
 _INDEX = 10
-_LIST_OF_DOUBLES = 256 + 10
+_LIST = 256
+_DOUBLE = {3: 10, 4: 20}
+"""How YARP marks float64, by its major version; to YARP 4, 10 is float32."""
 _DIGITS = 3
+
+
+READ = struct.pack("<2si2s", b"YA", _INDEX, b"RP") + b"\1\1" + b"\xff" * 8 + struct.pack("<iii4s", 8, 0, 0, b"~r\0\1")
+"""What asks a port, in a binary connection, to send its messages to whoever called."""
 
 
 class Carrier(Enum):
@@ -38,6 +46,12 @@ class Carrier(Enum):
         self.title = title
         self.is_text = is_text
         self.acknowledges = acknowledges
+
+    @classmethod
+    def of_greeting(cls, begin: bytes) -> Carrier | None:
+        """The carrier that a connection begins with in these eight bytes; None if it is none of ours."""
+        texts = {b"CONNECT ": cls.TEXT, b"CONNACK ": cls.TEXT_ACK}
+        return texts.get(begin) or {_TCP: cls.FAST_TCP, _TCP + _ACKNOWLEDGED: cls.TCP}.get(unframed(begin) or 0)
 
     def greeting(self, name: str) -> bytes:
         """What a sender begins a connection with; the receiver of a binary one answers eight bytes."""
@@ -55,10 +69,12 @@ class Message:
         values: (n,) numbers.
         count: of messages of the port.
         time_s: since 1970.
+        yarp: major version of the YARP that reads binary carriers, 3 or 4.
     """
 
-    def __init__(self, values: npt.NDArray[np.floating], count: int, time_s: float) -> None:
+    def __init__(self, values: npt.NDArray[np.floating], count: int, time_s: float, yarp: int = 4) -> None:
         self._values = values
+        self._tag = _LIST + _DOUBLE[yarp]
         self._command = f"do {count} {time_s:.6f}".encode()
 
     def of(self, carrier: Carrier) -> bytes:
@@ -73,7 +89,7 @@ class Message:
     @cached_property
     def _binary(self) -> bytes:
         command = struct.pack("<i4s", len(self._command) + 1, b"~\0\0\1") + self._command + b"\0"
-        block = command + struct.pack("<ii", _LIST_OF_DOUBLES, len(self._values)) + self._values.astype("<f8").tobytes()
+        block = command + struct.pack("<ii", self._tag, len(self._values)) + self._values.astype("<f8").tobytes()
         return framed(_INDEX) + b"\1\1" + b"\xff" * 8 + struct.pack("<ii", len(block), 0) + block
 
 
@@ -88,4 +104,4 @@ def unframed(data: bytes) -> int | None:
     return int(number) if (begin, end) == (b"YA", b"RP") else None
 
 
-__all__ = ["Carrier", "Message", "framed", "unframed"]
+__all__ = ["READ", "Carrier", "Message", "framed", "unframed"]

@@ -39,6 +39,7 @@ _LOOK_S = 2.0
 """Between two looks whether the name server still knows a port."""
 _END_S = 15.0
 _NOT_OF_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]")
+_NEWEST_YARP = 4
 ANYWHERE = ("0.0.0.0", "::", "")
 
 
@@ -53,6 +54,7 @@ class Wanted:
         full_scale: physical value that becomes 255; None: the type's greatest.
         regions: body parts that have a port each.
         host: where ports listen.
+        yarp: major version of the YARP whose programs read in binary, 3 or 4; None: not known, and they are refused.
     """
 
     names: Collection[str] = ()
@@ -61,19 +63,23 @@ class Wanted:
     full_scale: float | None = None
     regions: Sequence[Region] = ()
     host: str = "127.0.0.1"
+    yarp: int | None = None
 
 
 class _Served:
     """One port, in the event loop; ``offer`` and what is told of it are for any thread."""
 
-    def __init__(self, name: str, driver: str, names: NameServer, host: str, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self, name: str, driver: str, names: NameServer, wanted: Wanted, loop: asyncio.AbstractEventLoop
+    ) -> None:
         self.driver = driver
-        self.port = OutputPort(name, names)
+        self.port = OutputPort(name, names, wanted.yarp)
+        self._yarp = wanted.yarp or _NEWEST_YARP
         self.messages = 0
         self.values = 0
         self.registered: Contact | None = None
         self.trouble = ""
-        self._names, self._host, self._loop = names, host, loop
+        self._names, self._host, self._loop = names, wanted.host, loop
         self._lock = threading.Lock()
         self._newest: Message | None = None
         self._over = asyncio.Event()
@@ -85,7 +91,7 @@ class _Served:
         if not self.port.receivers:
             return
         since_s = (now_ns() - acquired_ns) / NS_PER_S
-        message = Message(values, self.messages, time.time() - since_s)
+        message = Message(values, self.messages, time.time() - since_s, self._yarp)
         with self._lock:
             waits, self._newest = self._newest is not None, message
         if not waits:
@@ -265,7 +271,7 @@ class Outlet:
     def _port(self, part: str, driver: str) -> _Served:
         name = f"{self._wanted.prefix}/{_NOT_OF_A_NAME.sub('_', part)}"
         if name not in self._ports:
-            served = _Served(name, driver, self._names, self._wanted.host, self._loop)
+            served = _Served(name, driver, self._names, self._wanted, self._loop)
             self._ports[name] = served
             self._tell({"event": "port", "port": name, "driver": driver})
             self._lives.append(asyncio.run_coroutine_threadsafe(served.live(), self._loop))

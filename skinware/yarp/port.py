@@ -1,8 +1,11 @@
 """An output port of YARP: whoever reads it gets the newest vector, as fast as each can; nobody is waited for.
 
-A reader calls us and says that it reads (``CONNECT who``, ``r``), or has us call it (``yarp connect OURS ITS``, which
-is the command ``[add]`` to a port). Commands are taken in text, as YARP's own tools send them; they are those of its
-manual that a port cannot do without. All of it runs in one event loop.
+A reader calls us and asks to read (the command ``r``, in text or binary), or has us call it (``yarp connect OURS ITS``,
+which is the command ``[add]`` to a port). Commands are taken in text, as YARP's own tools send them; they are those of
+its manual that a port cannot do without. All of it runs in one event loop.
+
+YARP 3 and YARP 4 mark a list of doubles differently, and a connection does not show which of them reads. Where the user
+has not named the version, binary readers are refused: none gets wrong numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import re
 import socket
 from dataclasses import dataclass, field
 
-from skinware.yarp.carriers import Carrier, Message, unframed
+from skinware.yarp.carriers import READ, Carrier, Message, framed, unframed
 from skinware.yarp.names import Contact, NameServer, is_port_name
 
 log: logging.Logger = logging.getLogger("skinware.yarp")
@@ -31,6 +34,7 @@ _MOST_BEHIND = 1 << 16
 """Wanted of the kernel: bytes that may be on their way to a reader, so that what a slow one sees is not old."""
 _ADDRESS = re.compile(r"(?:(?P<carrier>[a-z_]+):/)?(?P<name>/.*)")
 _WORD = re.compile(r'"([^"]*)"|\(([^()]*)\)|(\S+)')
+_WHICH_YARP = "YARP 3 and YARP 4 mark numbers differently: start skin-bridge yarp with --yarp 3 or --yarp 4"
 _HELP = (
     "*       Gives a description of this port",
     "d       Signals the beginning of input for the port's owner, who takes none",
@@ -77,10 +81,14 @@ class OutputPort:
     Args:
         name: of the port.
         server: asked for the ports that it is to call.
+        yarp: major version of the YARP that reads in binary, 3 or 4; None: not known.
     """
 
-    def __init__(self, name: str, server: NameServer) -> None:
+    def __init__(self, name: str, server: NameServer, yarp: int | None = None) -> None:
         self.name = name
+        self._yarp = yarp
+        self._number = 0
+        self._has_warned = False
         self.receivers: list[Receiver] = []
         self._names = server
         self._server: asyncio.Server | None = None
@@ -93,8 +101,8 @@ class OutputPort:
             OSError: it cannot listen there.
         """
         self._server = await asyncio.start_server(self._called, host, 0, limit=_LONGEST_LINE)
-        number: int = self._server.sockets[0].getsockname()[1]
-        return number
+        self._number = self._server.sockets[0].getsockname()[1]
+        return self._number
 
     def send(self, message: Message) -> None:
         """To all who read, as far as each can take it now; never waits."""
@@ -128,9 +136,14 @@ class OutputPort:
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         async with asyncio.timeout(_GREETING_S):
             begin = await reader.readexactly(_BEGIN)
-            carrier = {b"CONNECT ": Carrier.TEXT, b"CONNACK ": Carrier.TEXT_ACK}.get(begin)
+            carrier = Carrier.of_greeting(begin)
             if carrier is None:
-                return  # a binary one, in which only data could come
+                return
+            if not carrier.is_text:
+                who = await self._asked_to_send(reader, writer)
+                if who and not self._refusal(carrier, who):
+                    await self._serve(Receiver(who, carrier, writer), reader)
+                return
             who = (await _line(reader))[:_LONGEST_WHO] or "?"
         writer.write(f"Welcome {who}\r\n".encode())
         while True:
@@ -145,6 +158,25 @@ class OutputPort:
             writer.write("".join(f"{line}\r\n" for line in said).encode())
             if carrier.acknowledges:
                 writer.write(b"<ACK>\r\n")
+
+    async def _asked_to_send(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
+        """Greet a caller in binary; gives its name if it asks to read, else nothing."""
+        size = int.from_bytes(await reader.readexactly(4), "little")
+        if not 1 <= size <= _LONGEST_LINE:
+            return ""
+        who = (await reader.readexactly(size))[:-1].decode("utf-8", "replace")
+        writer.write(framed(self._number))
+        await writer.drain()
+        return who[:_LONGEST_WHO] or "?" if await reader.readexactly(len(READ)) == READ else ""
+
+    def _refusal(self, carrier: Carrier, who: str) -> str:
+        """Why a reader cannot be served in a carrier; empty if it can."""
+        if carrier.is_text or self._yarp is not None:
+            return ""
+        if not self._has_warned:
+            self._has_warned = True
+            log.warning("%s: %s reads by %s and is refused: %s", self.name, who, carrier.title, _WHICH_YARP)
+        return _WHICH_YARP
 
     async def _obey(self, command: str, reader: asyncio.StreamReader) -> list[str]:
         """What a command says back."""
@@ -202,6 +234,8 @@ class OutputPort:
             return f"Cannot connect to {text!r}: it is no name of a port".replace('"', "'")
         if carrier is None:
             return f"Cannot connect to {name} by {match['carrier']}: only text, tcp and fast_tcp"
+        if why := self._refusal(carrier, name):
+            return f"Cannot connect to {name}: {why}"
         self._remove(name)
         try:
             async with asyncio.timeout(_CONNECTING_S):

@@ -27,7 +27,7 @@ from skinware.cli._command import (
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
 from skinware_drivers.cli.driver_events import report, tell_capture, tell_patches, tell_ready
-from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
+from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -160,7 +160,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     help="Record all that goes over the buses, and what comes of it, into a new file for who helps you.",
 )
 @click.option(
-    "--unit",
+    "--systemd",
     is_flag=True,
     is_eager=True,
     expose_value=False,
@@ -227,7 +227,7 @@ def command(
         raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
     _refuse_twice(bus_names)
     _check_own_options(buses, settings)
-    given = {key: text for key, text in driver_options.items() if text is not None}
+    given = hardware_values(driver_options)
 
     def adapter_of(bus_name: str, file: ConfigFile) -> AnyAdapter:
         options = file.options_of_bus(driver.Options, bus_name, given, options_of_recording(bus_name, driver_type))

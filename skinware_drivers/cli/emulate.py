@@ -14,7 +14,7 @@ import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, namespace_option, run, seconds, version_option
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import HardwareCommand, value_of
+from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
 
 if TYPE_CHECKING:
     import msgspec
@@ -104,8 +104,7 @@ def command(
             " or none: skin-driver --bus virtual"
         )
     emulator = load_emulator(driver)
-    given = {name: text for name, text in hardware_options.items() if text is not None}
-    options = options_from_strings(emulator.Options, given)
+    options = options_from_strings(emulator.Options, hardware_values(hardware_options))
     medium = medium_of(emulator)
     longest = getattr(emulator, "payload_size", _LONGEST_COMMAND[medium])
     bus = make_bus(bus_name, payload_size=longest, for_devices=True)

@@ -6,12 +6,16 @@ from typing import TYPE_CHECKING
 
 import click
 
+from skinware.cli._command import CONTEXT_SETTINGS
+
 if TYPE_CHECKING:
     import msgspec
 
     from skinware_drivers.options import Option
 
 _HARDWARE_OPTIONS = "skinware.hardware_options"
+_PREFIX = "hardware_"
+"""Of parameters of hardware: the command's own have other names than their flags."""
 _LONGEST_KIND = 24
 """What is longer stands in the text, where it can be wrapped."""
 
@@ -29,12 +33,11 @@ class HardwareCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Find out whose options the command line may hold, then parse it."""
-        from skinware_drivers.options import describe_options
+        from skinware_drivers.options import check_names, describe_options
 
         driver, options_class = self.options_class(args)
-        own = {parameter.name for parameter in self.params}
-        theirs = [_click_option(option) for option in describe_options(options_class) if option.name not in own]
-        ctx.meta[_HARDWARE_OPTIONS] = driver, theirs
+        check_names(options_class, reserved_names(self), str(ctx.info_name), f"driver {driver}")
+        ctx.meta[_HARDWARE_OPTIONS] = driver, [_click_option(option) for option in describe_options(options_class)]
         return super().parse_args(ctx, args)
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
@@ -50,6 +53,17 @@ class HardwareCommand(click.Command):
             if records:
                 with formatter.section(title):
                     formatter.write_dl(records)
+
+
+def reserved_names(command: click.Command) -> frozenset[str]:
+    """Names that no option of hardware can have, because the command's own flags have them."""
+    flags = [flag for option in command.params for flag in option.opts] + CONTEXT_SETTINGS["help_option_names"]
+    return frozenset(flag[2:].replace("-", "_") for flag in flags if flag.startswith("--"))
+
+
+def hardware_values(parameters: dict[str, str | None]) -> dict[str, str]:
+    """The options of the hardware that were given, by name, of the parameters that a command has beside its own."""
+    return {name.removeprefix(_PREFIX): text for name, text in parameters.items() if text is not None}
 
 
 def value_of(flag: str, args: list[str]) -> str | None:
@@ -73,7 +87,7 @@ def _click_option(option: Option) -> click.Option:
         text += "  [required]"
     elif option.default:
         text += f"  [default: {option.default}]"
-    flag = f"--{option.name.replace('_', '-')}"
+    flag, name = f"--{option.name.replace('_', '-')}", f"{_PREFIX}{option.name}"
     if option.kind == "yes/no":  # alone, it means yes
-        return click.Option([flag, option.name], metavar="[yes|no]", is_flag=False, flag_value="yes", help=text)
-    return click.Option([flag, option.name], metavar=kind, help=text)
+        return click.Option([flag, name], metavar="[yes|no]", is_flag=False, flag_value="yes", help=text)
+    return click.Option([flag, name], metavar=kind, help=text)

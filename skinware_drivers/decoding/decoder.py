@@ -24,6 +24,7 @@ from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS, Addresses
 from skinware_drivers.decoding.cycles import CompiledCycle
 from skinware_drivers.decoding.device_stamps import DeviceStamps
 from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
+from skinware_drivers.decoding.groups import Carrier, Groups
 from skinware_drivers.decoding.sequences import Sequences
 from skinware_drivers.decoding.skin_state import SkinState, Updates
 from skinware_drivers.description import SkinTables
@@ -54,6 +55,8 @@ class Decoder:
             joined whenever they come (as those of fixed bytes in a test).
 
     Attributes:
+        described: the tables as given.
+        tables: the same with the update groups that follow from the layouts.
         samples: for each bus, some of the frames that could not be used.
 
     Raises:
@@ -64,8 +67,7 @@ class Decoder:
         self, layouts: Sequence[Layout | None], tables: SkinTables, periods_s: Sequence[float] | None = None
     ) -> None:
         self.layouts: list[Layout | None] = list(layouts)
-        self.tables = tables
-        self.state: SkinState = SkinState(tables)
+        self.described = tables
         self.samples: list[Samples] = [Samples() for _ in layouts]
         structure = tables.structure
         self._n_modules, self._n_patches = structure.n_modules, structure.n_patches
@@ -100,6 +102,7 @@ class Decoder:
         for kind, frame in enumerate(self.frames):
             self.length_ok[[kind, _NO_KIND], np.array(frame.length)[:, None]] = True
         self.header = self._compile_header()
+        self.state: SkinState = SkinState(self.tables)
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
         self.sequences = Sequences(structure)
         self.haste = np.zeros(self._n_patches, np.int64)
@@ -229,9 +232,17 @@ class Decoder:
             cycles += [(cycle, [number_of[name] for name in cycle.members], period_s) for cycle in layout.cycles]
         in_cycles = {number for _, members, _ in cycles for number in members}
         alone = [number for number in range(len(self.frames)) if number not in in_cycles]
-        groups = [[number] for number in alone] + [members for _, members, _ in cycles]
-        width = max((sum(len(self.kinds[number].channels) for number in group) for group in groups), default=0)
-        made = [Assembly([self.kinds[n] for n in group], self.tables, width) for group in groups]
+        made_of = [[number] for number in alone] + [members for _, members, _ in cycles]
+        width = max((sum(len(self.kinds[number].channels) for number in members) for members in made_of), default=0)
+        period_of: list[float] = [0.0 for _ in alone]
+        period_of += [own_s if (own_s := cycle.period_s or 0.0) > (bus_s or 0.0) else 0.0 for cycle, _, bus_s in cycles]
+        carriers = [self._carrier(members, period_s) for members, period_s in zip(made_of, period_of, strict=True)]
+        groups = Groups(self.described, carriers)
+        self.tables = groups.tables
+        made = [
+            Assembly([self.kinds[n] for n in members], self.tables, width, own)
+            for members, own in zip(made_of, groups.of_carrier, strict=True)
+        ]
         self.alone = dict(zip(alone, made, strict=False))
         of_cycles = iter(made[len(alone) :])
         self.cycles = [
@@ -240,7 +251,17 @@ class Decoder:
         ]
         self.width = width
         empty, none = np.zeros((0, width), np.int64), np.zeros(0, np.int64)
-        self._no_updates = Updates(none, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
+        self.most_groups = made[0].groups.shape[1] if made else 1
+        no_groups = np.zeros((0, self.most_groups), np.int64)
+        self._no_updates = Updates(none, no_groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
+
+    def _carrier(self, members: Sequence[int], period_s: float) -> Carrier:
+        """What an update that is made of some kinds of frame can be of."""
+        modules = {module for number in members for module in self.addresses.modules_of(number, self.frames[number])}
+        declared_s = [each for number in members if (each := self.frames[number].period_s) is not None]
+        longest_s = max([*declared_s, period_s])
+        channels = frozenset[int]().union(*(self.kinds[number].carries for number in members))
+        return Carrier(sorted(modules), channels, longest_s or None)
 
     def _compile_header(self) -> tuple[int, Bytes] | None:
         """One table over a payload byte and the length, if they tell all kinds of frame apart (a fast case)."""
@@ -384,7 +405,8 @@ class Decoder:
             oldest_ns, newest_ns = np.minimum(oldest_ns, stamps_ns), np.maximum(newest_ns, stamps_ns)
             last_row = np.maximum(last_row, rows[:, member])
         flagged = bool(status.any())
-        return Updates(module, whole, sensors, values, status, oldest_ns, newest_ns, flagged), last_row
+        groups = assembly.groups[module]
+        return Updates(module, groups, whole, sensors, values, status, oldest_ns, newest_ns, flagged), last_row
 
     def _count_unreadable(
         self, batch: FrameBatch, rows: Indices, module: Indices, unreadable: Indices, whole: Flags

@@ -26,6 +26,7 @@ class FrameKind:
     Attributes:
         frame: the declaration.
         channels: (width,) int64, channel of each value; -1 = dropped.
+        carries: the channels of which its frames can have values.
         module_by_byte: (n_patches, keys) module that a payload byte names, None if the identifier does.
     """
 
@@ -48,6 +49,8 @@ class FrameKind:
             channels = [channel for run in frame.runs for channel in run.channels]
             self.channels = np.array([-1 if c is None else c for c in channels], np.int64)
             self.channels[self.channels >= n_channels] = -1
+        to = frame.values.to if isinstance(frame.values, Expand) else None
+        self.carries: frozenset[int] = frozenset(self.channels[self.channels >= 0].tolist() if to is None else to)
 
     def name_modules(self, entry: Indices, payload: Bytes) -> Indices:
         """(n,) entries in which "some module of this patch" became the module that the payload names."""
@@ -213,9 +216,11 @@ class Assembly:
         kinds: the frames, in the order of the cycle.
         tables: the skin.
         width: values of every update, whatever it is made of; at least the sum over ``kinds``.
+        groups: (n_modules + 1, most) update groups that an update of each module belongs to.
     """
 
-    def __init__(self, kinds: list[FrameKind], tables: SkinTables, width: int) -> None:
+    def __init__(self, kinds: list[FrameKind], tables: SkinTables, width: int, groups: Indices) -> None:
+        self.groups = groups
         self._kinds = kinds
         self._sink = tables.structure.n_sensors
         self.channels = np.full(width, -1, np.int64)

@@ -125,7 +125,7 @@ class DriverLog:
         for total, name in ((self._interval, "patch_interval_counts"), (self._delay, "patch_age_counts")):
             now, was = (getattr(one, name).astype(np.int64) for one in (frame, before))
             total += np.where((now >= was) & same_writer, now - was, now)
-        times, earlier = frame.module_time_ns, before.module_time_ns
+        times, earlier = frame.group_time_ns, before.group_time_ns
         self.backwards += int(np.count_nonzero((times < earlier) & (times > 0))) if same_writer else 0
         self.future_ns = max(self.future_ns, int(times.max(initial=0)) - frame.published_ns)
         self.longest_gap_s = max(self.longest_gap_s, (frame.published_ns - before.published_ns) / 1e9)
@@ -183,7 +183,7 @@ class DriverLog:
             return ()
         n = structure.n_patches
         newest_ns = np.zeros(n, np.int64)
-        np.maximum.at(newest_ns, structure.module_patch, frame.module_time_ns)
+        np.maximum.at(newest_ns, structure.group_patch, frame.group_time_ns)
         sensors, modules, fresh = (
             np.bincount(of, minlength=n).tolist()
             for of in (structure.sensor_patch, structure.module_patch, structure.sensor_patch[status == 0])
@@ -233,8 +233,9 @@ class DriverLog:
         return whole_lines(self.structure, ((self._always & _BAD) != 0) & ~dark) if self.frames else ()
 
     def dark(self) -> dict[str, int]:
-        """The modules that told nothing but 0, and are suspect for it, with their numbers of sensors."""
-        sensors = np.bincount(self.structure.sensor_module, minlength=self.structure.n_modules)
+        """The modules that sent nothing but 0, if the driver says so, with how many of their sensors are suspect."""
+        suspect = (self._always & np.uint8(Status.SUSPECT)) != 0
+        sensors = np.bincount(self.structure.sensor_module[suspect], minlength=self.structure.n_modules)
         dark = np.flatnonzero(self._dark_modules()).tolist()
         return {self.structure.module_names[module]: int(sensors[module]) for module in dark}
 
@@ -242,7 +243,7 @@ class DriverLog:
         is_dark = ((self._always & np.uint8(Status.SUSPECT)) != 0) & ~self._is_lit & (self.frames > 0)
         found = np.bincount(self.structure.sensor_module, is_dark, self.structure.n_modules) > 0
         found[self.structure.sensor_module[~is_dark]] = False
-        return found
+        return found if self.newest is None else found | self.newest.module_untouched
 
 
 __all__ = ["DriverLog"]

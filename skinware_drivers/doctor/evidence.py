@@ -177,7 +177,8 @@ class DriverSeen:
         statuses: sensors by status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``, for people.
         lines: names of the rows and columns of matrices of which nothing good came.
-        dark: modules that told nothing but 0 and are suspect for it, with their numbers of sensors; none of ``lines``.
+        dark: modules that sent nothing but 0 so far, with how many of their sensors are suspect; none of
+            ``lines``.
         buses, patches: its.
         timing: its.
         health: of its taxels; None: not judged.

@@ -88,14 +88,16 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
 def _dark(driver: DriverSeen) -> Iterator[Finding]:
     if driver.dark:
         count = len(driver.dark)
+        is_fresh = not any(driver.dark.values())
         named = "; ".join(list(driver.dark)[:_MOST_LINES])
         yield Finding(
-            Severity.WARNING,
+            Severity.NOTE if is_fresh else Severity.WARNING,
             AREA,
-            f"{plural(count, 'module')} {'tells' if count == 1 else 'tell'} nothing but 0",
+            f"{plural(count, 'module')} {'has' if count == 1 else 'have'} sent nothing but 0 so far",
             f"driver {driver.name}",
             f"{named}{' ...' if count > _MOST_LINES else ''}",
-            "touch each once: those that go on with 0 are dead or switched off; look at their cables and plugs",
+            "fine where nothing touches them and taxels rest at 0; else touch each once: those that go on with 0 are"
+            " dead or switched off, look at their cables and plugs",
             (f"skin-top {driver.name}",),
             _STATUS,
         )

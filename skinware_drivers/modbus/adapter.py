@@ -16,7 +16,7 @@ from skinware.errors import BusError, ConfigurationError
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.conditions import Identifier
-from skinware_drivers.layout import AnyFlag, Frame, Layout, Values
+from skinware_drivers.layout import AnyFlag, Frame, Layout
 from skinware_drivers.link import Link, Match
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.bus import ModbusBus
@@ -256,12 +256,11 @@ class ModbusAdapter(Adapter[OptionsT]):
 
     def _frame(self, number: int, block: Registers) -> Frame:
         block.check(self.address_step)
-        values = Values(0, f">{block.dtype}", block.count // block.words, block.to)
         return Frame(
             f"{block.name} ({number})",
             [Identifier(number)],
             [2 * block.count],
-            values,
+            block.runs,
             patch=block.patch,
             module=block.module,
             flags=[*self.flags, *block.flags],
@@ -272,8 +271,7 @@ def _refuse_twice(registers: Sequence[Registers]) -> None:
     """A value lies in one block."""
     owners: dict[tuple[int | None, int | None, int], Registers] = {}
     for block in registers:
-        channels = block.to if block.to is not None else range(block.count // max(1, block.words))
-        for channel in channels:
+        for channel in (channel for run in block.runs for channel in run.channels):
             if channel is None:
                 continue
             owner = owners.setdefault((block.patch, block.module, channel), block)

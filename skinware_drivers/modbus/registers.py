@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.layout import AnyFlag
+from skinware_drivers.layout import AnyFlag, Packed, Values
 from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
 
 Order = Literal["big", "little"]
@@ -37,6 +37,8 @@ class Registers:
         module: key of the module, if the patch has several.
         every: it is read in each cycle (1), in every second one (2) ...
         flags: what sets status bits in it, beside the ``flags`` of the adapter.
+        values: where the values are in the bytes of the block, for blocks that are not values of one ``dtype`` one
+            after the other; then ``dtype`` and ``to`` are not used. Blocks may overlap.
     """
 
     address: int
@@ -49,11 +51,17 @@ class Registers:
     module: int | None = None
     every: int = 1
     flags: Sequence[AnyFlag] = ()
+    values: Sequence[Values] = ()
 
     @property
     def words(self) -> int:
         """Registers of a value."""
         return np.dtype(self.dtype).itemsize // 2
+
+    @property
+    def runs(self) -> Sequence[Values]:
+        """Where the values are in the bytes of the block."""
+        return self.values or (Values(0, f">{self.dtype}", self.count // self.words, self.to),)
 
     @property
     def name(self) -> str:
@@ -267,9 +275,17 @@ class Image:
         """In the order of the layout: the most significant byte first."""
         if self._wanted.byte_order == "little":
             registers = registers[:, ::-1]
-        if self._wanted.word_order == "little" and block.words > 1:
-            registers = registers.reshape(-1, block.words, 2)[:, ::-1]
-        return registers.tobytes()
+        data = registers.tobytes()
+        if self._wanted.word_order == "little":
+            for run in block.runs:
+                data = data[: run.offset] + _turned(data[run.offset : run.end], run) + data[run.end :]
+        return data
+
+
+def _turned(data: bytes, run: Values) -> bytes:
+    """The values of a run with their registers in the other order."""
+    words = 1 if isinstance(run.dtype, Packed) else np.dtype(run.dtype).itemsize // 2
+    return data if words < 2 else np.frombuffer(data, ">u2").reshape(-1, words)[:, ::-1].tobytes()
 
 
 __all__ = ["Image", "Order", "Read", "Registers", "Row", "Wanted"]

@@ -42,20 +42,25 @@ static void copy_values(const struct path *path, int64_t number)
     }
 }
 
-/* Of several updates of one module, the last one stays. */
+/* Of several updates of one group, the last one stays. */
 void show(struct path *path, const int64_t *updates, int64_t n)
 {
     const struct plan *plan = path->plan;
     bool is_to_see = n && path->words->sees_all;
     for (int64_t i = 0; i < n; i++) {
         const struct update *update = update_at(path, updates[i]);
-        plan->touched[update->module] = 1;
+        const int64_t *groups = (const int64_t *)(intptr_t)update->groups;
+        for (int64_t j = 0; j < plan->most_groups; j++) {
+            plan->touched[groups[j]] = 1;
+            plan->updated[groups[j]] |= (uint8_t)update->whole;
+            if (update->whole)
+                plan->group_time_ns[groups[j]] = update->oldest_ns;
+        }
         if (!update->whole)
             continue;
         copy_values(path, updates[i]);
-        plan->module_time_ns[update->module] = update->oldest_ns;
-        plan->updated[update->module] = 1;
-        plan->patch_time_ns[plan->module_patch[update->module]] = update->newest_ns;
+        if (plan->is_prompt[update->group])
+            plan->patch_time_ns[plan->group_patch[update->group]] = update->newest_ns;
         is_to_see |= update->is_flagged;
     }
     if (n && update_at(path, updates[n - 1])->newest_ns > path->words->newest_ns)
@@ -66,20 +71,20 @@ void show(struct path *path, const int64_t *updates, int64_t n)
     }
 }
 
-/* Leave out all but the last updates of every module, so many at the most; how many are left. */
+/* Leave out all but the last updates of every group, so many at the most; how many are left. */
 static int64_t skip_the_oldest(struct path *path, int64_t n, int64_t most)
 {
     const struct plan *plan = path->plan;
-    int64_t left = n, *from_last = path->of_module, limit = most > 1 ? most : 1;
+    int64_t left = n, *from_last = path->of_group, limit = most > 1 ? most : 1;
     if (n <= most)
         return n;
-    memset(from_last, 0, (size_t)plan->n_modules * sizeof *from_last);
+    memset(from_last, 0, (size_t)plan->n_groups * sizeof *from_last);
     for (int64_t i = n - 1; i >= 0; i--) {
         const struct update *update = update_at(path, path->list[i]);
-        if (++from_last[update->module] <= limit)
+        if (++from_last[update->group] <= limit)
             path->list[--left] = path->list[i];
         else if (update->whole)
-            skip(path, plan->module_patch[update->module], 1);
+            skip(path, plan->group_patch[update->group], 1);
     }
     memmove(path->list, path->list + left, (size_t)(n - left) * sizeof *path->list);
     return n - left;
@@ -88,13 +93,13 @@ static int64_t skip_the_oldest(struct path *path, int64_t n, int64_t most)
 static void show_the_newest(struct path *path, const int64_t *updates, int64_t n)
 {
     const struct plan *plan = path->plan;
-    int64_t *of_module = path->of_module;
-    memset(of_module, 0, (size_t)plan->n_modules * sizeof *of_module);
+    int64_t *of_group = path->of_group;
+    memset(of_group, 0, (size_t)plan->n_groups * sizeof *of_group);
     for (int64_t i = 0; i < n; i++)
-        of_module[update_at(path, updates[i])->module] += update_at(path, updates[i])->whole;
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        if (of_module[module] + plan->updated[module] > 1)
-            skip(path, plan->module_patch[module], of_module[module] + plan->updated[module] - 1);
+        of_group[update_at(path, updates[i])->group] += update_at(path, updates[i])->whole;
+    for (int64_t group = 0; group < plan->n_groups; group++)
+        if (of_group[group] + plan->updated[group] > 1)
+            skip(path, plan->group_patch[group], of_group[group] + plan->updated[group] - 1);
     show(path, updates, n);
 }
 
@@ -103,8 +108,8 @@ void find_begun(struct path *path)
 {
     const struct plan *plan = path->plan;
     memset(path->has_begun, 0, (size_t)plan->n_patches);
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        path->has_begun[plan->module_patch[module]] |= plan->updated[module];
+    for (int64_t group = 0; group < plan->n_groups; group++)
+        path->has_begun[plan->group_patch[group]] |= plan->updated[group] & plan->is_prompt[group];
 }
 
 /* `is_open`: patches whose burst has begun in this frame, is not whole, and not too old to go on. Whether any is. */
@@ -113,9 +118,9 @@ bool find_open(struct path *path, int64_t time_ns)
     const struct plan *plan = path->plan;
     bool any = false;
     memset(path->is_open, 0, (size_t)plan->n_patches);
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        if (!plan->touched[module] && lives(path, module))
-            any = (path->is_open[plan->module_patch[module]] = 1);
+    for (int64_t group = 0; group < plan->n_groups; group++)
+        if (!plan->touched[group] && lives(path, group))
+            any = (path->is_open[plan->group_patch[group]] = 1);
     if (!any)
         return false;
     any = false;
@@ -135,14 +140,16 @@ static void learn_pauses(struct path *path, int64_t n, const int64_t *gap_ns)
     for (int64_t patch = 0; patch < plan->n_patches; patch++)
         longest_ns[patch] = INT64_MIN;
     for (int64_t i = 0; i < n; i++) {
-        int64_t module = update_at(path, path->list[i])->module, patch = plan->module_patch[module];
-        plan->gap_ns[module] = gap_ns[i] < 2 * longest_pause_ns ? gap_ns[i] : 0;
-        if (plan->gap_ns[module] > longest_ns[patch])
-            longest_ns[patch] = plan->gap_ns[module];
+        int64_t group = update_at(path, path->list[i])->group, patch = plan->group_patch[group];
+        if (!plan->is_prompt[group])
+            continue;
+        plan->gap_ns[group] = gap_ns[i] < 2 * longest_pause_ns ? gap_ns[i] : 0;
+        if (plan->gap_ns[group] > longest_ns[patch])
+            longest_ns[patch] = plan->gap_ns[group];
     }
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        if (plan->gap_ns[module] > longest_ns[plan->module_patch[module]])
-            longest_ns[plan->module_patch[module]] = plan->gap_ns[module];
+    for (int64_t group = 0; group < plan->n_groups; group++)
+        if (plan->gap_ns[group] > longest_ns[plan->group_patch[group]])
+            longest_ns[plan->group_patch[group]] = plan->gap_ns[group];
     for (int64_t patch = 0; patch < plan->n_patches; patch++) {
         double own_ns = (double)longest_pause_ns;
         if ((double)longest_ns[patch] >= plan->standing_out_ns[patch])
@@ -157,19 +164,21 @@ static void find_bursts(struct path *path, int64_t n)
 {
     const struct plan *plan = path->plan;
     int64_t *before = path->before, *of_patch = path->of_patch, *gap_ns = path->other;
-    begin_chains(&path->modules);
+    begin_chains(&path->updated_groups);
     begin_chains(&path->patches);
     for (int64_t i = 0; i < n; i++) {
         const struct update *update = update_at(path, path->list[i]);
-        int64_t module = update->module, patch = plan->module_patch[module];
-        int64_t previous = chain_on(&path->modules, module, i);
-        bool is_shown = update->whole ? plan->touched[module] : plan->updated[module];
+        int64_t group = update->group, patch = plan->group_patch[group];
+        int64_t previous = chain_on(&path->updated_groups, group, i);
+        bool is_shown = update->whole ? plan->touched[group] : plan->updated[group];
         if (previous == NEVER)
             before[i] = is_shown ? 0 : NEVER;
         else if (!update->whole && !update_at(path, path->list[previous])->whole)
             before[i] = NEVER;
         else
             before[i] = previous + 1;
+        if (!plan->is_prompt[group])
+            continue; /* slow groups come at any time: they neither begin nor end a burst */
         of_patch[i] = chain_on(&path->patches, patch, i);
         gap_ns[i] = update->oldest_ns - (of_patch[i] == NEVER ? plan->patch_time_ns[patch]
                                                               : update_at(path, path->list[of_patch[i]])->newest_ns);
@@ -177,8 +186,8 @@ static void find_bursts(struct path *path, int64_t n)
     learn_pauses(path, n, gap_ns);
     find_begun(path);
     for (int64_t i = 0; i < n; i++) {
-        int64_t patch = plan->module_patch[update_at(path, path->list[i])->module];
-        if (gap_ns[i] > plan->burst_pause_ns[patch] && (of_patch[i] != NEVER || path->has_begun[patch]) &&
+        int64_t group = update_at(path, path->list[i])->group, patch = plan->group_patch[group];
+        if (plan->is_prompt[group] && gap_ns[i] > plan->burst_pause_ns[patch] && (of_patch[i] != NEVER || path->has_begun[patch]) &&
             of_patch[i] + 1 > before[i])
             before[i] = of_patch[i] + 1;
     }
@@ -198,7 +207,7 @@ static int64_t finish(struct path *path, int64_t begin, int64_t n, int64_t thres
     int64_t n_early = 0, n_rest = 0, *early = path->other;
     memcpy(path->has_begun, path->is_open, (size_t)plan->n_patches); /* of these, what comes belongs to the open burst */
     for (int64_t i = begin; i < n; i++) {
-        int64_t number = path->list[i], patch = plan->module_patch[update_at(path, number)->module];
+        int64_t number = path->list[i], patch = plan->group_patch[update_at(path, number)->group];
         if (path->has_begun[patch] && path->before[i] >= threshold)
             path->has_begun[patch] = path->is_open[patch] = 0;
         if (path->has_begun[patch])
@@ -240,7 +249,7 @@ static int64_t take_in_order(struct path *path, int64_t n)
         }
         const struct update *next = update_at(path, path->list[end]);
         find_open(path, next->oldest_ns);
-        path->is_open[plan->module_patch[next->module]] = 0;
+        path->is_open[plan->group_patch[next->group]] = 0;
         for (int64_t patch = 0; patch < plan->n_patches; patch++)
             if (path->is_open[patch])
                 return finish(path, end, n, threshold);

@@ -56,8 +56,8 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
         plan.header_byte, plan.header = decoder.header[0], arrays.at(decoder.header[1])
 
     assemblies = [*decoder.alone.items()]
-    groups = [([number], assembly) for number, assembly in assemblies]
-    groups += [(cycle.members, cycle.assembly) for cycle in decoder.cycles]
+    made_of = [([number], assembly) for number, assembly in assemblies]
+    made_of += [(cycle.members, cycle.assembly) for cycle in decoder.cycles]
     _, plan.assemblies = arrays.structs(
         structs.Assembly,
         (
@@ -66,12 +66,13 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
                 arrays.of(members, np.int64),
                 arrays.at(assembly.channels),
                 arrays.of(assembly.destination, np.int32),
+                arrays.at(assembly.groups),
             )
-            for members, assembly in groups
+            for members, assembly in made_of
         ),
     )
     kinds = [_kind(kind, decoder, arrays) for kind in decoder.kinds]
-    for number, (members, assembly) in enumerate(groups):
+    for number, (members, assembly) in enumerate(made_of):
         for place, (member, columns) in enumerate(zip(members, assembly.columns, strict=True)):
             kind = kinds[member]
             kind.assembly, kind.place, kind.column = number, place, columns.start
@@ -83,14 +84,19 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
         (_cycle(cycle, len(assemblies) + number, arrays) for number, cycle in enumerate(decoder.cycles)),
     )
     plan.module_patch = arrays.of(structure.module_patch, np.int64)
-    plan.sensor_module = arrays.of(structure.sensor_module, np.int64)
-    plan.first_module = arrays.of(np.searchsorted(structure.module_patch, np.arange(structure.n_patches)), np.int64)
+    plan.n_groups, plan.groups_are_modules = structure.n_groups, structure.groups_are_modules
+    plan.most_groups = decoder.most_groups
+    plan.group_module, plan.group_patch = (
+        arrays.of(of, np.int64) for of in (structure.group_module, structure.group_patch)
+    )
+    plan.sensor_group = arrays.of(structure.sensor_group, np.int64)
+    plan.first_group = arrays.of(np.searchsorted(structure.group_patch, np.arange(structure.n_patches)), np.int64)
     plan.patch_bus = arrays.of(structure.patch_bus, np.int64)
     plan.last_sequence, plan.haste = arrays.at(decoder.sequences.last), arrays.at(decoder.haste)
     plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
 
     plan.values, plan.status = arrays.at(state.values_and_sink), arrays.at(state.status_and_sink)
-    plan.module_time_ns, plan.updated = arrays.at(state.module_time_ns), arrays.at(state.updated)
+    plan.group_time_ns, plan.updated = arrays.at(state.group_time_ns), arrays.at(state.updated)
     plan.patch_time_ns, plan.touched = arrays.at(state.patch_time_ns), arrays.at(state.touched)
     plan.bus_counters, plan.patch_counters = arrays.at(state.bus_counters), arrays.at(state.patch_counters)
 

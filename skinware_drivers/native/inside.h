@@ -25,6 +25,8 @@ struct words { /* what Python sees and sets between calls */
 
 struct update { /* followed by int32_t sensors[width], values[width], uint8_t status[width] */
     int64_t module, row, whole, is_flagged, oldest_ns, newest_ns;
+    int64_t group;  /* the first of its update groups stands for it */
+    int64_t groups; /* address of all of them, plan.most_groups */
 };
 
 struct chain { /* the last element of every key so far, forgotten all at once */
@@ -60,11 +62,11 @@ struct path {
     int64_t *list, *other, *before, *of_patch; /* (most_updates,) */
     int64_t *expanded_update, *expanded_row, *expanded_kind, n_expanded; /* frames that are read by Python */
     uint8_t *has_failed;
-    int64_t *of_module, *of_patch_ns; /* (n_modules,), (n_patches,) */
-    struct chain modules, patches;
+    int64_t *of_group, *of_patch_ns; /* (n_groups,), (n_patches,) */
+    struct chain updated_groups, patches;
     uint8_t *is_open, *was_open, *has_begun; /* (n_patches,) */
     int64_t left;                 /* publications of this take */
-    int64_t living_ns;            /* as of when modules live, in this take */
+    int64_t living_ns;            /* as of when groups live, in this take */
 };
 
 static inline struct update *update_at(const struct path *path, int64_t number)
@@ -120,9 +122,10 @@ static inline int64_t chain_on(struct chain *chain, int64_t key, int64_t element
     return before;
 }
 
-static inline bool lives(const struct path *path, int64_t module)
+/* Whether a group can be expected to send in every period. */
+static inline bool lives(const struct path *path, int64_t group)
 {
-    return path->living_ns - path->plan->module_heard_ns[module] < path->plan->silence_ns;
+    return path->plan->is_prompt[group] && path->living_ns - path->plan->group_heard_ns[group] < path->plan->silence_ns;
 }
 
 static inline int64_t floor_mod(int64_t value, int64_t by)
@@ -140,6 +143,7 @@ void name_rows(struct path *path, int64_t time_ns);
 void count_strangers(struct path *path, const int64_t *rows, int64_t n, int64_t time_ns);
 void find_cycles(struct path *path, const struct cycle *cycle, int64_t number);
 int64_t new_update(struct path *path);
+void join_groups(const struct path *path, struct update *update, const struct assembly *assembly);
 void read_update(struct path *path, const struct assembly *assembly, int64_t number, const int64_t *rows);
 void finish_updates(struct path *path, int64_t first);
 void compare_sequence(struct path *path, const struct number *sequence, int64_t row);

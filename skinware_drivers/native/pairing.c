@@ -172,7 +172,7 @@ static void fill_in(struct path *path, const struct cycle *cycle, int64_t number
         memset(unset[i], 0, (size_t)m);
 }
 
-static void add_orphan(struct path *path, int64_t row)
+static void add_orphan(struct path *path, const struct cycle *cycle, int64_t row)
 {
     int64_t number = new_update(path);
     if (number < 0)
@@ -180,6 +180,7 @@ static void add_orphan(struct path *path, int64_t row)
     struct update *update = update_at(path, number);
     update->module = path->entry[row];
     update->row = row;
+    join_groups(path, update, &path->plan->assemblies[cycle->assembly]);
     update->oldest_ns = update->newest_ns = path->batch->time_ns[row];
     path->plan->patch_counters[path->plan->module_patch[update->module] * N_PATCH_COUNTERS + ORPHANS]++;
 }
@@ -238,7 +239,7 @@ void find_cycles(struct path *path, const struct cycle *cycle, int64_t number)
         if (what >= 2 * m)
             carry(path, row);
         else if (what >= m)
-            add_orphan(path, row);
+            add_orphan(path, cycle, row);
         else if (what >= 0)
             add_cycle(path, cycle, what);
     }

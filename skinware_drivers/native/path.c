@@ -3,7 +3,7 @@
 
 #include <stdlib.h>
 
-enum { ABI = 5, FIRST_UPDATES = 64 };
+enum { ABI = 7, FIRST_UPDATES = 64 };
 
 SKINWARE_EXPORT uint32_t skinware_native_abi(void)
 {
@@ -60,10 +60,11 @@ SKINWARE_EXPORT void skinware_path_free(struct path *path)
                    path->expanded_kind,   path->first_of_group, path->kind,         path->is_wrong,     path->is_severed,
                    path->place,           path->is_member,     path->is_soon,       path->is_held_up,   path->is_doubtful,
                    path->is_used,         path->is_waiting,    path->is_orphan,     path->has_failed,   path->groups.last,
-                   path->groups.turn,     path->punctual.last, path->punctual.turn, path->modules.last, path->modules.turn,
+                   path->groups.turn,     path->punctual.last, path->punctual.turn, path->updated_groups.last,
+                   path->updated_groups.turn,
                    path->patches.last,    path->patches.turn,  path->before_ns,     path->before_spacing_ns,
                    path->carried_wire,    path->carried_time_ns, path->carried_bus, path->store,        path->spare,
-                   path->list,            path->other,         path->before,        path->of_patch,     path->of_module,
+                   path->list,            path->other,         path->before,        path->of_patch,     path->of_group,
                    path->of_patch_ns,     path->is_open,       path->was_open,      path->has_begun};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++)
         free(all[i]);
@@ -95,14 +96,14 @@ SKINWARE_EXPORT struct path *skinware_path_new(const struct plan *plan, struct b
     make_rows(path, batch->capacity);
     make_chain(path, &path->groups, plan->n_modules + plan->n_patches + 1);
     make_chain(path, &path->punctual, n_keys);
-    make_chain(path, &path->modules, plan->n_modules);
+    make_chain(path, &path->updated_groups, plan->n_groups);
     make_chain(path, &path->patches, plan->n_patches);
     path->before_ns = room(path, n_keys, sizeof *path->before_ns);
     path->before_spacing_ns = room(path, n_keys, sizeof *path->before_spacing_ns);
     path->carried_wire = room(path, batch->headroom, (size_t)batch->row_bytes);
     path->carried_time_ns = room(path, batch->headroom, sizeof *path->carried_time_ns);
     path->carried_bus = room(path, batch->headroom, sizeof *path->carried_bus);
-    path->of_module = room(path, plan->n_modules, sizeof *path->of_module);
+    path->of_group = room(path, plan->n_groups, sizeof *path->of_group);
     path->of_patch_ns = room(path, plan->n_patches, sizeof *path->of_patch_ns);
     path->is_open = room(path, plan->n_patches, 1);
     path->was_open = room(path, plan->n_patches, 1);

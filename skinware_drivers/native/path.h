@@ -81,6 +81,7 @@ struct assembly { /* what makes one update of a module */
     const int64_t *members;     /* kinds, in order */
     const int64_t *channels;    /* (width,) */
     const int32_t *destination; /* (modules, width) sensor of each value */
+    const int64_t *groups;      /* (modules, most_groups) update groups, n_groups: none */
 };
 
 enum order { GIVEN, ANY, ENDS_WITH };
@@ -127,12 +128,13 @@ enum { UPDATES, ORPHANS, LATE, SEQUENCE_LOST, SEQUENCE_REPEATED, SEQUENCE_BACK, 
 enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, SAMPLE_REFUSED, N_SAMPLE_KINDS };
 
 struct columns { /* of a slot: where they begin, bytes from its start */
-    int64_t values, status, module_time_ns, patch_state, bus_state, bus_reason, bus_since_ns, bus_load, bus_samples;
+    int64_t values, status, module_time_ns, group_time_ns, module_untouched, patch_state, bus_state, bus_reason, bus_since_ns;
+    int64_t bus_load, bus_samples;
     int64_t bus_counters, patch_counters, patch_interval_counts, patch_age_counts, latency_ns, data_path, bus_data_path;
 };
 
 struct plan {
-    int64_t n_buses, n_patches, n_modules, n_sensors, value_type, value_bytes, width;
+    int64_t n_buses, n_patches, n_modules, n_groups, n_sensors, value_type, value_bytes, width;
 
     /* naming */
     int64_t nobody, n_kinds, n_forms, length_columns, header_byte;
@@ -146,12 +148,15 @@ struct plan {
     const struct kind *kinds;
 
     /* updates */
-    int64_t n_cycles;
+    int64_t n_cycles, most_groups, groups_are_modules;
     const struct assembly *assemblies;
     const struct cycle *cycles;
     const int64_t *module_patch;  /* (n_modules,) */
-    const int64_t *sensor_module; /* (n_sensors,) */
-    const int64_t *first_module;  /* (n_patches,) */
+    const int64_t *group_module, *group_patch; /* (n_groups,) */
+    const int64_t *sensor_group;  /* (n_sensors,) */
+    const int64_t *first_group;   /* (n_patches,) */
+    const uint8_t *is_prompt;     /* (n_groups,) bool: in every period, so that frames wait for it */
+    const int64_t *age_limit_ns;  /* (n_groups,) */
     int64_t *last_sequence;       /* (n_modules,) */
     int64_t *haste;               /* (n_patches,) */
     int64_t *unknown_identifiers; /* (n_buses, 2048) */
@@ -161,9 +166,8 @@ struct plan {
     /* what is shown */
     uint8_t *values; /* (n_sensors + 1,) */
     uint8_t *status; /* (n_sensors + 1,) */
-    int64_t *module_time_ns, *patch_time_ns; /* one more than there are */
-    uint8_t *updated;                        /* (n_modules + 1,) bool */
-    uint8_t *touched;                        /* (n_modules,) bool */
+    int64_t *group_time_ns, *patch_time_ns; /* one more than there are */
+    uint8_t *updated, *touched;             /* (n_groups + 1,) bool */
     int64_t *bus_counters, *patch_counters;
 
     /* bursts and publication */
@@ -171,12 +175,11 @@ struct plan {
     int64_t stale, state_live, state_stale; /* bit of a status; states of a patch */
     int64_t *burst_pause_ns;           /* (n_patches,) */
     const double *standing_out_ns;     /* (n_patches,) */
-    int64_t *gap_ns;                   /* (n_modules,) */
-    int64_t *module_heard_ns;          /* (n_modules,) */
-    int64_t *patch_heard_ns, *patch_updated_ns; /* (n_patches,) */
-    uint8_t *behind;                            /* (n_modules,) bool */
+    int64_t *gap_ns;                   /* (n_groups,) */
+    int64_t *group_heard_ns;           /* (n_groups,) */
+    int64_t *patch_heard_ns, *patch_lives_until_ns; /* (n_patches,) */
     uint8_t *patch_state;
-    const uint8_t *module_status; /* (n_modules,) of the watch */
+    const uint8_t *module_status, *module_untouched; /* (n_modules,) of the watch */
     const uint8_t *bus_state, *bus_reason, *bus_samples;
     const int64_t *bus_since_ns;
     const uint16_t *bus_load;

@@ -21,33 +21,28 @@ static void count_timing(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     int64_t *intervals = plan->timing, *ages = plan->timing + plan->n_patches * SKINWARE__BUCKETS;
-    for (int64_t module = 0; module < plan->n_modules; module++) {
-        if (!plan->updated[module])
+    for (int64_t group = 0; group < plan->n_groups; group++) {
+        if (!plan->updated[group] || !plan->is_prompt[group])
             continue;
-        int64_t shown_ns = plan->module_time_ns[module], before_ns = plan->timing_before_ns[module];
-        int64_t first = plan->module_patch[module] * SKINWARE__BUCKETS;
+        int64_t shown_ns = plan->group_time_ns[group], before_ns = plan->timing_before_ns[group];
+        int64_t first = plan->group_patch[group] * SKINWARE__BUCKETS;
         if (before_ns > 0)
             intervals[first + skinware__bucket(shown_ns - before_ns)]++;
         ages[first + skinware__bucket(time_ns - shown_ns)]++;
-        plan->timing_before_ns[module] = shown_ns;
+        plan->timing_before_ns[group] = shown_ns;
     }
 }
 
-/* Marks modules that missed their patch's last update, or have been silent for too long; `of_module`: their bits. */
-static bool judge_modules(struct path *path, int64_t time_ns)
+/* Marks groups that have been silent for too long; `of_group`: their bits. */
+static bool judge_groups(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     bool any = false;
-    find_begun(path);
-    for (int64_t module = 0; module < plan->n_modules; module++) {
-        int64_t patch = plan->module_patch[module], shown_ns = plan->module_time_ns[module];
-        if (plan->by_cycle)
-            plan->behind[module] = (plan->behind[module] | path->has_begun[patch]) && !plan->updated[module];
-        else
-            plan->behind[module] = plan->patch_time_ns[patch] - shown_ns > plan->period_ns * 3 / 2;
-        bool is_stale = shown_ns > 0 && (plan->behind[module] || shown_ns < time_ns - plan->silence_ns);
-        path->of_module[module] = (is_stale ? plan->stale : 0) | plan->module_status[module];
-        any |= path->of_module[module] != 0;
+    for (int64_t group = 0; group < plan->n_groups; group++) {
+        int64_t shown_ns = plan->group_time_ns[group];
+        bool is_stale = shown_ns > 0 && shown_ns < time_ns - plan->age_limit_ns[group];
+        path->of_group[group] = (is_stale ? plan->stale : 0) | plan->module_status[plan->group_module[group]];
+        any |= path->of_group[group] != 0;
     }
     return any;
 }
@@ -56,9 +51,9 @@ static void fill_status(struct path *path, uint8_t *status, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     memcpy(status, plan->status, (size_t)plan->n_sensors);
-    if (judge_modules(path, time_ns))
+    if (judge_groups(path, time_ns))
         for (int64_t sensor = 0; sensor < plan->n_sensors; sensor++)
-            status[sensor] |= (uint8_t)path->of_module[plan->sensor_module[sensor]];
+            status[sensor] |= (uint8_t)path->of_group[plan->sensor_group[sensor]];
 }
 
 /* What buses count themselves is there already. */
@@ -77,6 +72,23 @@ static void fill(const void *from, uint8_t *slot, int64_t column, int64_t bytes)
     memcpy(slot + column, from, (size_t)bytes);
 }
 
+/* The times of groups, and of each module the oldest of its groups. */
+static void fill_times(const struct plan *plan, uint8_t *slot)
+{
+    int64_t *of_modules = (int64_t *)(void *)(slot + plan->columns.module_time_ns);
+    if (plan->groups_are_modules) {
+        fill(plan->group_time_ns, slot, plan->columns.module_time_ns, plan->n_modules * 8);
+        return;
+    }
+    fill(plan->group_time_ns, slot, plan->columns.group_time_ns, plan->n_groups * 8);
+    for (int64_t group = plan->n_groups - 1; group >= 0; group--) {
+        int64_t module = plan->group_module[group], time_ns = plan->group_time_ns[group];
+        bool is_last = group == plan->n_groups - 1 || plan->group_module[group + 1] != module;
+        if (is_last || time_ns < of_modules[module])
+            of_modules[module] = time_ns;
+    }
+}
+
 static void write_frame(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
@@ -86,8 +98,9 @@ static void write_frame(struct path *path, int64_t time_ns)
     skinware_ring_writer *ring = (skinware_ring_writer *)(intptr_t)path->words->ring;
     uint8_t *slot = skinware_ring_begin(ring);
     fill(plan->values, slot, columns->values, plan->n_sensors * plan->value_bytes);
-    fill(plan->module_time_ns, slot, columns->module_time_ns, plan->n_modules * 8);
+    fill_times(plan, slot);
     fill_status(path, slot + columns->status, time_ns);
+    fill(plan->module_untouched, slot, columns->module_untouched, plan->n_modules);
     fill(plan->patch_state, slot, columns->patch_state, plan->n_patches);
     fill(plan->bus_state, slot, columns->bus_state, plan->n_buses);
     fill(plan->bus_reason, slot, columns->bus_reason, plan->n_buses);
@@ -110,9 +123,9 @@ static int64_t oldest_new_ns(const struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     int64_t oldest_ns = INT64_MAX;
-    for (int64_t module = 0; module < plan->n_modules; module++)
-        if (plan->updated[module] && plan->module_time_ns[module] < oldest_ns)
-            oldest_ns = plan->module_time_ns[module];
+    for (int64_t group = 0; group < plan->n_groups; group++)
+        if (plan->updated[group] && plan->group_time_ns[group] < oldest_ns)
+            oldest_ns = plan->group_time_ns[group];
     return oldest_ns == INT64_MAX ? time_ns : oldest_ns;
 }
 
@@ -126,38 +139,39 @@ void publish(struct path *path)
         if (words->wanted_ns != INT64_MAX)
             plan->hooks.published(oldest_new_ns(path, time_ns));
     }
-    memset(plan->updated, 0, (size_t)plan->n_modules);
-    memset(plan->touched, 0, (size_t)plan->n_modules);
+    memset(plan->updated, 0, (size_t)plan->n_groups);
+    memset(plan->touched, 0, (size_t)plan->n_groups);
     words->due_ns = words->not_before_ns = 0;
     words->last_published_ns = time_ns;
 }
 
-/* Note who lives. Of a patch that begins to send, all its modules: its first burst is not over after one. */
+/* Note which groups live. Of a patch that begins to send, all: its first burst is not over after one. */
 static void hear(struct path *path, int64_t first, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
     for (int64_t number = first; number < path->n_updates; number++) {
         const struct update *update = update_at(path, number);
-        int64_t patch = plan->module_patch[update->module];
-        if (time_ns - plan->patch_heard_ns[patch] > plan->silence_ns)
-            for (int64_t module = plan->first_module[patch];
-                 module < plan->n_modules && plan->module_patch[module] == patch; module++)
-                plan->module_heard_ns[module] = time_ns;
-        plan->patch_heard_ns[patch] = plan->module_heard_ns[update->module] = time_ns;
-    }
-    for (int64_t i = first; i < path->n_updates; i++) {
-        const struct update *update = update_at(path, path->list[i]);
-        if (update->whole)
-            plan->patch_updated_ns[plan->module_patch[update->module]] = update->newest_ns;
+        int64_t patch = plan->group_patch[update->group];
+        if (plan->is_prompt[update->group]) {
+            if (time_ns - plan->patch_heard_ns[patch] > plan->silence_ns)
+                for (int64_t group = plan->first_group[patch];
+                     group < plan->n_groups && plan->group_patch[group] == patch; group++)
+                    plan->group_heard_ns[group] = time_ns;
+            plan->patch_heard_ns[patch] = time_ns;
+        }
+        plan->group_heard_ns[update->group] = time_ns;
+        int64_t seen_ns = update->newest_ns < time_ns ? update->newest_ns : time_ns;
+        int64_t until_ns = seen_ns + plan->age_limit_ns[update->group];
+        if (update->whole && until_ns > plan->patch_lives_until_ns[patch])
+            plan->patch_lives_until_ns[patch] = until_ns;
     }
 }
 
 static void update_patch_states(struct path *path, int64_t time_ns)
 {
     const struct plan *plan = path->plan;
-    int64_t since_ns = time_ns > plan->silence_ns ? time_ns - plan->silence_ns : 0;
     for (int64_t patch = 0; patch < plan->n_patches; patch++)
-        if (plan->patch_updated_ns[patch] > since_ns)
+        if (plan->patch_lives_until_ns[patch] > time_ns)
             plan->patch_state[patch] = (uint8_t)plan->state_live;
         else if (plan->patch_state[patch] == plan->state_live)
             plan->patch_state[patch] = (uint8_t)plan->state_stale;
@@ -172,10 +186,10 @@ static void look_at_frame(struct path *path, int64_t time_ns)
         path->words->due_ns = time_ns + plan->pause_ns;
         return;
     }
-    for (int64_t module = 0; module < plan->n_modules; module++) {
-        any_updated |= plan->updated[module];
-        any_touched |= plan->touched[module];
-        is_complete &= plan->touched[module] || !lives(path, module);
+    for (int64_t group = 0; group < plan->n_groups; group++) {
+        any_updated |= plan->updated[group];
+        any_touched |= plan->touched[group];
+        is_complete &= plan->touched[group] || !lives(path, group);
     }
     if (any_updated && is_complete)
         publish(path);

@@ -185,6 +185,14 @@ static void apply_flags(const struct path *path, const struct kind *kind, int64_
     }
 }
 
+/* Note which groups an update of a module belongs to. */
+void join_groups(const struct path *path, struct update *update, const struct assembly *assembly)
+{
+    const int64_t *groups = assembly->groups + update->module * path->plan->most_groups;
+    update->groups = (int64_t)(intptr_t)groups;
+    update->group = groups[0];
+}
+
 /* Read the frames of a whole update, those that Python reads excepted. `rows`: one of each member, in order. */
 void read_update(struct path *path, const struct assembly *assembly, int64_t number, const int64_t *rows)
 {
@@ -193,6 +201,7 @@ void read_update(struct path *path, const struct assembly *assembly, int64_t num
     struct update *update = update_at(path, number);
     memcpy(sensors_of(path, number), assembly->destination + update->module * plan->width,
            (size_t)plan->width * sizeof(int32_t));
+    join_groups(path, update, assembly);
     update->whole = 1;
     update->row = rows[0];
     update->oldest_ns = update->newest_ns = batch->time_ns[rows[0]];

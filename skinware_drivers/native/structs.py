@@ -97,7 +97,7 @@ class Kind(ctypes.Structure):
 class Assembly(ctypes.Structure):
     """What makes one update of a module."""
 
-    _fields_ = [*_fields("n_members"), *_fields("members channels destination", _POINTER)]
+    _fields_ = [*_fields("n_members"), *_fields("members channels destination groups", _POINTER)]
 
 
 class Cycle(ctypes.Structure):
@@ -126,8 +126,9 @@ class Columns(ctypes.Structure):
     """Where the columns of a slot begin."""
 
     _fields_ = _fields(
-        "values status module_time_ns patch_state bus_state bus_reason bus_since_ns bus_load bus_samples"
-        " bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns data_path bus_data_path"
+        "values status module_time_ns group_time_ns module_untouched patch_state bus_state bus_reason bus_since_ns"
+        " bus_load bus_samples bus_counters patch_counters patch_interval_counts patch_age_counts latency_ns"
+        " data_path bus_data_path"
     )
 
 
@@ -163,17 +164,21 @@ class Plan(ctypes.Structure):
     """All of one generation."""
 
     _fields_ = [
-        *_fields("n_buses n_patches n_modules n_sensors value_type value_bytes width"),
+        *_fields("n_buses n_patches n_modules n_groups n_sensors value_type value_bytes width"),
         *_fields("nobody n_kinds n_forms length_columns header_byte"),
         *_fields("entry candidates sets payload_names forms length_ok header kinds", _POINTER),
-        *_fields("n_cycles"),
-        *_fields("assemblies cycles module_patch sensor_module first_module", _POINTER),
+        *_fields("n_cycles most_groups groups_are_modules"),
+        *_fields("assemblies cycles module_patch group_module group_patch sensor_group first_group", _POINTER),
+        *_fields("is_prompt age_limit_ns", _POINTER),
         *_fields("last_sequence haste unknown_identifiers sample_next_ns interrupted", _POINTER),
-        *_fields("values status module_time_ns patch_time_ns updated touched bus_counters patch_counters", _POINTER),
+        *_fields("values status group_time_ns patch_time_ns updated touched bus_counters patch_counters", _POINTER),
         *_fields("period_ns patience_ns pause_ns silence_ns by_cycle most_at_once idle_ns n_counts n_own_counts"),
         *_fields("stale state_live state_stale"),
-        *_fields("burst_pause_ns standing_out_ns gap_ns module_heard_ns patch_heard_ns patch_updated_ns", _POINTER),
-        *_fields("behind patch_state module_status bus_state bus_reason bus_samples bus_since_ns bus_load", _POINTER),
+        *_fields("burst_pause_ns standing_out_ns gap_ns group_heard_ns patch_heard_ns patch_lives_until_ns", _POINTER),
+        *_fields(
+            "patch_state module_status module_untouched bus_state bus_reason bus_samples bus_since_ns bus_load",
+            _POINTER,
+        ),
         *_fields("bus_samples_bytes"),
         *_fields("latency_ns data_path bus_data_path", _POINTER),
         *_fields("counts skipped skipped_before patch_bus", _POINTER),
@@ -301,7 +306,9 @@ class Flow(ctypes.Structure):
     ]
 
 
-UPDATE = np.dtype([(name, np.int64) for name in ["module", "row", "whole", "is_flagged", "oldest_ns", "newest_ns"]])
+UPDATE = np.dtype(
+    [(name, np.int64) for name in ["module", "row", "whole", "is_flagged", "oldest_ns", "newest_ns", "group", "groups"]]
+)
 """An update; its sensors (int32), values and status (uint8) follow."""
 
 SIZES = (

@@ -1,6 +1,6 @@
 """Options of drivers and emulators: declared as structs, written by people as text or TOML, checked."""
 
-from skinware_drivers.options.declared import HasOptions, NoOptions, Option, describe_options
+from skinware_drivers.options.declared import HasOptions, NoOptions, Option, check_names, describe_options
 from skinware_drivers.options.names import nearest_name
 from skinware_drivers.options.texts import OptionsT, check_options, option_text, options_from_strings
 
@@ -9,6 +9,7 @@ __all__ = [
     "NoOptions",
     "Option",
     "OptionsT",
+    "check_names",
     "check_options",
     "describe_options",
     "nearest_name",

@@ -8,6 +8,7 @@ An options class is a ``msgspec.Struct`` whose fields carry a description::
 
 from __future__ import annotations
 
+from collections.abc import Set
 from typing import Annotated, Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -47,12 +48,17 @@ class HasOptions(Generic[OptionsT]):
         period_s: nominal time between two sets of data, s; options with a field ``period_ms`` set it.
 
     Raises:
-        ConfigurationError: when a subclass is made: what stands in its brackets is no class of options.
+        ConfigurationError: when a subclass is made: what stands in its brackets is no class of options, or the command
+            that takes them has an option of the same name.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
     least_options: ClassVar[type[msgspec.Struct]] = msgspec.Struct
     """What the class of the options must be derived from."""
+    options_command: ClassVar[str] = ""
+    """The command that takes the options as flags, beside its own."""
+    reserved_options: ClassVar[Set[str]] = frozenset()
+    """Names of the command's own options."""
     period_s: float = 0.02
 
     def __init_subclass__(cls, **more: Any) -> None:
@@ -73,6 +79,7 @@ class HasOptions(Generic[OptionsT]):
                     " its base has in brackets: leave out the line"
                 )
             cls.Options = named
+        check_names(cls.Options, cls.reserved_options, cls.options_command, f"class {cls.__name__}")
 
     def __init__(self, options: OptionsT) -> None:
         self.options = options
@@ -91,6 +98,26 @@ def _in_brackets(cls: Any) -> Any:
             inherited = _in_brackets(origin)
             return dict(zip(origin.__parameters__, get_args(base), strict=False)).get(inherited, inherited)
     return None
+
+
+def check_names(options_class: type[msgspec.Struct], reserved: Set[str], command: str, owner: str) -> None:
+    """Refuse options that the command line cannot carry.
+
+    Args:
+        options_class: the options.
+        reserved: names of the command's own options.
+        command: the command that takes both.
+        owner: whose options they are, for the message.
+
+    Raises:
+        ConfigurationError: an option has the name of one of the command's.
+    """
+    for name in options_class.__struct_encode_fields__:
+        if name.replace("-", "_") in reserved:
+            raise ConfigurationError(
+                f"{owner}: its option {name!r} would be hidden by --{name.replace('_', '-')} of {command}:"
+                f" give it another name, such as 'device_{name}'"
+            )
 
 
 def describe_options(options_class: type[msgspec.Struct]) -> list[Option]:

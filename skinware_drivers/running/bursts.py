@@ -31,7 +31,6 @@ class Bursts:
 
     Args:
         state: what is shown; its owner calls ``begin_frame`` after each publication.
-        module_patch: (n_modules,) int64.
         period_ns: nominal time from burst to burst.
         show: shows updates in ``state``.
         skip: told how many updates of each patch were skipped, (n_patches,) int64.
@@ -40,20 +39,19 @@ class Bursts:
     def __init__(
         self,
         state: SkinState,
-        module_patch: Indices,
         period_ns: int,
         show: Callable[[Updates], None],
         skip: Callable[[Indices], None],
     ) -> None:
         self._state = state
-        self._module_patch = module_patch
+        self._group_patch = state.group_patch
         self._n_patches = len(state.patch_time_ns)
         self.pause_ns: Indices = np.full(self._n_patches, period_ns // 2, np.int64)
-        self.standing_out_ns: npt.NDArray[np.float64] = (
-            _STANDS_OUT * period_ns / np.bincount(module_patch, minlength=self._n_patches)
-        )
-        self._first_module = np.searchsorted(module_patch, np.arange(self._n_patches))
-        self.gap_ns: Indices = np.zeros(len(module_patch), np.int64)  # before the last update of each module
+        self._all_prompt = bool(state.is_prompt.all())
+        n_prompt = np.bincount(self._group_patch[state.is_prompt], minlength=self._n_patches)
+        self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * period_ns / np.maximum(1, n_prompt)
+        self._first_group = np.searchsorted(self._group_patch, np.arange(self._n_patches))
+        self.gap_ns: Indices = np.zeros(len(self._group_patch), np.int64)  # before the last update of each group
         self._longest_pause_ns = period_ns // 2
         self._show = show
         self._skip = skip
@@ -70,7 +68,7 @@ class Bursts:
 
         Args:
             updates: what has arrived, in order of time; None: nothing new.
-            living: (n_modules,) bool, modules that can be expected to send.
+            living: (n_groups,) bool, update groups that can be expected to send.
             publish: called whenever a frame is over and more belongs to the next one.
             most: how often, at the most.
         """
@@ -90,24 +88,24 @@ class Bursts:
             rest = self._take_in_order(rest, living, count_and_publish)
 
     def _skip_the_oldest(self, updates: Updates, most: int) -> Updates:
-        """The last updates of every module, so many at the most: as many bursts as can be published."""
+        """The last updates of every group, so many at the most: as many bursts as can be published."""
         if len(updates) <= most:
             return updates
-        order = np.argsort(updates.module, kind="stable")
-        last = np.cumsum(np.bincount(updates.module, minlength=len(self._module_patch)))  # behind each module's own
+        order = np.argsort(updates.group, kind="stable")
+        last = np.cumsum(np.bincount(updates.group, minlength=len(self._group_patch)))  # behind each group's own
         from_last = np.empty(len(updates), np.int64)
-        from_last[order] = last[updates.module[order]] - np.arange(len(updates))
+        from_last[order] = last[updates.group[order]] - np.arange(len(updates))
         old = from_last > max(1, most)
         if not old.any():
             return updates
-        self._skip(np.bincount(self._module_patch[updates.module[old & updates.whole]], minlength=self._n_patches))
+        self._skip(np.bincount(self._group_patch[updates.group[old & updates.whole]], minlength=self._n_patches))
         return updates.take(~old)
 
     def _show_the_newest(self, updates: Updates) -> None:
         """Show updates in one frame, whatever bursts they are of."""
-        of_module = np.bincount(updates.module[updates.whole], minlength=len(self._module_patch))
-        skipped = np.maximum(of_module + self._state.updated - 1, 0)
-        self._skip(np.bincount(self._module_patch, skipped, self._n_patches).astype(np.int64))
+        of_group = np.bincount(updates.group[updates.whole], minlength=len(self._group_patch))
+        skipped = np.maximum(of_group + self._state.updated - 1, 0)
+        self._skip(np.bincount(self._group_patch, skipped, self._n_patches).astype(np.int64))
         self._show(updates)
 
     def in_the_middle(self, living: Flags, time_ns: int) -> Flags:
@@ -116,7 +114,7 @@ class Bursts:
         missing = living & ~self._state.touched
         if not missing.any():
             return lacks
-        lacks[self._module_patch[missing]] = True
+        lacks[self._group_patch[missing]] = True
         return self._begun() & lacks & (time_ns - self._state.patch_time_ns <= self.pause_ns)
 
     def pause_ends_ns(self, patches: Flags) -> int:
@@ -126,7 +124,7 @@ class Bursts:
     def _begun(self) -> Flags:
         """(n_patches,) bool: patches of which this frame shows something."""
         begun = np.zeros(self._n_patches, bool)
-        begun[self._module_patch[self._state.updated]] = True
+        begun[self._group_patch[self._state.updated & self._state.is_prompt]] = True
         return begun
 
     def _take_in_order(self, updates: Updates, living: Flags, publish: Callable[[], None]) -> Updates | None:
@@ -143,7 +141,7 @@ class Bursts:
             if self._left <= 0:
                 return updates.take(slice(end, None))
             open_patches = self.in_the_middle(living, int(updates.oldest_ns[end]))
-            open_patches[self._module_patch[updates.module[end]]] = False
+            open_patches[self._group_patch[updates.group[end]]] = False
             if open_patches.any():
                 rest = updates.take(slice(end, None))
                 return self._finish(rest, before[end:] >= threshold, open_patches, living, publish)
@@ -159,7 +157,7 @@ class Bursts:
         Returns:
             The rest, unless it is held back.
         """
-        patch = self._module_patch[rest.module]
+        patch = self._group_patch[rest.group]
         early = np.zeros(len(rest), bool)
         for number in np.flatnonzero(open_patches).tolist():
             rows = np.flatnonzero(patch == number)
@@ -181,30 +179,46 @@ class Bursts:
 
         -1 for all others. So an update begins a new frame if its number lies within the present one.
         """
-        module, patch = updates.module, self._module_patch[updates.module]
-        previous = _chain(module)
+        group, patch = updates.group, self._group_patch[updates.group]
+        previous = _chain(group)
         orphans = ~updates.whole
         orphans[previous == _NEVER] = False
         orphans[orphans] = ~updates.whole[previous[orphans]]  # two halves of one module that found no partners
         found = np.where(orphans, _NEVER, previous + 1)
         first = previous == _NEVER
-        shown = np.where(updates.whole, self._state.touched[module], self._state.updated[module])
+        shown = np.where(updates.whole, self._state.touched[group], self._state.updated[group])
         found[first] = np.where(shown[first], _BEFORE, _NEVER)
+        # slow groups come at any time: they neither begin nor end a burst
+        prompt = np.arange(len(group)) if self._all_prompt else np.flatnonzero(self._state.is_prompt[group])
+        if len(prompt):
+            of_prompt = updates if self._all_prompt else updates.take(prompt)
+            self._find_pauses(of_prompt, patch[prompt], prompt, found)
+        return found
+
+    def _find_pauses(self, updates: Updates, patch: Indices, rows: Indices, found: Indices) -> None:
+        """See ``_previous``, where a pause lies before an update.
+
+        Args:
+            updates: of prompt groups.
+            patch: of each.
+            rows: where they are in ``found``.
+            found: what is known already; filled in.
+        """
         of_patch = _chain(patch)
         first = of_patch == _NEVER
         before_ns = np.where(first, self._state.patch_time_ns[patch], updates.newest_ns[of_patch])
         gap_ns = updates.oldest_ns - before_ns
-        self._learn_pauses(module, patch, gap_ns)
+        self._learn_pauses(updates.group, patch, gap_ns)
         pause = gap_ns > self.pause_ns[patch]
         if pause.any():
             pause &= ~first | self._begun()[patch]
-            found[pause] = np.maximum(found[pause], of_patch[pause] + 1)
-        return found
+            before = np.where(first, _NEVER, rows[of_patch])[pause] + 1
+            found[rows[pause]] = np.maximum(found[rows[pause]], before)
 
-    def _learn_pauses(self, module: Indices, patch: Indices, gap_ns: Indices) -> None:
+    def _learn_pauses(self, group: Indices, patch: Indices, gap_ns: Indices) -> None:
         gap_ns = np.where(gap_ns < 2 * self._longest_pause_ns, gap_ns, 0)  # more than a period is no pause
-        self.gap_ns[module] = gap_ns
-        longest_ns = np.maximum.reduceat(self.gap_ns, self._first_module)
+        self.gap_ns[group] = gap_ns
+        longest_ns = np.maximum.reduceat(self.gap_ns, self._first_group)
         np.maximum.at(longest_ns, patch, gap_ns)
         own_ns = np.where(longest_ns >= self.standing_out_ns, _SIMILAR * longest_ns, self._longest_pause_ns)
         self.pause_ns[:] = np.minimum(own_ns, self._longest_pause_ns)

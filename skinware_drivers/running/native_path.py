@@ -200,12 +200,16 @@ class NativePath:
         plan.state_live, plan.state_stale = int(PatchState.LIVE), int(PatchState.STALE)
         plan.burst_pause_ns = arrays.at(bursts.pause_ns)
         plan.standing_out_ns, plan.gap_ns = arrays.at(bursts.standing_out_ns), arrays.at(bursts.gap_ns)
-        plan.module_heard_ns = arrays.at(publisher.module_heard_ns)
+        plan.group_heard_ns = arrays.at(publisher.group_heard_ns)
+        plan.is_prompt = arrays.at(self._decoder.state.is_prompt)
+        plan.age_limit_ns = arrays.at(publisher.age_limit_ns)
         plan.patch_heard_ns = arrays.at(publisher.patch_heard_ns)
-        plan.patch_updated_ns = arrays.at(publisher.patch_updated_ns)
-        plan.behind, plan.patch_state = arrays.at(publisher.behind), arrays.at(publisher.patch_state)
+        plan.patch_lives_until_ns = arrays.at(publisher.patch_lives_until_ns)
+        plan.patch_state = arrays.at(publisher.patch_state)
         self._module_status = publisher.watch.module_status.copy()  # a watch may replace its own
+        self._module_untouched = publisher.watch.module_untouched.copy()
         plan.module_status = arrays.at(self._module_status)
+        plan.module_untouched = arrays.at(self._module_untouched)
         plan.bus_state, plan.bus_reason = arrays.at(publisher.bus_state), arrays.at(publisher.bus_reason)
         plan.bus_since_ns, plan.bus_load = arrays.at(publisher.bus_since_ns), arrays.at(publisher.bus_load)
         plan.bus_samples, plan.bus_samples_bytes = arrays.at(publisher.bus_samples), publisher.bus_samples.nbytes
@@ -347,12 +351,12 @@ class NativePath:
         sensors = records["sensors"].astype(np.int64)
         sensors[~whole] = self._plan.n_sensors
         parts = records["values"], records["status"], records["oldest_ns"], records["newest_ns"]
-        self._publisher.look(Updates(records["module"], whole, sensors, *parts, True))
+        self._publisher.look(Updates(records["module"], records["group"][:, None], whole, sensors, *parts, True))
         self._take_from_watch()
 
     def _take_from_watch(self) -> None:
         watch = self._publisher.watch
-        self._module_status[:] = watch.module_status
+        self._module_status[:], self._module_untouched[:] = watch.module_status, watch.module_untouched
         self._words.sees_all = watch.sees_all
 
     def _on_published(self, oldest_ns: int) -> None:

@@ -44,9 +44,10 @@ class Desk(Protocol):
 class Publisher:
     """Copies the state of the skin into the ring at the right moments.
 
-    By cycle: as soon as every module that lives was heard; and always before a patch begins its next burst, so that
-    no update is overwritten before it was published and no frame holds two bursts of a patch (see ``bursts``). If
-    neither happens, half a period after the cycle is over. Otherwise at deadlines that the runner keeps.
+    By cycle: as soon as every update group that lives was heard (but for those that are slower than the driver); and
+    always before a patch begins its next burst, so that no update is overwritten before it was published and no frame
+    holds two bursts of a patch (see ``bursts``). If neither happens, half a period after the cycle is over. Otherwise
+    at deadlines that the runner keeps.
 
     With nothing to show it publishes four times a second, so that readers see the states.
 
@@ -83,16 +84,17 @@ class Publisher:
         self.idle_ns: int = max(_IDLE_NS, 2 * self.period_ns)
         self._silence_ns = age_limit_ns(self.period_ns)
         self._structure = structure = decoder.tables.structure
-        self._module_patch = structure.module_patch.astype(np.intp)
-        self._sensor_module = structure.sensor_module.astype(np.intp)
-        self._first_module = np.searchsorted(self._module_patch, np.arange(structure.n_patches))
+        self._group_patch = self._state.group_patch
+        self._group_module = structure.group_module.astype(np.intp)
+        self._sensor_group = structure.sensor_group.astype(np.intp)
+        self._state.settle_pace(self.period_ns)
+        self.age_limit_ns = structure.group_age_limits_ns(self.period_ns)
         self._counts = np.zeros((len(structure.buses), len(ALL_BUS_COUNTERS)), np.int64)
-        self.bursts = Bursts(self._state, self._module_patch, self.period_ns, self._show, self._skip)
-        self.module_heard_ns = np.full(structure.n_modules, now_ns(), np.int64)
+        self.bursts = Bursts(self._state, self.period_ns, self._show, self._skip)
+        self.group_heard_ns = np.full(structure.n_groups, now_ns(), np.int64)
         self.timing: PatchTiming = PatchTiming(structure)
-        self.behind = np.zeros(structure.n_modules, bool)
         self.patch_heard_ns = np.zeros(structure.n_patches, np.int64)
-        self.patch_updated_ns = np.zeros(structure.n_patches, np.int64)  # newest stamp of a whole update
+        self.patch_lives_until_ns = np.zeros(structure.n_patches, np.int64)  # unless something whole comes before
         self._due_ns = 0
         self._not_before_ns = 0  # a burst that has begun holds up the frame until then
         self._last_published_ns = now_ns()
@@ -190,15 +192,18 @@ class Publisher:
     def _oldest_new_ns(self, time_ns: int) -> int:
         """Oldest stamp of what is new in this frame; if nothing is, the frame says so as of now."""
         new = self._state.updated
-        return int(self._state.module_time_ns[new].min()) if new.any() else time_ns
+        return int(self._state.group_time_ns[new].min()) if new.any() else time_ns
 
     def _write(self, time_ns: int) -> None:
         state = self._state
-        self.timing.count(state.updated, state.module_time_ns, time_ns)
+        self.timing.count(state.updated & state.is_prompt, state.group_time_ns, time_ns)
         columns = self._writer.begin()
         columns["values"][:] = state.values
         columns["module_time_ns"][:] = state.module_time_ns
+        if not self._structure.groups_are_modules:
+            columns["group_time_ns"][:] = state.group_time_ns
         self._fill_status(columns["status"], time_ns)
+        columns["module_untouched"][:] = self.watch.module_untouched
         columns["patch_state"][:] = self.patch_state
         columns["bus_state"][:] = self.bus_state
         columns["bus_reason"][:] = self.bus_reason
@@ -232,7 +237,7 @@ class Publisher:
 
     def lose(self, patch: int, state: PatchState) -> None:
         """Take a patch as silent from here on, until its next data."""
-        self.patch_updated_ns[patch] = 0
+        self.patch_lives_until_ns[patch] = 0
         self.patch_state[patch] = state
 
     def count_buses(self) -> npt.NDArray[np.int64]:
@@ -242,7 +247,7 @@ class Publisher:
         return self._counts
 
     def _update_patch_states(self, time_ns: int) -> None:
-        live = self.patch_updated_ns > max(0, time_ns - self._silence_ns)
+        live = self.patch_lives_until_ns > time_ns
         if not live.all() or not (self.patch_state == _LIVE).all():
             self.patch_state[~live & (self.patch_state == _LIVE)] = _NOW_STALE
             self.patch_state[live] = _LIVE
@@ -262,7 +267,7 @@ class Publisher:
         try:
             self.watch.look(updates)
         except Exception as error:
-            buses = np.unique(self._structure.patch_bus[self._module_patch[updates.module]]).tolist()
+            buses = np.unique(self._structure.patch_bus[self._group_patch[updates.group]]).tolist()
             names = ", ".join(self._structure.buses[bus] for bus in buses)
             raise failure("Watch.look", f"bus {names}", error) from error
 
@@ -281,44 +286,30 @@ class Publisher:
             self._due_ns = time_ns + self.patience_ns
 
     def _hear(self, updates: Updates, time_ns: int) -> None:
-        """Note who lives. Of a patch that begins to send, all its modules: its first burst is not over after one."""
+        """Note which groups live. Of a patch that begins to send, all: its first burst is not over after one."""
+        group, whole = updates.group, updates.whole
         patch_sends = np.zeros(len(self.patch_heard_ns), bool)
-        patch_sends[self._module_patch[updates.module]] = True
+        patch_sends[self._group_patch[group[self._state.is_prompt[group]]]] = True
         begins = patch_sends & (time_ns - self.patch_heard_ns > self._silence_ns)
         if begins.any():
-            self.module_heard_ns[begins[self._module_patch]] = time_ns
+            self.group_heard_ns[begins[self._group_patch]] = time_ns
         self.patch_heard_ns[patch_sends] = time_ns
-        self.module_heard_ns[updates.module] = time_ns
-        whole = updates.whole
-        self.patch_updated_ns[self._module_patch[updates.module[whole]]] = updates.newest_ns[whole]
+        self.group_heard_ns[group] = time_ns
+        until_ns = np.minimum(updates.newest_ns[whole], time_ns) + self.age_limit_ns[group[whole]]
+        np.maximum.at(self.patch_lives_until_ns, self._group_patch[group[whole]], until_ns)
 
     def _living(self, time_ns: int) -> npt.NDArray[np.bool_]:
-        living: npt.NDArray[np.bool_] = time_ns - self.module_heard_ns < self._silence_ns
+        """(n_groups,) bool, groups that can be expected to send in every period."""
+        living: npt.NDArray[np.bool_] = time_ns - self.group_heard_ns < self._silence_ns
+        living &= self._state.is_prompt
         return living
 
     def _fill_status(self, status: npt.NDArray[np.uint8], time_ns: int) -> None:
         """What the wire said, what time tells, and what the driver's watch holds against a module."""
-        bits = np.multiply(self._stale_modules(time_ns), _STALE)
-        bits |= self.watch.module_status
+        seen_ns = self._state.group_time_ns
+        bits = np.multiply((seen_ns > 0) & (seen_ns < time_ns - self.age_limit_ns), _STALE)
+        bits |= self.watch.module_status[self._group_module]
         if bits.any():
-            np.bitwise_or(self._state.status, bits.take(self._sensor_module), out=status)
+            np.bitwise_or(self._state.status, bits.take(self._sensor_group), out=status)
         else:
             status[:] = self._state.status
-
-    def _stale_modules(self, time_ns: int) -> npt.NDArray[np.bool_]:
-        """Modules that missed their patch's last update, or that have been silent for too long.
-
-        By cycle, a module is behind if others of its patch were updated since the last publication and it was not,
-        and stays so until its own next update. At a rate, publications fall anywhere in a burst, so only time tells.
-        """
-        state, module_patch = self._state, self._module_patch
-        shown_ns, updated = state.module_time_ns, state.updated
-        if not self.by_cycle:
-            self.behind[:] = state.patch_time_ns[module_patch] - shown_ns > self.period_ns * 3 // 2
-        else:
-            self.behind |= np.logical_or.reduceat(updated, self._first_module)[module_patch]
-            np.greater(self.behind, updated, out=self.behind)  # and not updated
-        stale: npt.NDArray[np.bool_] = shown_ns < time_ns - self._silence_ns
-        stale |= self.behind
-        stale &= shown_ns > 0
-        return stale

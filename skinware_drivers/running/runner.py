@@ -260,7 +260,7 @@ class Runner:
         adapters = [line.adapter for line in self.lines if line.patches]
         if not adapters:
             if anew and self.generation is not None:  # the sensors stay, without data
-                self._go_over_to(self.generation.tables.with_buses([line.name for line in self.lines]))
+                self._go_over_to(self.generation.decoder.described.with_buses([line.name for line in self.lines]))
             return
         try:
             tables = assemble(
@@ -273,7 +273,7 @@ class Runner:
             log.error("the devices that were found do not form a valid skin: %s", str(error))
             return
         known = self.generation
-        is_known = known is not None and (known.tables.structure, known.decoder.layouts) == (
+        is_known = known is not None and (known.decoder.described.structure, known.decoder.layouts) == (
             tables.structure,
             self._layouts,
         )
@@ -282,9 +282,10 @@ class Runner:
         self._go_over_to(tables)
         self._built.notify_all()
 
-    def _go_over_to(self, tables: SkinTables) -> None:
+    def _go_over_to(self, described: SkinTables) -> None:
         # the driver's own code comes first: if it fails, nothing has changed
-        decoder = Decoder(self._layouts, tables, [line.adapter.period_s for line in self.lines])
+        decoder = Decoder(self._layouts, described, [line.adapter.period_s for line in self.lines])
+        tables = decoder.tables
         watch = make_watch(self.lines, tables)
         if self.writer is None:
             self.writer = writer = DriverWriter(
@@ -346,7 +347,7 @@ class Runner:
         if generation is None:
             return
         if self._period_s != generation.period_s or self._layouts != generation.decoder.layouts:
-            self._go_over_to(generation.tables)
+            self._go_over_to(generation.decoder.described)
         elif set_up:
             for number in (generation.number_of(line, patch) for patch in patches):
                 if number is not None:

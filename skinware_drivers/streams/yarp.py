@@ -1,7 +1,7 @@
-"""The skin ports of a robot that runs YARP, as iCub: one vector of values a message, over YARP's text carrier.
+"""The skin ports of a robot that runs YARP, as iCub: one vector of values a message, over YARP's carrier ``fast_tcp``.
 
 Which values there are, and where, the port does not say: the robot's files do (``skin-import icub --yarp``). What is in
-a message: ``yarp_text``. How the port is found, and read: ``yarp_bus``.
+a message: ``yarp_messages``. How the port is found, and read: ``yarp_bus``.
 
 Values, by robotology/icub-main: the port of a part (``/icub/skin/left_hand``) has what its boards send, 0 to 255, where
 less is more pressure, and unused triangles have a place too. The ports of skinManager (``/icub/skin/left_hand_comp``)
@@ -33,7 +33,7 @@ from skinware_drivers.notice import Notice
 from skinware_drivers.options import check_options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.streams.yarp_text import LENGTH, MOST_VALUES, PLAIN, TIMED, VALUES_OF_A_FRAME, YarpText
+from skinware_drivers.streams.yarp_messages import LENGTH, MOST_VALUES, PLAIN, TIMED, VALUES_OF_A_FRAME, YarpMessages
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -118,7 +118,7 @@ class YarpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class YarpDriver(SerialAdapter[YarpOptions]):
     """One port. A patch is a board, or sixteen times twelve values where nobody says so; uid = place in the vector."""
 
-    framing: Framing = YarpText()
+    framing: Framing = YarpMessages()
     dtype: npt.DTypeLike = np.float32
     layout: Layout = Layout(
         [
@@ -154,7 +154,7 @@ class YarpDriver(SerialAdapter[YarpOptions]):
         else:
             self._length = await self._heard_length(link)
             self._described, parts = self._of_places(self._length)
-        self.change_framing(YarpText(self._length, tuple(parts)))
+        self.change_framing(YarpMessages(self._length, tuple(parts)))
         return self._described
 
     async def attend(self, link: Link) -> None:
@@ -185,7 +185,7 @@ class YarpDriver(SerialAdapter[YarpOptions]):
 
     async def _heard_length(self, link: Link) -> int:
         with link.follow(_TOLD_LENGTH) as told:
-            self.change_framing(YarpText())  # which tells it anew
+            self.change_framing(YarpMessages())  # which tells it anew
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_FIRST_S):
                     while True:

@@ -1,4 +1,4 @@
-"""A port of a robot that runs YARP as a bus that is only read: found by its name, listened to in the text carrier.
+"""A port of a robot that runs YARP as a bus that is only read: found by its name, read in the carrier ``fast_tcp``.
 
 The port never waits for us. What has come is read whenever the loop comes round, as much as there is; if more has piled
 up than is read at once otherwise, because this machine was held up, only the newest message of it is used, and the
@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason
+from skinware.yarp.carriers import READ, Carrier, unframed
 from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server, is_port_name
 from skinware_drivers.bus import Bus
 from skinware_drivers.serial.ports import Port
@@ -21,13 +22,14 @@ from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.address import Address, parse_address
 from skinware_drivers.streams.bus import ServerBus
 from skinware_drivers.streams.tcp import TcpPort, connect
-from skinware_drivers.streams.yarp_text import LONGEST_LINE
+from skinware_drivers.streams.yarp_messages import BEGIN, message_size
 
 _ROOM = 1 << 20
 """Wanted of the kernel, for what comes while this machine is held up."""
 _PILE = 1 << 20
 _MOST_PILES = 8
-_LINES_OF_A_MESSAGE = 2
+_GREETING_S = 3.0
+_ANSWER = 8
 _CARRIERS = ("tcp", "fast_tcp", "text", "text_ack")
 """As what ports register that can be called by TCP."""
 
@@ -55,7 +57,10 @@ def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any
 
 
 class YarpPort(TcpPort):
-    """A connection to a port. Gives whole messages: each a line that says so, and a line with what it is.
+    """A connection to a port, which sends its messages to us from then on. Gives whole messages.
+
+    It is called in the carrier ``fast_tcp``, never in ``text``: a real port that sends vectors writes past a buffer
+    when it is read in text, and its program dies (YARP 2.3.64 to 4.0.0, ``BufferedConnectionWriter``).
 
     Attributes:
         passed_over: messages that were not used as newer ones had come already.
@@ -65,16 +70,19 @@ class YarpPort(TcpPort):
         connection = connect(address)
         try:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _ROOM)
+            _begin_reading(connection, name)
             super().__init__(name, connection, patience_s)
-            connection.sendall(f"CONNECT {WHO}\nr\n".encode())  # a few bytes into an empty buffer
         except OSError as error:
             connection.close()
             raise BusNotAvailable(f"{name}: the port has hung up ({error.strerror or error})") from None
+        except BusNotAvailable:
+            connection.close()
+            raise
         self._rest = b""
         self.passed_over = 0
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """The messages that have come, at most about 64 KiB; what is no message is given too, once it is a line.
+        """The messages that have come, at most about 64 KiB; what is no message is given too.
 
         Raises:
             BusNotAvailable: the port is gone.
@@ -86,8 +94,6 @@ class YarpPort(TcpPort):
             if len(more) < _PILE:
                 break
         whole, self._rest = _whole_messages(pile)
-        if len(self._rest) > LONGEST_LINE:  # whoever counts lines is to know of it
-            whole, self._rest = pile, b""
         return whole
 
     def _newest(self, pile: bytes) -> bytes:
@@ -95,11 +101,28 @@ class YarpPort(TcpPort):
         if len(pile) <= CHUNK:
             return pile
         whole, rest = _whole_messages(pile)
-        at = _last_head(whole)
+        at = whole.rfind(BEGIN)
         if at < 0:
             return pile[-2 * CHUNK :]  # of no message, it does not matter what it is
-        self.passed_over += whole.count(b"\n", 0, at) // _LINES_OF_A_MESSAGE
-        return whole[max(0, at - 1) :] + rest  # with the end of the line before, which may be known in part
+        self.passed_over += whole.count(BEGIN, 0, at)
+        return whole[at:] + rest
+
+
+def _begin_reading(connection: socket.socket, name: str) -> None:
+    """Greet a port, and ask it to send.
+
+    Raises:
+        BusNotAvailable: what answers is no port of YARP.
+        OSError: it hung up, or did not answer in time.
+    """
+    connection.settimeout(_GREETING_S)
+    connection.sendall(Carrier.FAST_TCP.greeting(WHO))
+    answer = b""
+    while len(answer) < _ANSWER and (more := connection.recv(_ANSWER - len(answer))):
+        answer += more
+    if len(answer) < _ANSWER or unframed(answer) is None:
+        raise BusNotAvailable(f"{name}: what answers at this port is no port of YARP", reason=BusReason.FAILED)
+    connection.sendall(READ)  # a few bytes into an empty buffer
 
 
 class YarpBus(ServerBus):
@@ -112,7 +135,7 @@ class YarpBus(ServerBus):
         channel: ``HOST:PORT/NAME`` or ``/NAME``.
         options: see :class:`skinware_drivers.streams.bus.ServerOptions`.
         payload_size: longest body that fits into a batch.
-        listen_only: makes no difference: nothing is sent but what asks the port to speak.
+        listen_only: makes no difference: only the request to be sent messages goes out.
 
     Raises:
         ConfigurationError: no such name, or an option is unknown or has a bad value.
@@ -155,19 +178,14 @@ class YarpBus(ServerBus):
             port.passed_over = 0
 
 
-def _last_head(text: bytes) -> int:
-    """Where the last line begins that says that a message follows; -1: nowhere."""
-    at = max(text.rfind(b"\nd"), text.rfind(b"\nD"))
-    return at + 1 if at >= 0 else (0 if text[:1] in (b"d", b"D") else -1)
-
-
 def _whole_messages(pile: bytes) -> tuple[bytes, bytes]:
-    """What can be used now, and what has to wait for its end."""
-    at = _last_head(pile)
-    if at >= 0 and pile.count(b"\n", at) < _LINES_OF_A_MESSAGE:
+    """What can be used now, and the message at the end that is not whole yet."""
+    at = pile.rfind(BEGIN)
+    size = message_size(pile, at) if at >= 0 else 0
+    if size is None or (at >= 0 and len(pile) < at + size):
         return pile[:at], pile[at:]
-    end = pile.rfind(b"\n") + 1
-    return pile[:end], pile[end:]
+    cut = next((n for n in range(len(BEGIN) - 1, 0, -1) if pile.endswith(BEGIN[:n])), 0)
+    return pile[: len(pile) - cut], pile[len(pile) - cut :]
 
 
 __all__ = ["YarpBus", "YarpPort", "split_channel"]

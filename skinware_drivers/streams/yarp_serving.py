@@ -1,10 +1,15 @@
-"""A YARP name server that knows one port, and that port: the device's end, for emulators. It speaks text only."""
+"""A YARP name server that knows one port, and that port: the end of emulated devices.
+
+The name server is asked in text, as real ones can be. The port is read in a binary carrier only: real ports of vectors
+die of a reader in text, so this one hangs up.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import select
 import socket
+from collections.abc import Callable
 
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
@@ -15,12 +20,16 @@ from skinware_drivers.streams.tcp import ListeningPort
 from skinware_drivers.streams.yarp_bus import split_channel
 
 _END = b"*** end of message\r\n"
+_MESSAGE = bytes.fromhex("59410A0000005250")
+_READ = bytes.fromhex("7E720001")
+_HEAD_OF_MESSAGE, _HEAD_OF_GREETING = 30, 12
+_MOST_HEARD = 1 << 12
 _MOST_UNSENT = 1 << 20
 """Bytes that a reader may be behind; what is sent to one that is further behind is for nobody."""
 
 
 class _Conversation:
-    """What a caller has said so far, line by line; begins anew with each caller."""
+    """What a caller has said so far; begins again with each caller."""
 
     def __init__(self, line: ListeningPort) -> None:
         self.line = line
@@ -28,13 +37,25 @@ class _Conversation:
         self._caller: socket.socket | None = None
         self._heard = b""
 
-    def hear(self) -> list[bytes]:
+    def lines(self) -> list[bytes]:
         """The lines that have come."""
-        data = self.line.read(1 << 12)
+        *lines, self._heard = self._hear().split(b"\n")
+        return [line.strip() for line in lines]
+
+    def parts(self, sizes: Callable[[bytes], int]) -> list[bytes]:
+        """The binary parts that have come; ``sizes`` gives how many bytes the next one has."""
+        heard, found = self._hear(), []
+        while heard and len(heard) >= (size := sizes(heard)) > 0:
+            found.append(heard[:size])
+            heard = heard[size:]
+        self._heard = heard
+        return found
+
+    def _hear(self) -> bytes:
+        data = self.line.read(_MOST_HEARD)
         if self.line.caller is not self._caller:
             self._caller, self._heard, self.unsent = self.line.caller, b"", b""
-        *lines, self._heard = (self._heard + data)[-(1 << 12) :].split(b"\n")
-        return [line.strip() for line in lines]
+        return (self._heard + data)[-_MOST_HEARD:]
 
     def say(self, data: bytes) -> None:
         """As far as the caller takes it; the rest waits."""
@@ -74,10 +95,10 @@ class ServedPort(Port):
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
         """Answer; gives nothing."""
-        for line in self._server.hear():
+        for line in self._server.lines():
             self._answer_question(line)
-        for line in self._port.hear():
-            self._answer_reader(line)
+        for part in self._port.parts(_size):
+            self._answer_reader(part)
         self._server.say(b"")
         self._forget_reader()
         self._port.say(b"")
@@ -107,15 +128,28 @@ class ServedPort(Port):
             self._is_asked = False
             self._server.say((told if line == b"query " + self._name.encode() else b"") + _END)
 
-    def _answer_reader(self, line: bytes) -> None:
-        if line.startswith(b"CONNECT "):
-            self._port.say(b"Welcome " + line[8:] + b"\r\n")
-        elif line == b"r":
-            self._is_read, self._reader = True, self._port.line.caller
+    def _answer_reader(self, part: bytes) -> None:
+        if part.startswith(_MESSAGE):
+            self._is_read, self._reader = part.endswith(_READ), self._port.line.caller
+        elif part[:2] == b"YA":
+            self._port.say(b"YA" + self._port.line.address.port.to_bytes(4, "little") + b"RP")
+        elif self._port.line.caller is not None:
+            self._port.line.caller.shutdown(socket.SHUT_RDWR)
 
     def _forget_reader(self) -> None:
         if self._port.line.caller is not self._reader:
             self._is_read, self._reader = False, self._port.line.caller
+
+
+def _size(heard: bytes) -> int:
+    """How many bytes the greeting or message that begins here has; text is given line by line, to be refused."""
+    if not heard.startswith(b"YA"[: len(heard)]):
+        return heard.find(b"\n") + 1
+    if heard.startswith(_MESSAGE) and len(heard) >= _HEAD_OF_MESSAGE:
+        return _HEAD_OF_MESSAGE - 4 + int.from_bytes(heard[18:22], "little")
+    if not heard.startswith(_MESSAGE) and len(heard) >= _HEAD_OF_GREETING:
+        return _HEAD_OF_GREETING + int.from_bytes(heard[8:12], "little")
+    return _MOST_HEARD
 
 
 class YarpServerBus(SerialBus):

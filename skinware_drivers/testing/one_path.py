@@ -27,14 +27,14 @@ Arrays = dict[str, npt.NDArray[Any] | bytes | int | str]
 _OF_STATE = (
     "values",
     "status",
-    "module_time_ns",
+    "group_time_ns",
     "updated",
     "touched",
     "patch_time_ns",
     "bus_counters",
     "patch_counters",
 )
-_OF_PUBLISHER = ("module_heard_ns", "patch_heard_ns", "patch_updated_ns", "behind", "patch_state", "sequence")
+_OF_PUBLISHER = ("group_heard_ns", "patch_heard_ns", "patch_lives_until_ns", "patch_state", "sequence")
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Way:
         self.decoder = Decoder(layouts, tables, periods_s)
         self.writer = DriverWriter(
             name,
-            tables.structure,
+            self.decoder.tables.structure,
             bus_counters=ALL_BUS_COUNTERS,
             patch_counters=ALL_PATCH_COUNTERS,
             slots=publishing.slots,

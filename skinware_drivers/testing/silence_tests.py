@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from skinware.driver_service import DriverFrame
+from skinware.realtime import NS_PER_S
 from skinware.status import BusState, PatchState, Status
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.testing.comparison import Comparison
 from skinware_drivers.testing.defect import require
 from skinware_drivers.testing.rig import Running, is_fresh, is_live, play
 from skinware_drivers.testing.suite import Suite
+from skinware_drivers.testing.torn_tests import Heard
 from skinware_drivers.virtual.hand_clock import HandClock
 
 _BURSTS = 24
@@ -28,7 +33,8 @@ class SilenceTests(Suite):
             async with self.running(clock) as rig:
                 await rig.until_fresh()
                 rig.wire.silent = True
-                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s))
+                slowest_ns = int(rig.record.frames[-1].structure.group_period_ns.max())
+                await rig.sleep(max(_SILENCE_S, 20 * rig.adapter.period_s, 4 * slowest_ns / NS_PER_S))
                 require(
                     (rig.record.frames[-1].status & _STALE).all(),
                     "no data has come for seconds, but values are still shown as fresh: is `period_s` far too long?",
@@ -37,6 +43,32 @@ class SilenceTests(Suite):
                 await self._comes_back(rig, "the cable was cut and mended")
 
         play(scenario)
+
+    def test_a_silent_kind_of_frame_is_not_shown_as_fresh(self) -> None:
+        """One kind of frame falls silent while all others go on: what only it carried keeps the time that it has."""
+
+        async def scenario(clock: HandClock) -> tuple[Heard, Running]:
+            async with self.running(clock) as rig:
+                await rig.until_fresh()
+                heard = Heard(rig)
+                await rig.sleep(_BURSTS * rig.adapter.period_s)
+                return heard, rig
+
+        heard, rig = play(scenario)
+        wire, time_ns = np.concatenate([t.wire for t in heard.takes]), np.concatenate([t.time_ns for t in heard.takes])
+        layout, half = rig.adapter.layout, len(wire) // 2
+        for number, frame in enumerate(layout.frames):
+            decoder = Decoder([layout], heard.tables, [rig.adapter.period_s])
+            seen = _show(decoder, wire[:half], time_ns[:half], None)
+            silent_ns, before = decoder.state.newest_ns, decoder.state.group_time_ns.copy()
+            seen &= ~_show(decoder, wire[half:], time_ns[half:], number)
+            groups = np.unique(decoder.tables.structure.sensor_group[seen])
+            renewed = groups[decoder.state.group_time_ns[groups] > np.maximum(before[groups], silent_ns)]
+            require(
+                not len(renewed),
+                f"frames {frame.name!r} fell silent, but what only they carry goes on as fresh: other frames fill the"
+                " same module. If an Expand is among them, say with `to` which channels it has",
+            )
 
     def test_a_lost_bus_comes_back(self) -> None:
         """The interface is unplugged and plugged in again: the driver goes on by itself."""
@@ -125,6 +157,28 @@ class SilenceTests(Suite):
                     )
 
         play(scenario)
+
+
+def _show(
+    decoder: Decoder, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], silent: int | None
+) -> npt.NDArray[np.bool_]:
+    """Show frames without those of one kind; (n_sensors,) bool, which sensors they have values of."""
+    batch = FrameBatch(len(wire) + decoder.headroom, wire.dtype["payload"].shape[0], decoder.headroom)
+    decoder.put_back(batch)
+    rows = slice(batch.stop, batch.stop + len(wire))
+    batch.wire[rows], batch.time_ns[rows], batch.bus[rows] = wire, time_ns, 0
+    batch.stop = rows.stop
+    if silent is not None:
+        _, kind, _ = decoder.name(batch)
+        keep = np.flatnonzero(kind != silent) + batch.start
+        left = batch.start + len(keep)
+        batch.wire[batch.start : left], batch.time_ns[batch.start : left] = batch.wire[keep], batch.time_ns[keep]
+        batch.stop = left
+    updates, _ = decoder.decode(batch)
+    decoder.state.show(updates)
+    found = np.zeros(decoder.tables.structure.n_sensors + 1, bool)
+    found[updates.sensors[updates.whole]] = True
+    return found[:-1]
 
 
 __all__ = ["SilenceTests"]

@@ -129,12 +129,14 @@ class Emulator(Stage, HasOptions[OptionsT]):
     medium: ClassVar[str] = "can"
     Options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
     least_options: ClassVar[type[msgspec.Struct]] = EmulatorOptions
+    options_command = "skin-emulate"
+    reserved_options = frozenset(("bus", "driver", "geometry", "help", "json", "log", "name", "namespace", "version"))
     numbers: Sequence[int] = (0,)
     identifiers: Collection[int] = ()
-    full_scale: ClassVar[int | Sequence[int]]
-    lowest: ClassVar[int | Sequence[int]] = 0
-    rest: ClassVar[int | Sequence[int]] = 0
-    swing: ClassVar[int | Sequence[int]]
+    full_scale: int | Sequence[int]
+    lowest: int | Sequence[int] = 0
+    rest: int | Sequence[int] = 0
+    swing: int | Sequence[int]
     longest_queue: ClassVar[int] = 256
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None, source: Source | None = None) -> None:
@@ -182,6 +184,10 @@ class Emulator(Stage, HasOptions[OptionsT]):
     def on_timer(self, device: Device, name: str, time_ns: int) -> None:  # noqa: ARG002
         """What a device does by itself; by default it has one timer, for its data."""
         self.burst(device, time_ns)
+
+    def kinds(self) -> Sequence[str]:
+        """Name the kinds of frames with data that the devices send, for the option ``silence``."""
+        return [self.kind_of(identifier, b"") for identifier in sorted(self.identifiers)]
 
     # What a subclass may use
 
@@ -261,6 +267,7 @@ class Emulator(Stage, HasOptions[OptionsT]):
         ):
             for number in numbers:
                 self.schedule(now_ns + round(after_s * 1e9), partial(action, self.devices[number]))
+        self.plan_silence(options.silence, self.kinds(), options.silence_after_s, now_ns)
         return [*self.devices.values(), *self._foreign(now_ns)]
 
     def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:

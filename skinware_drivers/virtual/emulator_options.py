@@ -36,6 +36,10 @@ class EmulatorOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     foreign_hz: Annotated[
         float, Meta(ge=0, le=10_000, description="frames per second from other devices on the bus")
     ] = 0.0
+    silence: Annotated[
+        tuple[str, ...], Meta(description="kinds of frames that the devices stop sending, after silence_after_s")
+    ] = ()
+    silence_after_s: Annotated[Seconds, Meta(description="seconds from power-up to that silence")] = 2.0
     dead: Annotated[tuple[int, ...], Meta(description="devices that die, after dead_after_s")] = ()
     dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 2.0
     restart: Annotated[

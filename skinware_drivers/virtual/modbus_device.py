@@ -51,6 +51,10 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         """What is in registers that do not belong to its sensors, in the same way. By default there are none."""
         return {}
 
+    def of_other_function(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
+        """What is in the registers that the other function reads, 3 or 4. By default there are none."""
+        return {}
+
     def written(self, device: Device, address: int, value: int) -> bool:  # noqa: ARG002
         """A register is written; tells whether it can be. By default none can."""
         return False
@@ -59,6 +63,11 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Wait to be asked."""
+
+    def kinds(self) -> Sequence[str]:
+        """Name the registers with data: a question for one that is silent has no answer."""
+        device = Device(self.numbers[0], self, self.wire.attach(), 0)
+        return [str(address) for address in sorted(self.registers(device, self._each("rest").tolist()))]
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         """Cut questions out of a stream, as on a line or as over TCP."""
@@ -81,11 +90,16 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
         if function == self.function and 1 <= count <= _MOST_READ:
             wanted = range(address, address + count * self.step, self.step)
+            if not self.silent.isdisjoint(map(str, wanted)):
+                self.counts["silenced"] += 1
+                return b""
             if self._is_to_sample(device, wanted):
                 device.memory[_ASKED] = asked
                 self.burst(device, now_ns)
                 return b""
-            return self._told(device, asked)
+            return _read_from({**self.beside(device), **device.memory.get(_SAMPLE, {})}, asked, self.step)
+        if function in _READS and 1 <= count <= _MOST_READ and (others := self.of_other_function(device)):
+            return _read_from(others, asked, self.step)
         if function in (_WRITE_ONE, _WRITE_MANY):
             return self._write(device, asked, address)
         return _reply(asked, bytes([function | 0x80, _NO_SUCH_FUNCTION]))
@@ -93,21 +107,12 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A new sample, and the answer to the question that wanted it."""
         device.memory[_SAMPLE] = self.registers(device, values)
-        return [self._told(device, device.memory[_ASKED])]
+        return [_read_from({**self.beside(device), **device.memory[_SAMPLE]}, device.memory[_ASKED], self.step)]
 
     def _is_to_sample(self, device: Device, wanted: range) -> bool:
         if _SAMPLE in device.memory:
             return min(device.memory[_SAMPLE]) in wanted
         return not set(wanted) <= set(self.beside(device))
-
-    def _told(self, device: Device, asked: _Asked) -> bytes:
-        address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
-        known: dict[int, int] = {**self.beside(device), **device.memory.get(_SAMPLE, {})}
-        wanted = range(address, address + count * self.step, self.step)
-        if not all(one in known for one in wanted):
-            return _reply(asked, bytes([asked.message[0] | 0x80, _NO_SUCH_REGISTERS]))
-        data = b"".join(known[one].to_bytes(2, "big") for one in wanted)
-        return _reply(asked, bytes([asked.message[0], len(data)]) + data)
 
     def _write(self, device: Device, asked: _Asked, address: int) -> bytes:
         message = asked.message
@@ -116,6 +121,15 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         if all(self.written(device, register, high << 8 | low) for register, high, low in pairs):
             return _reply(asked, message[:5])
         return _reply(asked, bytes([message[0] | 0x80, _NO_SUCH_REGISTERS]))
+
+
+def _read_from(known: Mapping[int, int], asked: _Asked, step: int) -> bytes:
+    address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
+    wanted = range(address, address + count * step, step)
+    if not all(one in known for one in wanted):
+        return _reply(asked, bytes([asked.message[0] | 0x80, _NO_SUCH_REGISTERS]))
+    data = b"".join(known[one].to_bytes(2, "big") for one in wanted)
+    return _reply(asked, bytes([asked.message[0], len(data)]) + data)
 
 
 def _size_on_line(heard: bytes) -> int:

@@ -79,6 +79,14 @@ class SerialEmulator(Emulator[OptionsT]):
         """Send a message beside the data."""
         self.reply(device, (0, message), now_ns)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """Name the kind of a message; by default all are ``data``."""
+        return "data"
+
+    def kinds(self) -> Sequence[str]:
+        """Name the kinds of messages with data; by default there is one."""
+        return ["data"]
+
     # What it need not care about
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:  # noqa: ARG002

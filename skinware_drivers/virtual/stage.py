@@ -6,15 +6,18 @@ See :class:`skinware_drivers.virtual.hardware.EmulatedHardware` for what a carri
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, Protocol
 
 import msgspec
 
+from skinware.errors import ConfigurationError
 from skinware_drivers.virtual import events
 from skinware_drivers.virtual.hardware import EventLog, WireFrame
 from skinware_drivers.virtual.wire import Wire
 
+_IDENTIFIER_MASK = 0x1FFF_FFFF
+_MOST_LISTED = 40
 _LONGEST_CATCH_UP_NS = 1_000_000_000
 """What ``skip`` still emulates frame by frame; the time before it is jumped over."""
 
@@ -43,18 +46,22 @@ class Stage(ABC):
     Args:
         log: takes the :mod:`.events`; a list will do.
         counted: names of the totals beside ``frames`` given by ``emit``, ``bursts`` of a device, ``commands`` that some
-            device obeyed or answered, and ``unheard`` frames of ``skip``.
+            device obeyed or answered, ``silenced`` frames, and ``unheard`` frames of ``skip``.
 
     Attributes:
         wire: what the devices share.
         log: where events go.
         counts: the totals.
+        silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
     """
 
     def __init__(self, log: EventLog | None, counted: Sequence[str]) -> None:
         self.wire: Wire = Wire()
         self.log: EventLog = _Unlogged() if log is None else log
-        self.counts: dict[str, int] = dict.fromkeys(("frames", "bursts", "commands", *counted, "unheard"), 0)
+        self.counts: dict[str, int] = dict.fromkeys(
+            ("frames", "bursts", "commands", *counted, "silenced", "unheard"), 0
+        )
+        self.silent: set[str] = set()
         self._actors: list[Actor] = []
         self._scheduled: list[_Scheduled] = []
         self._now_ns: int | None = None
@@ -67,6 +74,10 @@ class Stage(ABC):
     @abstractmethod
     def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
         """Let the devices hear a frame of the host; returns the addresses of those that obeyed or answered it."""
+
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """Name the kind of a frame that a device sends, as the option ``silence`` does; by default its identifier."""
+        return f"0x{identifier & _IDENTIFIER_MASK:03x}"
 
     # EmulatedHardware
 
@@ -94,6 +105,10 @@ class Stage(ABC):
         """The frames that began by ``now_ns`` and were not given before, oldest first."""
         self.run_to(now_ns)
         frames, self.wire.heard = self.wire.heard, []
+        if self.silent:
+            spoken = [frame for frame in frames if self.kind_of(frame.identifier, frame.payload) not in self.silent]
+            self.counts["silenced"] += len(frames) - len(spoken)
+            frames = spoken
         self.counts["frames"] += len(frames)
         return frames
 
@@ -115,6 +130,17 @@ class Stage(ABC):
         return dict(self.counts)
 
     # For those who make devices
+
+    def plan_silence(self, kinds: Collection[str], known: Collection[str], after_s: float, now_ns: int) -> None:
+        """Stop frames of these kinds, at a time from now.
+
+        Raises:
+            ConfigurationError: the devices send no frames of such a kind.
+        """
+        for kind in kinds:
+            if kind not in known:
+                raise ConfigurationError(f"option silence: {kind!r} is no kind of frame; there are {_shortened(known)}")
+        self.schedule(now_ns + round(after_s * 1e9), lambda _: self.silent.update(kinds))
 
     def run_to(self, now_ns: int) -> int:
         """Bring everything to ``now_ns``, in order of time; returns the time that holds."""
@@ -146,6 +172,11 @@ class Stage(ABC):
         """Have something done at a moment."""
         self._scheduled.append(_Scheduled(time_ns, action))
         self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
+
+
+def _shortened(names: Collection[str]) -> str:
+    listed = list(names)
+    return ", ".join(listed if len(listed) <= _MOST_LISTED else [*listed[:_MOST_LISTED], "..."])
 
 
 class _Unlogged:

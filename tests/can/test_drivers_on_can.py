@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -15,7 +14,6 @@ from skinware import DriverReader
 from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.virtual.hardware import load_emulator
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.sdk.driving import driving_lines, read_until
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(200)]
@@ -87,9 +85,7 @@ def test_a_driver_and_its_emulator(
     n_sensors: int,
     options: dict[str, Any],
     emulated: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ZeroWatch, "patience_s", math.inf)  # nobody touches it, however long the lab takes
     bus, adapter = vcan(), load_driver(driver)
     with emulating(driver, bus, pattern="idle", **emulated) as emulator:
         with driving_lines([(adapter(adapter.Options(**options)), make_bus(bus))], driver, wait=False) as running:

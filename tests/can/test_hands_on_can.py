@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +14,6 @@ from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import read_until
-from skinware_drivers.zero_watch import ZeroWatch
 from tests.can.rig import can_frame, sender
 from tests.can.test_drivers_on_can import emulating
 
@@ -68,9 +66,8 @@ class Program:
 
 
 def test_a_driver_shows_what_the_hands_own_program_asks_for_and_sends_nothing(
-    vcan: Callable[[], str], monkeypatch: pytest.MonkeyPatch
+    vcan: Callable[[], str],
 ) -> None:
-    monkeypatch.setattr(ZeroWatch, "patience_s", math.inf)  # nobody touches it, however long the lab takes
     bus = vcan()
     listener = LinkerHandDriver(LinkerHandOptions(period_ms=round(1e3 * PERIOD_S)))
     lines = [(listener, make_bus(bus))]

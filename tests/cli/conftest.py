@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from skinware import Structure
 from skinware.views import health
 
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(health, "_LEAST_SILENCE_NS", 10**15)
-    monkeypatch.setattr(health, "age_limit_ns", lambda _: 10**15)
+    monkeypatch.setattr(Structure, "age_limits_ns", lambda self, _: np.full(self.n_sensors, 10**15))

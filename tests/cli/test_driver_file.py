@@ -85,6 +85,26 @@ def test_help_shows_the_options_of_the_file(write: Write, capsys: pytest.Capture
     assert "Options of emulated finger:" in told(capsys, emulate.command, f"--driver={path}", "--help")
 
 
+@pytest.mark.parametrize("name", ["revo2", "revo3", "inspire"])
+def test_the_number_of_a_hand_is_an_option(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was hidden by an option of the command."""
+    assert "--unit INTEGER" in told(capsys, driver.command, "--driver", name, "--help")
+
+
+def test_an_emulator_that_is_no_class_of_ours_is_refused_an_option_that_the_command_has(
+    write: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        "import msgspec\nclass Options(msgspec.Struct):\n    log: int = 1\n\nclass Emulated:\n    Options = Options\n"
+    )
+    methods = "".join(
+        f"    def {name}(self, *_): ...\n" for name in ("receive", "next_due_ns", "emit", "skip", "totals")
+    )
+    path = write("emulated.py", f"{text}{methods}")
+    assert exit_status(emulate.command, ["--driver", path, "--bus", "vcan0"]) == 2
+    assert "option 'log' would be hidden by --log of skin-emulate" in capsys.readouterr().err
+
+
 def test_all_who_name_it_mean_the_same_class(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = Path(write("finger.py", FINGER + "\n\nDriver = Finger\n"))
     monkeypatch.chdir(path.parent)

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from skinware import DriverReader
+from skinware import DriverReader, Structure
 from skinware.memory.ring import Frame
 from skinware.status import Status
 from skinware.views import health
@@ -47,7 +47,7 @@ def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> 
         skin.publish()
         frame = reader.read()
         assert status_now("live", frame).tolist() == [0] * 3 + [Status.OUT_OF_RANGE] + [0] * 8
-        monkeypatch.setattr(health, "age_limit_ns", lambda _: 0)
+        monkeypatch.setattr(Structure, "age_limits_ns", lambda self, _: np.zeros(self.n_sensors, np.int64))
         assert status_now("live", frame).tolist() == [Status.STALE] * 3 + [Status.OUT_OF_RANGE] + [Status.STALE] * 8
 
 
@@ -132,5 +132,5 @@ def test_nothing_is_fresh_in_the_last_frame_of_a_driver_that_is_gone() -> None:
 def test_a_patch_is_as_old_as_its_newest_module(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(health, "now_ns", lambda: 5000)
     structure = fake_structure(3, 2)
-    frame = SimpleNamespace(structure=structure, module_time_ns=np.array([1000, 4000, 0, 2000, 0, 0]))
+    frame = SimpleNamespace(structure=structure, group_time_ns=np.array([1000, 4000, 0, 2000, 0, 0]))
     assert patch_ages_ns(cast(Any, frame)) == [1000, 3000, None]

@@ -22,7 +22,7 @@ INSTANCE = "torso"
 
 
 def printed() -> str:
-    done = run("skin-driver", "--unit")
+    done = run("skin-driver", "--systemd")
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -353,7 +353,7 @@ class TestPaxiniConverter(DriverConformance):
     driver_options: ClassVar[Mapping[str, Any]] = {"sensors": (1, 3)}
     emulator_options: ClassVar[Mapping[str, Any]] = {
         "sensors": (1, 3),
-        "version": "PAXINI PXSR-STDIP03B-v1.0.5",
+        "sensor_version": "PAXINI PXSR-STDIP03B-v1.0.5",
         "points": 25,
     }
 
@@ -406,6 +406,32 @@ class TestRevo2(DriverConformance):
         return [float(np.float32(value)) for value in felt]
 
 
+class EmulatedPressureRevo2(EmulatedRevo2):
+    full_scale = 0xFFFF
+
+
+class TestRevo2Pressure(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedPressureRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "pressure"}
+
+
+class EmulatedForce3dRevo2(EmulatedRevo2):
+    full_scale = 127
+
+
+class TestRevo2Force3d(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedForce3dRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "force3d"}
+
+
+class TestRevo2ArrayPressure(DriverConformance):
+    driver = Revo2Driver
+    emulator = EmulatedPressureRevo2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"edition": "array_pressure"}
+
+
 class TestRevo2ThatIsSwitchedOn(TestRevo2):
     driver_options: ClassVar[Mapping[str, Any]] = {"enable": True}
     emulator_options: ClassVar[Mapping[str, Any]] = {"enabled": False}
@@ -416,11 +442,28 @@ class TestRevo3(DriverConformance):
     emulator = EmulatedRevo3
 
 
+class TestRevo3Sums(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedRevo3
+    emulator_options: ClassVar[Mapping[str, Any]] = {"sums": True, "side": "left"}
+
+
 class TestRevo3Matrix(DriverConformance):
     driver = Revo3Driver
     emulator = EmulatedRevo3
     driver_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
-    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "matrix", "values": "force"}
+
+
+class EmulatedPackedRevo3(EmulatedRevo3):
+    full_scale = 0xFF
+
+
+class TestRevo3Packed(DriverConformance):
+    driver = Revo3Driver
+    emulator = EmulatedPackedRevo3
+    driver_options: ClassVar[Mapping[str, Any]] = {"mapping": "packed"}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"mapping": "packed", "values": "force", "adc_pads": (1, 4)}
 
 
 def test_every_driver_that_ships_is_here() -> None:

@@ -138,14 +138,14 @@ class _InC(_InPython):
         self.bus.open()
         line._is_open()
         tables = assemble([("line", adapter.patches)], adapter.types, np.dtype(np.uint16))
+        decoder = Decoder([adapter.layout], tables, [adapter.period_s])
         writer = DriverWriter(
             "fingers",
-            tables.structure,
+            decoder.tables.structure,
             bus_counters=ALL_BUS_COUNTERS,
             patch_counters=ALL_PATCH_COUNTERS,
         )
         stack.callback(writer.close)
-        decoder = Decoder([adapter.layout], tables, [adapter.period_s])
         publisher = Publisher(writer, decoder, adapter.watch(tables), adapter.period_s, by_cycle=True)
         self._generation = Generation([line], decoder, adapter.watch(tables), publisher, adapter.period_s)
         flow = flow_of(self._generation, epoll.fileno(), 0.0, self._fail, self._fail)

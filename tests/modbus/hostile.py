@@ -41,8 +41,10 @@ FUZZED: Mapping[str, Callable[[], ModbusAdapter[Any]]] = {
     "inspire": lambda: InspireDriver(InspireOptions()),
     "inspire-by_matrix": lambda: InspireDriver(InspireOptions(by_matrix=True)),
     "revo2": lambda: Revo2Driver(Revo2Options()),
+    "revo2-force3d": lambda: Revo2Driver(Revo2Options(edition="force3d")),
     "revo3": lambda: Revo3Driver(Revo3Options()),
     "revo3-matrix": lambda: Revo3Driver(Revo3Options(mapping="matrix")),
+    "revo3-packed": lambda: Revo3Driver(Revo3Options(mapping="packed")),
 }
 _ROWS = 64
 

@@ -71,9 +71,9 @@ HANDS = {
         4100,
     ),
     "revo3": Hand(
-        lambda: Revo3Driver(Revo3Options(period_ms=20)),
-        lambda: device(127, 4000, revo3.registers().tolist()),
-        127,
+        lambda: Revo3Driver(Revo3Options(period_ms=20, mapping="pressure")),
+        lambda: device(1, 101, revo3.registers().tolist()),
+        1,
         list(range(1, 417)),
         [(READ_INPUT, begin, n) for begin, n in zip(revo3.BEGINS, revo3.POINTS, strict=True)],
         5100,

@@ -245,12 +245,12 @@ def test_bytes_in_the_other_order_are_told_where_the_shape_is_given(caplog: Any)
             wait_until(lambda: "add byte_order=little" in caplog.text)
 
 
-def test_an_array_that_tells_nothing_but_0_is_doubted(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_array_that_has_sent_only_0_is_untouched_and_fresh(caplog: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ZeroWatch, "patience_s", 0.2)
-    caplog.set_level(logging.WARNING)
+    caplog.set_level(logging.INFO)
     values = [0] * 36
     with emulated_reading(feeling(values)) as reader:
-        read_until(reader, lambda frame: bool(((frame.status & DOUBT) != 0).all()))
-        wait_until(lambda: "nothing but 0 comes from unit 1" in caplog.text)
+        read_until(reader, lambda frame: bool(frame.module_untouched.all()) and not frame.status.any())
+        wait_until(lambda: "nothing but 0 has come from unit 1" in caplog.text)
         values[7] = 1
-        read_until(reader, lambda frame: not frame.status.any())
+        read_until(reader, lambda frame: not frame.module_untouched.any() and not frame.status.any())

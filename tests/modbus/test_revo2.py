@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,6 +19,7 @@ from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.notice import Notice
 from skinware_drivers.registry import make_bus
+from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2, EmulatedRevo2Options
 from tests.modbus.peers import Action, device, rtu_server
@@ -30,7 +31,7 @@ ENABLE = "7E 10 0F A0 00 05 0A 00 01 00 01 00 01 00 01 00 01 4E E4"
 CALIBRATE = "7E 10 0F AA 00 05 0A 00 01 00 01 00 01 00 01 00 01 44 EE"
 FORCES = [1000, 20, 300, 0, 0, 0, 2500, 7, 359, 1, 2, 3, 4, 5, 6]
 PROXIMITIES = [1, 65535, 65536, 0x0102_0304, 0]
-WORDS = [*FORCES, 1, 0, 65535, 0, 0, 1, 0x0304, 0x0102, 0, 0, 9, 0, 0, 0, 0]
+WORDS = [*FORCES, 0, 1, 0, 65535, 1, 0, 0x0102, 0x0304, 0, 0, 0, 0, 0, 0, 0]
 
 
 def adapter(**options: Any) -> Revo2Driver:
@@ -55,7 +56,9 @@ def reading(name: str, **options: Any) -> Iterator[DriverReader]:
 
 def hand_of(words: list[int], action: Action | None = None) -> Any:
     """A left hand on a pymodbus server: its switches and its input registers are in one space."""
-    return device(126, 4000, [0] * 200 + words, action)
+    before = [0] * (4200 - 901)
+    before[0], before[970 - 901] = 2, 1
+    return device(126, 901, before + words, action)
 
 
 # What is asked
@@ -63,7 +66,7 @@ def hand_of(words: list[int], action: Action | None = None) -> Any:
 
 def test_one_read_gets_all_of_a_left_hand() -> None:
     [read] = adapter(side="left").wanted.reads()
-    assert (read.address, read.count) == (4200, 25)
+    assert (read.address, read.count) == (4200, 30)
     whole = wire.rtu_frame(wire.Message(read.unit, wire.question_to_read(read.function, read.address, 30)))
     assert whole == bytes.fromhex(READ)
 
@@ -141,14 +144,14 @@ def test_a_hand_that_is_not_switched_on_shows_no_data_and_says_what_to_do(caplog
 
 
 def test_only_ffff_of_the_right_width_means_none() -> None:
-    words = [*[0xFFFF] * 3, *FORCES[3:], 0xFFFF, 0, 0xFFFF, 0xFFFF, *[1, 0] * 3, *[0] * 5]
+    words = [*[0xFFFF] * 3, *FORCES[3:], 0, 0xFFFF, 0xFFFF, 0xFFFF, *[0, 1] * 3, *[0] * 5]
     with rtu_server(hand_of(words), baudrate=460_800) as name, reading(name, side="left") as reader:
         frame = read_until(reader, lambda frame: not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any())
         assert frame.status.tolist() == [16, 16, 16, *[0] * 12, 0, 16, 0, 0, 0]
 
 
 def test_a_hand_without_touch_is_switched_on_more_and_more_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
-    driver, pauses, told_of = adapter(enable=True), list[float](), list[Notice]()
+    driver, pauses, told_of = adapter(enable=True, edition="touch"), list[float](), list[Notice]()
 
     async def sleep(pause_s: float) -> None:
         pauses.append(pause_s)
@@ -165,3 +168,133 @@ def test_a_hand_without_touch_is_switched_on_more_and_more_rarely(monkeypatch: p
         asyncio.run(driver.attend(Link(make_bus("modbus:/dev/null"))))
     assert pauses == [1, 1, 2, 4, 8, 16, 32, 60, 60]
     assert told_of == [Notice.RESTARTED] * 7
+
+
+def test_a_finger_whose_status_is_not_normal_is_not_shown_as_good() -> None:
+    with patient("revo2", abnormal=(1,), missing=(4,)) as skin:
+        frame = read_until(skin.reader, lambda frame: not (frame.status & (Status.NEVER_SEEN | Status.STALE)).any())
+        of_uid = dict(zip(skin.reader.structure.sensor_uid.tolist(), frame.status.tolist(), strict=True))
+        assert of_uid == {0: 0, 1: Status.SUSPECT, 2: 0, 3: 0, 4: Status.NOT_CONNECTED}
+
+
+def test_status_registers_that_mean_something_else_can_be_left_out() -> None:
+    words = [*WORDS[:25], 900, 901, 902, 903, 904]
+    with rtu_server(hand_of(words), baudrate=460_800) as name:
+        with reading(name, side="left", status=False) as reader:
+            read_until(reader, lambda frame: not frame.status.any())
+
+
+def test_the_low_word_of_proximities_comes_first_on_request() -> None:
+    words = [*FORCES, 1, 0, 65535, 0, 0, 1, 0x0304, 0x0102, 0, 0, 0, 0, 0, 0, 0]
+    with rtu_server(hand_of(words), baudrate=460_800) as name:
+        with reading(with_options(name, "word_order=little"), side="left") as reader:
+            frame = read_until(reader, lambda frame: not frame.status.any())
+            assert frame.values.tolist() == np.array([*FORCES, *PROXIMITIES], np.float32).tolist()
+
+
+# The other editions
+
+
+@pytest.mark.parametrize(
+    ("hand", "counts", "kinds"),
+    [
+        ({"edition": "pressure"}, [9, 9, 9, 9, 9, 46, 6], {("pressure", "counts", 1.0), ("total_force_z", "N", 1e-3)}),
+        (
+            {"edition": "pressure", "kind": 1},
+            [9, 9, 9, 9, 9, 46, 6],
+            {("pressure", "Pa", 1000), ("total_force_z", "N", 1e-3)},
+        ),
+        (
+            {"edition": "pressure", "kind": 2},
+            [9, 9, 9, 9, 9, 46, 6],
+            {("force_z", "N", 1e-3), ("total_force_z", "N", 1e-3)},
+        ),
+        (
+            {"edition": "force3d"},
+            [93, 93, 93, 93, 12],
+            {(f"{what}_{axis}", "counts", 1.0) for what in ("force", "total_force") for axis in "xyz"},
+        ),
+        (
+            {"edition": "array_pressure", "side": "left"},
+            [5, 5, 5, 5, 5],
+            {(name, "counts", 1.0) for name in ("force_x", "force_y", "force_z", "moment_x", "moment_y")},
+        ),
+        ({"side": "left", "unit": 126}, [3] * 5 + [1] * 5, None),
+    ],
+)
+def test_the_hand_is_asked_which_edition_it_is(
+    hand: Mapping[str, Any], counts: list[int], kinds: set[tuple[str, str, float]] | None
+) -> None:
+    with emulated_skin("revo2", EmulatedRevo2, **hand) as skin:
+        read_until(skin.reader, lambda frame: not frame.status.any())
+        structure = skin.reader.structure
+        assert np.bincount(structure.sensor_module).tolist() == counts
+        if kinds is not None:
+            assert {(kind.name, kind.unit, kind.scale) for kind in structure.types} == kinds
+        assert structure.patch_names[0] == f"{hand.get('side', 'right')} hand"
+
+
+def test_forces_of_three_axes_are_two_signed_bytes_and_a_register() -> None:
+    registers = np.zeros(8000 - 901, np.int64)
+    registers[970 - 901] = 4
+    registers[7200 - 901 : 7204 - 901] = [0xFF01, 511, 0x0102, 33023]
+    with rtu_server(device(127, 901, registers.tolist()), baudrate=460_800) as name, reading(name) as reader:
+        frame = read_until(reader, lambda frame: not frame.status.any())
+        kinds = {kind.name: kind.id for kind in reader.structure.types}
+        of_type = [frame.values[reader.structure.sensor_type == kinds[f"force_{axis}"]] for axis in "xyz"]
+        assert [values[:2].tolist() for values in of_type] == [[-1, 1], [1, 2], [511, 33023]]
+
+
+def test_fingers_are_suspect_until_their_sensors_are_warm() -> None:
+    with emulated_skin("revo2", EmulatedRevo2, edition="array_pressure", cold=True) as skin:
+        read_until(skin.reader, lambda frame: bool((frame.status == Status.SUSPECT).all()))
+
+
+@pytest.mark.parametrize(
+    ("edition", "operation", "registers"),
+    [
+        ("touch", "enable", (4000, 5)),
+        ("touch", "calibrate", (4010, 5)),
+        ("touch", "reset", (4005, 5)),
+        ("pressure", "enable", (6200, 6)),
+        ("pressure", "calibrate", (6310, 6)),
+        ("force3d", "enable", (7001, 4)),
+        ("force3d", "calibrate", (7006, 4)),
+        ("array_pressure", "enable", (8000, 1)),
+        ("array_pressure", "calibrate", (8010, 1)),
+    ],
+)
+def test_operations_write_what_the_makers_program_writes(
+    monkeypatch: pytest.MonkeyPatch, edition: Any, operation: str, registers: tuple[int, int]
+) -> None:
+    driver, written = adapter(edition=edition), list[Any]()
+
+    async def write(_link: object, address: int, values: Sequence[int], *, unit: int) -> None:
+        written.append((address, list(values), unit))
+
+    async def sleep(_pause_s: float) -> None: ...
+
+    monkeypatch.setattr(driver, "write", write)
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    asyncio.run(getattr(driver, operation)(Link(make_bus("modbus:/dev/null")), []))
+    address, count = registers
+    assert written == [(address, [1] * count, 127)]
+
+
+def test_an_edition_without_a_reset_says_so() -> None:
+    with pytest.raises(BusError, match="no such registers"):
+        asyncio.run(adapter(edition="force3d").reset(Link(make_bus("modbus:/dev/null")), []))
+
+
+def test_serial_number_and_firmware_are_told() -> None:
+    with patient("revo2") as skin:
+        [names] = skin.reader.call("names").values()
+        assert names == "serial number BCXTR0000000001, firmware 1.0.14.U"
+
+
+def test_an_edition_of_another_number_is_refused(caplog: Any) -> None:
+    registers = [0] * (4230 - 901)
+    registers[970 - 901] = 9
+    with rtu_server(device(127, 901, registers), baudrate=460_800) as name:
+        with driving_lines([(adapter(), make_bus(with_options(name, PATIENTLY)))], "hand", wait=False):
+            wait_until(lambda: "register 970 says 9" in caplog.text)

@@ -297,11 +297,11 @@ class _Fuzz:
             join_types([adapter.types for adapter in adapters]),
             np.result_type(*(adapter.dtype for adapter in adapters)),
         )
+        decoder = Decoder([adapter.layout for adapter in adapters], tables, [a.period_s for a in adapters])
         writer = DriverWriter(
-            "flow", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
+            "flow", decoder.tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
         )
         self._stack.callback(writer.close)
-        decoder = Decoder([adapter.layout for adapter in adapters], tables, [a.period_s for a in adapters])
         watch, period_s = adapters[0].watch(tables), adapters[0].period_s
         publisher = Publisher(writer, decoder, watch, period_s, by_cycle=self._script.number(4) > 0)
         rows = _ROWS[self._script.number(len(_ROWS))]

@@ -46,11 +46,16 @@ def typestore() -> Typestore:
 
 
 def with_chars_of_ros(store: Typestore) -> Typestore:
-    """The same, with ``char`` being ``uint8`` in an event of a service, as it is in hashes that ROS makes."""
-    constants, fields = store.fielddefs["service_msgs/msg/ServiceEventInfo"]
+    """The same, with ``char`` being ``uint8``, as it is in hashes that ROS makes.
+
+    rosidl_adapter turns ``char`` of a ``.msg`` file into ``uint8`` before the hash is computed
+    (ros2/rosidl, rosidl_adapter/rosidl_adapter/msg/__init__.py, MSG_TYPE_TO_IDL).
+    """
     chars: Any = (Nodetype.ARRAY, (_plain("uint8"), 16))
-    fields = [(name, chars if name == "client_gid" else kind) for name, kind in fields]
-    store.fielddefs["service_msgs/msg/ServiceEventInfo"] = (constants, fields)
+    for name in ("service_msgs/msg/ServiceEventInfo", "rmw_dds_common/msg/Gid"):
+        constants, fields = store.fielddefs[name]
+        fields = [(field, chars if kind == (Nodetype.ARRAY, (_plain("char"), 16)) else kind) for field, kind in fields]
+        store.fielddefs[name] = (constants, fields)
     return store
 
 

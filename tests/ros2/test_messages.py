@@ -49,14 +49,22 @@ def test_all_of_the_message_package_is_known_here() -> None:
 
 
 MESSAGE_TYPES = [
-    *(types.POINTS, types.IMAGE, types.SKIN_FRAME, types.SENSORS, types.DIAGNOSTICS, types.PARTICIPANT),
+    *(
+        types.POINTS,
+        types.IMAGE,
+        types.SKIN_FRAME,
+        types.SENSORS,
+        types.DIAGNOSTICS,
+        types.TRANSFORMS,
+        types.PARTICIPANT,
+    ),
     *(types.TRIGGER.request, types.TRIGGER.response),
 ]
 
 
 @pytest.mark.parametrize("message_type", MESSAGE_TYPES, ids=lambda each: each.name)
 def test_hashes_are_those_of_the_definitions(message_type: MessageType) -> None:
-    assert message_type.hash == STORE.hash_rihs01(message_type.name)
+    assert message_type.hash == with_chars_of_ros(typestore()).hash_rihs01(message_type.name)
 
 
 def test_the_hash_of_a_service_is_the_one_that_ros_has() -> None:

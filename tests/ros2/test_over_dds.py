@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import signal
+import socket
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -107,7 +110,7 @@ def test_endpoints_and_the_node_have_names_and_hashes(namespace: Namespace, doma
 
 
 def test_a_service_tares(namespace: Namespace, domain: int) -> None:
-    with tareable(namespace), bridge() as ours:
+    with tareable(namespace), bridge("--tare") as ours:
         ours.wait_for("ready")
         with peer(domain, "--call", "/skin/arm/tare") as theirs:
             answers = [theirs.wait_for("answer") for _ in range(2)]
@@ -188,6 +191,50 @@ def test_a_network_that_is_not_there(domain: int, monkeypatch: pytest.MonkeyPatc
     )
     with pytest.raises(BridgeError, match=rf"domain {domain} of DDS cannot be joined"):
         dds.DdsNode(Identity("skin", domain=domain))
+
+
+def udp_addresses() -> set[str]:
+    """Addresses that UDP sockets of this process are bound to, but for those that receive on all."""
+    own = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            own.add(str(descriptor.readlink()))
+    lines = [line.split() for line in Path("/proc/self/net/udp").read_text().splitlines()[1:]]
+    words = [int(line[1].partition(":")[0], 16) for line in lines if f"socket:[{line[9]}]" in own]
+    return {socket.inet_ntoa(word.to_bytes(4, sys.byteorder)) for word in words if word}
+
+
+def test_this_machine_alone_by_default(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CYCLONEDDS_URI")
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    before = udp_addresses()
+    node = dds.DdsNode(Identity("skin", domain=domain))
+    try:
+        assert udp_addresses() - before == {"127.0.0.1"}
+    finally:
+        node.close()
+
+
+@pytest.mark.parametrize("name", ["lo", "127.0.0.1"])
+def test_an_interface_is_chosen_by_name_or_address(name: str, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CYCLONEDDS_URI")
+    before = udp_addresses()
+    node = dds.DdsNode(Identity("skin", domain=domain), [name])
+    try:
+        assert udp_addresses() - before == {"127.0.0.1"}
+    finally:
+        node.close()
+    with pytest.raises(BridgeError, match="cannot be joined"):
+        dds.DdsNode(Identity("skin", domain=domain), ["none'0"])
+
+
+def test_an_interface_beside_a_configuration_is_refused(domain: int) -> None:
+    done = refused("skin-bridge", "ros2", "--interface", "lo")
+    assert done.returncode == 2
+    assert "--interface and CYCLONEDDS_URI both choose networks: give one of them" in done.stderr
+    done = refused("skin-bridge", "ros2", "--rmw", "zenoh", "--interface", "lo")
+    assert done.returncode == 2
+    assert "--interface is for --rmw dds" in done.stderr
 
 
 def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -218,12 +218,31 @@ def test_a_carrier_that_takes_no_more_costs_nobody_else_anything(namespace: Name
 
 
 def test_topics_may_be_in_a_namespace_of_ros(namespace: Namespace) -> None:
-    with FakeSkin("arm", small()) as skin, served(namespace, prefix="/robot") as (graph, _):
+    with FakeSkin("arm", small()) as skin, served(namespace, prefix="/robot", with_tare=True) as (graph, _):
         graph.wanted = {"/robot/skin/arm/frame", "/robot/skin/arm/points/pressure"}
         heard_from(graph, "/robot/skin/arm/frame", skin)
         heard_from(graph, "/robot/skin/arm/points/pressure", skin)
         assert "/diagnostics" in graph.publishers
         assert "/robot/skin/arm/tare" in graph.services
+
+
+def test_coordinate_frames_are_below_a_root_that_is_asked_for(namespace: Namespace) -> None:
+    with FakeSkin("arm", small()) as arm, served(namespace, root_frame="robot") as (graph, _):
+        arm.publish()
+        transforms = told(graph, "/tf_static")[-1].transforms
+    geometry = arm.structure.geometry
+    assert geometry is not None
+    assert [each.child_frame_id for each in transforms] == sorted(set(geometry.frame[geometry.known]))
+    assert {each.header.frame_id for each in transforms} == {"robot"}
+    assert {each.transform.rotation.w for each in transforms} == {1.0}
+
+
+def test_no_transform_is_published_unasked(namespace: Namespace) -> None:
+    """A robot's own description places these frames: a second parent would tear its tree."""
+    with FakeSkin("arm", small()) as skin, served(namespace) as (graph, _):
+        graph.wanted = {FRAMES}
+        heard_from(graph, FRAMES, skin)
+        assert "/tf_static" not in graph.publishers
 
 
 # -- taring -----------------------------------------------------------------------------------------------------------
@@ -261,7 +280,7 @@ def tareable(namespace: Namespace, error: str = "") -> Iterator[DriverWriter]:
 
 
 def test_a_service_tares_and_tells_the_drivers_errors(namespace: Namespace) -> None:
-    with served(namespace) as (graph, _):
+    with served(namespace, with_tare=True) as (graph, _):
         with tareable(namespace) as writer:
             wait_until(lambda: "/skin/arm/tare" in graph.services)
             answer = graph.call("/skin/arm/tare")
@@ -282,15 +301,15 @@ def test_a_service_tares_and_tells_the_drivers_errors(namespace: Namespace) -> N
 
 
 def test_a_driver_that_cannot_be_tared_says_so(namespace: Namespace) -> None:
-    with publishing(FakeSkin("arm", small())), served(namespace) as (graph, _):
+    with publishing(FakeSkin("arm", small())), served(namespace, with_tare=True) as (graph, _):
         wait_until(lambda: "/skin/arm/tare" in graph.services)
         answer = graph.call("/skin/arm/tare")
         assert not answer.success
         assert answer.message
 
 
-def test_nobody_tares_where_it_is_read_only(namespace: Namespace) -> None:
-    with FakeSkin("arm", small()) as skin, served(namespace, is_read_only=True) as (graph, _):
+def test_the_graph_can_only_read_by_default(namespace: Namespace) -> None:
+    with FakeSkin("arm", small()) as skin, served(namespace) as (graph, _):
         graph.wanted = {FRAMES}
         heard_from(graph, FRAMES, skin)
         assert not graph.services
@@ -304,7 +323,7 @@ def test_the_end_of_the_bridge_waits_for_no_driver(namespace: Namespace) -> None
         columns["module_time_ns"][:] = time.monotonic_ns()
         writer.commit(time.monotonic_ns())
         answers: list[Any] = []
-        with served(namespace) as (graph, _):
+        with served(namespace, with_tare=True) as (graph, _):
             wait_until(lambda: "/skin/arm/tare" in graph.services)
             handler = graph.services["/skin/arm/tare"]
             asking = threading.Thread(target=lambda: answers.append(handler(Cdr().numbers("B", 0).done())))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Generic, TypeVar
 
+import click
 import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.adapter import CanAdapter
-from skinware_drivers.options import NoOptions
+from skinware_drivers.cli import driver, emulate
+from skinware_drivers.cli.hardware_options import reserved_names
+from skinware_drivers.options import HasOptions, NoOptions
 from skinware_drivers.virtual.emulator import Emulator, EmulatorOptions
 from tests.testing.fingertips import EmulatedFingertips, Fingertips
 
@@ -100,3 +103,35 @@ def test_an_option_period_ms_is_the_period() -> None:
     assert Emulated(EmulatedOptions()).period_s == 0.04
     assert Driver(Options(period_ms=0)).period_s == Driver.period_s == 0.02  # 0: that of the device, say
     assert Fingertips(NoOptions()).period_s == 0.02
+
+
+@pytest.mark.parametrize("name", ["slots", "group", "listen_only", "latency", "help", "systemd"])
+def test_an_option_that_skin_driver_would_hide_is_refused(name: str) -> None:
+    hidden = msgspec.defstruct("Hidden", [(name, int, 1)], frozen=True)
+    flag = name.replace("_", "-")
+    with pytest.raises(
+        ConfigurationError, match=f"class Rack: its option '{name}' .*--{flag} of skin-driver.*'device_"
+    ):
+        type("Rack", (CanAdapter,), {"__orig_bases__": (CanAdapter[hidden],)})  # type: ignore[valid-type]
+
+
+def test_an_option_is_hidden_by_the_name_that_is_written() -> None:
+    class Renamed(msgspec.Struct, frozen=True, rename={"rack": "slots"}):
+        rack: int = 1
+
+    with pytest.raises(ConfigurationError, match="'slots'"):
+
+        class Rack(CanAdapter[Renamed]):
+            pass
+
+
+def test_an_option_that_skin_emulate_would_hide_is_refused() -> None:
+    hidden = msgspec.defstruct("Hidden", [("log", int, 1)], bases=(EmulatorOptions,), frozen=True, kw_only=True)
+    with pytest.raises(ConfigurationError, match=r"class Rack: its option 'log' .*--log of skin-emulate"):
+        type("Rack", (Emulator,), {"__orig_bases__": (Emulator[hidden],)})  # type: ignore[valid-type]
+
+
+@pytest.mark.parametrize(("command", "base"), [(driver.command, CanAdapter), (emulate.command, Emulator)])
+def test_the_reserved_names_are_those_of_the_commands(command: click.Command, base: type[HasOptions[Any]]) -> None:
+    assert base.reserved_options == reserved_names(command)
+    assert base.options_command == command.name

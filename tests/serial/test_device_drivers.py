@@ -50,7 +50,7 @@ DEVICES: list[tuple[type[SerialAdapter[Any]], Any, dict[str, Any], dict[str, Any
     (WeissWtsDriver, EmulatedWeissWts, {}, {"columns": 2}, (32, 16)),
     (WujiGloveDriver, EmulatedWujiGlove, {}, {}, (768, 768)),
     (AgniDriver, EmulatedAgni, {}, {"sensors": (3, 4, 5)}, (20, 12)),
-    (PaxiniDriver, EmulatedPaxini, {}, {"version": "PAXINI PXSR-STDIP03B-v1.0.5", "points": 25}, (96, 78)),
+    (PaxiniDriver, EmulatedPaxini, {}, {"sensor_version": "PAXINI PXSR-STDIP03B-v1.0.5", "points": 25}, (96, 78)),
     (PaxiniDriver, EmulatedPaxini, HAND, {**HAND, "slots": (6,)}, (90, 30)),
 ]
 

@@ -250,7 +250,7 @@ class Exchanged(EmulatedPaxini):
         return super().answer(device, command, now_ns)
 
     def text(self) -> str:
-        return getattr(self, "_version", self.options.version)
+        return getattr(self, "_version", self.options.sensor_version)
 
 
 def test_another_sensor_in_the_place_of_one_that_fell_silent_is_noticed() -> None:
@@ -265,7 +265,9 @@ def test_another_sensor_in_the_place_of_one_that_fell_silent_is_noticed() -> Non
 def test_a_part_code_that_nobody_knows_needs_the_option_points(caplog: pytest.LogCaptureFixture) -> None:
     with (
         caplog.at_level(logging.WARNING, "skinware.driver"),
-        emulated_skin(PaxiniDriver, EmulatedPaxini, version="PAXINI X", driver_options={"points": 4}, points=4) as skin,
+        emulated_skin(
+            PaxiniDriver, EmulatedPaxini, sensor_version="PAXINI X", driver_options={"points": 4}, points=4
+        ) as skin,
     ):
         frame = read_until(skin.reader, is_live)
         assert frame.structure.module_kind.tolist() == [b"4 taxels"]
@@ -379,7 +381,7 @@ class Babbling(EmulatedPaxini):
 @pytest.mark.parametrize("board", ["converter", "high_speed"])
 def test_frames_that_mean_nothing_stop_nothing(board: str, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "skinware.driver"):
-        emulated: dict[str, Any] = {**HAND, "board": board, "sensors": (3,), "version": OTHER_PART, "points": 25}
+        emulated: dict[str, Any] = {**HAND, "board": board, "sensors": (3,), "sensor_version": OTHER_PART, "points": 25}
         with emulated_skin(
             PaxiniDriver, Babbling, driver_options={"board": board, "sensors": (3,)}, pattern="cycle", **emulated
         ) as skin:

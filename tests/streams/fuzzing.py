@@ -19,7 +19,7 @@ from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _
 from skinware_drivers.streams.icub_rops import rops
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.streams.xela_messages import XelaMessages
-from skinware_drivers.streams.yarp_text import YarpText
+from skinware_drivers.streams.yarp_messages import YarpMessages
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
@@ -44,8 +44,8 @@ def _xela() -> tuple[Framing, list[bytes]]:
 
 
 def _yarp() -> tuple[Framing, list[bytes]]:
-    port = Spoken(EmulatedYarp(EmulatedYarpOptions(length=96)))
-    return YarpText(96, tuple((number, 12 * number) for number in range(8))), port.answers(b"", 500)
+    port = Spoken(EmulatedYarp(EmulatedYarpOptions(length=12)))
+    return YarpMessages(12, ((0, 0),)), port.answers(b"", 500)
 
 
 def _icub() -> tuple[Framing, list[bytes]]:

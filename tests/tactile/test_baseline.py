@@ -355,6 +355,17 @@ def test_a_second_contact_in_the_module_outlives_the_first() -> None:
     assert all(seen)
 
 
+@pytest.mark.parametrize(("held_s", "grip", "eased"), [(60, 50, 8), (60, 150, 8), (240, 100, 15)])
+def test_an_eased_grip_stays_felt(held_s: int, grip: float, eased: float) -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.run(held_s, on(3, load=grip))
+    seen: list[bool] = []
+    bench.run(60, on(3, load=eased), each=lambda calm: seen.append(bool(calm.touched[3])))
+    assert all(seen)
+    assert not bench.run(2).touched.any()
+
+
 def test_settings_can_change_while_it_runs() -> None:
     bench = Bench()
     bench.run(6)

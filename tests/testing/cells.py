@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -93,10 +92,10 @@ class NoTemperatures(Cells):
 class EmulatedCells(Emulator[EmulatorOptions]):
     """They send by themselves. Pressures have 12 bits, temperatures 10."""
 
-    full_scale: ClassVar[Sequence[int]] = ([4095] * 9 + [1023]) * len(CELLS)
-    lowest: ClassVar[Sequence[int]] = ([0] * 9 + [100]) * len(CELLS)
-    rest: ClassVar[Sequence[int]] = ([200] * 9 + [512]) * len(CELLS)
-    swing: ClassVar[Sequence[int]] = ([3000] * 9 + [50]) * len(CELLS)
+    full_scale: int | Sequence[int] = ([4095] * 9 + [1023]) * len(CELLS)
+    lowest: int | Sequence[int] = ([0] * 9 + [100]) * len(CELLS)
+    rest: int | Sequence[int] = ([200] * 9 + [512]) * len(CELLS)
+    swing: int | Sequence[int] = ([3000] * 9 + [50]) * len(CELLS)
     period_s = 0.02
     numbers = (0,)
 

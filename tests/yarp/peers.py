@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,9 @@ from contextlib import contextmanager
 LOCAL = "127.0.0.1"
 PORT = "/icub/skin/left_hand_comp"
 END = b"*** end of message\r\n"
+GREETING = bytes.fromhex("5941641e0000525009000000") + b"skinware\0"
+READING = GREETING + bytes.fromhex("59410a00000052500101ffffffffffffffff0800000000000000000000007e720001")
+"""What a reader says to a port, as real ports of YARP 3.8.1 and 4.0.0 took it."""
 PATIENCE_S = 20.0
 
 
@@ -69,11 +73,13 @@ class Robot:
         ports: where ports are, by name: (host, port, carrier).
         asked: everything that was said to the name server.
         heard: everything that was said to the port.
+        is_dead: the port was read as one that kills its program.
     """
 
     def __init__(self, says: Callable[[socket.socket], None]) -> None:
         self.asked: list[bytes] = []
         self.heard: list[bytes] = []
+        self.is_dead = False
         self._says = says
         self.port = Answering(self._speak)
         self.ports: dict[str, tuple[str, int, str]] = {PORT: (LOCAL, self.port.port, "tcp")}
@@ -122,13 +128,18 @@ class Robot:
 
     def _speak(self, caller: socket.socket) -> None:
         heard = b""
-        while heard.count(b"\n") < 2:
-            more = caller.recv(100)
+        while len(heard) < len(READING) and READING.startswith(heard):
+            more = caller.recv(len(READING) - len(heard))
             if not more:
                 return
             heard += more
+            if heard == GREETING:
+                caller.sendall(b"YA" + self.port.port.to_bytes(4, "little") + b"RP")
         self.heard.append(heard)
-        caller.sendall(b"Welcome " + heard[8:].split(b"\n")[0].strip() + b"\r\n")
+        if heard != READING:
+            self.is_dead = True  # as a real port of vectors, of a reader in text
+            self.port.hang_up()
+            return
         self._says(caller)
 
 
@@ -145,6 +156,13 @@ def until_gone(caller: socket.socket) -> None:
             pass
 
 
-def vector(values: list[float], head: bytes = b"D") -> bytes:
-    """As YARP writes a vector of doubles."""
-    return head + b"\r\n" + " ".join(f"{value:.1f}" for value in values).encode() + b"\r\n"
+def message(data: bytes, command: bytes = b"\0\0\0\0~D\0\1") -> bytes:
+    """A binary message of YARP in two blocks."""
+    return b"YA\n\0\0\0RP\2\1" + b"\xff" * 8 + struct.pack("<iii", len(command), len(data), 0) + command + data
+
+
+def vector(values: list[float], envelope: str = "") -> bytes:
+    """As YARP 4 writes a vector of doubles."""
+    data = struct.pack(f"<ii{len(values)}d", 276, len(values), *values)
+    text = envelope.encode() + b"\0"
+    return message(data, struct.pack("<i", len(text)) + b"~\0\0\1" + text) if envelope else message(data)

@@ -60,9 +60,9 @@ class Skin:
 
 
 @contextmanager
-def outlet(yarp: Robot, **wanted: Any) -> Iterator[tuple[Outlet, list[dict[str, Any]]]]:
+def outlet(there: Robot, /, **wanted: Any) -> Iterator[tuple[Outlet, list[dict[str, Any]]]]:
     told: list[dict[str, Any]] = []
-    one = Outlet(Namespace(None), Wanted(**wanted), NameServer(LOCAL, yarp.server.port), told.append)
+    one = Outlet(Namespace(None), Wanted(**wanted), NameServer(LOCAL, there.server.port), told.append)
     thread = threading.Thread(target=one.run)
     thread.start()
     try:
@@ -73,8 +73,9 @@ def outlet(yarp: Robot, **wanted: Any) -> Iterator[tuple[Outlet, list[dict[str, 
         one.close()
 
 
-def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot) -> None:
-    with contextlib.closing(Skin("hand")) as skin, outlet(yarp) as (there, told):
+@pytest.mark.parametrize("version", [3, 4])
+def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot, version: int) -> None:
+    with contextlib.closing(Skin("hand")) as skin, outlet(yarp, yarp=version) as (there, told):
         wait_until(lambda: "/skinware/hand" in yarp.ports)
         assert told == [{"event": "port", "port": "/skinware/hand", "driver": "hand"}]
         with emulated_skin("yarp", name="again", bus=f"yarp://{LOCAL}:{yarp.server.port}/skinware/hand") as driver:
@@ -85,7 +86,7 @@ def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot) -> Non
             (port,) = [port for name, port in there.ports().items() if name == "/skinware/hand"]
             assert port["registered"]
             assert port["values"] == 24
-            assert [(r["name"], r["carrier"]) for r in port["readers"]] == [("skinware", "text")]
+            assert [(r["name"], r["carrier"]) for r in port["readers"]] == [("skinware", "fast_tcp")]
     assert "/skinware/hand" not in yarp.ports
 
 
@@ -171,7 +172,7 @@ def test_wrong_use(namespace: object) -> None:
 
 
 def test_a_reader_that_is_stuck_takes_nothing_from_the_others(namespace: object, yarp: Robot) -> None:
-    with contextlib.closing(Skin("hand", 2000)) as skin, outlet(yarp) as (there, _):
+    with contextlib.closing(Skin("hand", 2000)) as skin, outlet(yarp, yarp=4) as (there, _):
         wait_until(lambda: "/skinware/hand" in yarp.ports)
         host, number, _ = yarp.ports["/skinware/hand"]
         with socket.create_connection((host, number), PATIENCE_S) as stuck:

@@ -17,9 +17,9 @@ import pytest
 
 from skinware.yarp.carriers import Carrier, Message
 from skinware.yarp.names import NameServer
-from skinware.yarp.port import OutputPort
+from skinware.yarp.port import _WHICH_YARP, OutputPort
 from skinware_drivers.testing.waiting import wait_until
-from tests.yarp.peers import LOCAL, PATIENCE_S, Answering, Robot, robot, until_gone
+from tests.yarp.peers import GREETING, LOCAL, PATIENCE_S, READING, Answering, Robot, robot, until_gone
 
 OURS = "/skinware/hand"
 
@@ -31,13 +31,13 @@ class There:
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)
         self._thread.start()
-        self.port = OutputPort(OURS, names)
+        self.port = OutputPort(OURS, names, yarp=3)
         self.number = asyncio.run_coroutine_threadsafe(self.port.open(LOCAL), self.loop).result(PATIENCE_S)
         self.count = 0
 
     def send(self, *values: float) -> None:
         self.count += 1
-        message = Message(np.array(values), self.count, time.time())
+        message = Message(np.array(values), self.count, time.time(), yarp=3)
         done = threading.Event()
         self.loop.call_soon_threadsafe(self.port.send, message)
         self.loop.call_soon_threadsafe(done.set)
@@ -217,7 +217,43 @@ def test_a_reader_that_does_not_read_misses_vectors_and_holds_nobody_up(yarp: Ro
             wait_until(lambda: busy.messages == 2)
 
 
-@pytest.mark.parametrize("said", [b"YA\x64\x1e\0\0RP", b"GET / HTTP/1.1\r\n", b"\0" * 100, b"CONNECT " + b"x" * 10_000])
+def test_a_reader_in_binary(there: There) -> None:
+    with called(there, GREETING) as connection:
+        assert hear(connection, b"RP") == b"YA" + there.number.to_bytes(4, "little") + b"RP"
+        connection.sendall(READING[len(GREETING) :])
+        wait_until(lambda: [(r.name, r.carrier) for r in there.port.receivers] == [("skinware", Carrier.FAST_TCP)])
+        there.send(4.0)
+        assert hear(connection, struct.pack("<iid", 266, 1, 4.0))
+
+
+def test_no_reader_in_binary_is_served_where_its_version_is_not_known(
+    yarp: Robot, there: There, caplog: pytest.LogCaptureFixture
+) -> None:
+    there.port._yarp = None
+    for _ in range(2):
+        with called(there, READING) as connection, contextlib.suppress(ConnectionError):
+            assert hear(connection, b"RP")
+            assert connection.recv(100) == b""
+    assert [record.message for record in caplog.records] == [
+        f"/skinware/hand: skinware reads by fast_tcp and is refused: {_WHICH_YARP}"
+    ]
+    with contextlib.closing(Input(Carrier.TEXT)) as gui:
+        yarp.ports["/gui:i"] = (LOCAL, gui.port, "tcp")
+        assert b"start skin-bridge yarp with --yarp 3 or --yarp 4" in connect(there, "tcp://gui:i")
+        assert not gui.callers
+        assert connect(there, "text://gui:i").startswith(b'0 "Added')
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"YA\x65\x1e\0\0RP",
+        b"YA\x64\x1e\0\0RP\xff\xff\xff\x7f",
+        b"GET / HTTP/1.1\r\n",
+        b"\0" * 100,
+        b"CONNECT " + b"x" * 10_000,
+    ],
+)
 def test_who_speaks_otherwise_is_hung_up_on(there: There, said: bytes) -> None:
     with called(there, said) as connection, contextlib.suppress(ConnectionError):
         assert connection.recv(100) == b""

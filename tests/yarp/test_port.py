@@ -19,10 +19,10 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import is_only_asked, place_of_bus
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.yarp_bus import YarpBus
-from skinware_drivers.streams.yarp_text import LENGTH, YarpText
+from skinware_drivers.streams.yarp_messages import LENGTH, YarpMessages
 from skinware_drivers.testing.waiting import wait_until
 from tests.streams.peers import received, why_lost
-from tests.yarp.peers import LOCAL, PORT, Robot, robot, until_gone, vector
+from tests.yarp.peers import LOCAL, PORT, READING, Answering, Robot, message, robot, until_gone, vector
 
 TWELVE = [float(value) for value in range(12)]
 
@@ -42,7 +42,7 @@ def says(*pieces: bytes) -> Callable[[socket.socket], None]:
 def opened(name: str, length: int = 12) -> Iterator[tuple[YarpBus, FrameBatch]]:
     bus = make_bus(name, payload_size=56)
     assert isinstance(bus, YarpBus)
-    bus.use(YarpText(length, ((0, 0),)))
+    bus.use(YarpMessages(length, ((0, 0),)))
     bus.open()
     try:
         yield bus, FrameBatch(5000, 56)
@@ -66,11 +66,11 @@ def test_a_port_is_found_and_nothing_is_said_but_what_makes_it_speak() -> None:
     with robot(says(vector(TWELVE), vector([5.0] * 12))) as there, opened(there.bus) as (bus, batch):
         assert take(bus, batch, 2) == [0, 5]
         assert there.asked == [b"query " + PORT.encode()]
-        assert there.heard == [b"CONNECT skinware\nr\n"]
+        assert there.heard == [READING]
         assert bus.name == f"bus {there.bus}"
         with pytest.raises(BusSendError, match="only read"):
             bus.send(0, b"")
-    assert there.heard == [b"CONNECT skinware\nr\n"]
+    assert there.heard == [READING]
 
 
 def test_a_port_of_the_configured_name_server(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_what_the_name_of_such_a_bus_means() -> None:
 
 def test_a_port_that_hangs_up_is_gone_and_what_it_said_before_counts() -> None:
     def speak(caller: socket.socket) -> None:
-        caller.sendall(vector(TWELVE) + b"D\r\n1.0 2.0")
+        caller.sendall(vector(TWELVE) + vector(TWELVE)[:50])
 
     with robot(speak) as there, opened(there.bus) as (bus, batch):
         assert "closed by the other end" in why_lost(bus, batch)
@@ -153,11 +153,9 @@ def test_silence_is_not_waited_out() -> None:
     [
         vector(TWELVE[:5]),
         vector(TWELVE * 2),
-        b"D\r\n(1 2 3) 4\r\n",
-        b'D\r\n"no skin"\r\n',
-        b"no message\r\n",
-        b"\xff" * 300 + b"\n",
-        b"D\r\n" + b"1.0 " * 15_000 + b"\r\n",
+        message(struct.pack("<iii8s", 256, 1, 5, b"no skin")),
+        message(bytes(100)),
+        vector([1.0] * 7000),
     ],
 )
 def test_what_is_wrong_is_counted_and_costs_itself_alone(wrong: bytes) -> None:
@@ -168,21 +166,43 @@ def test_what_is_wrong_is_counted_and_costs_itself_alone(wrong: bytes) -> None:
         assert framing.bytes_in == framing.frame_bytes + framing.idle_bytes + framing.skipped_bytes
 
 
-def test_a_line_that_never_ends_needs_no_room() -> None:
+def test_bytes_that_are_no_messages_need_no_room() -> None:
     over = threading.Event()
 
     def speak(caller: socket.socket) -> None:
-        caller.sendall(b"D\r\n")
         for _ in range(200):
-            caller.sendall(b"1.0 " * 16_384)
-        caller.sendall(b"\r\n" + vector([7.0] * 12))
+            caller.sendall(b"YA\n\0" * 16_384)
+        caller.sendall(vector([7.0] * 12))
         over.set()
         until_gone(caller)
 
     with robot(speak) as there, opened(there.bus) as (bus, batch):
         assert take(bus, batch, 1) == [7]
         assert over.is_set()
-        assert bus.counters.framing.refused >= 1
+        assert bus.counters.framing.skipped_bytes >= 1
+
+
+def test_what_answers_otherwise_is_no_port() -> None:
+    def speak(caller: socket.socket) -> None:
+        caller.sendall(b"HTTP/1.1 400 Bad Request")
+        until_gone(caller)
+
+    with contextlib.closing(Answering(speak)) as other, robot(until_gone) as there:
+        there.ports[PORT] = (LOCAL, other.port, "tcp")
+        with pytest.raises(BusNotAvailable, match="is no port of YARP"):
+            make_bus(there.bus).open()
+
+
+def test_a_port_that_dies_of_readers_in_text_lives() -> None:
+    with robot(says(vector(TWELVE))) as there:
+        for _ in range(5):
+            with opened(there.bus) as (bus, batch):
+                assert take(bus, batch, 1) == [0]
+        assert not there.is_dead
+        with socket.create_connection((LOCAL, there.port.port)) as reader:
+            reader.sendall(b"CONNECT skinware\nr\n")
+            assert reader.recv(100) == b""
+        assert there.is_dead
 
 
 def pile_up(there: Robot, bus: YarpBus, count: int) -> None:

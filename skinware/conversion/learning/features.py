@@ -15,7 +15,6 @@ from skinware.conversion._packages import pillow
 from skinware.conversion.learning.joined import Joined
 from skinware.conversion.tables import COLUMNS, TIME, Block, Table
 from skinware.errors import BadRecording, ConfigurationError
-from skinware.freshness import age_limit_ns
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.structure import Structure
@@ -24,7 +23,8 @@ MOST_NAMES = 4096
 """Of sensors, in the description of a feature; the side file has them all."""
 IMAGE = "image"
 _PNG, _RGB = b"\x89PNG\r\n\x1a\n", (8, 2)
-_NEEDED = (COLUMNS + "values", COLUMNS + "status", COLUMNS + "module_time_ns", TIME)
+_OF_MODULES, _OF_GROUPS = COLUMNS + "module_time_ns", COLUMNS + "group_time_ns"
+_NEEDED = (COLUMNS + "values", COLUMNS + "status", TIME)
 _MORE = ("frames/acquired_ns", "frames/published_ns")
 
 Batch = dict[str, npt.NDArray[Any]]
@@ -60,7 +60,7 @@ class SkinFeatures:
         self, service: str, structure: Structure, sensor_names: Sequence[str], window: int, period_ns: int
     ) -> None:
         self._structure, self._window = structure, window
-        self._limit_ns = age_limit_ns(period_ns)
+        self._limits_ns = structure.group_age_limits_ns(period_ns)
         self._prefix = "observation.tactile." + service.replace("/", "_")
         self._types = {
             each.name: np.arange(structure.n_sensors)[structure.index(each.name)]
@@ -109,12 +109,13 @@ class SkinFeatures:
 
         Frames before the newest are judged as late as that one was: a driver that fell silent makes all of them stale.
         """
-        time_ns = frames[COLUMNS + "module_time_ns"][numbers]  # (t, window, modules)
+        times_ns = frames[_OF_GROUPS if _OF_GROUPS in frames else _OF_MODULES]
+        time_ns = times_ns[numbers]  # (t, window, groups)
         at_ns = frames["frames/published_ns"][numbers] + late_ns[:, np.newaxis]
-        is_old = (time_ns > 0) & (time_ns < at_ns[..., np.newaxis] - self._limit_ns)
+        is_old = (time_ns > 0) & (time_ns < at_ns[..., np.newaxis] - self._limits_ns)
         status: npt.NDArray[np.uint8] = frames[COLUMNS + "status"][numbers]
         if is_old.any():
-            status |= np.where(is_old[..., self._structure.sensor_module], np.uint8(Status.STALE), np.uint8(0))
+            status |= np.where(is_old[..., self._structure.sensor_group], np.uint8(Status.STALE), np.uint8(0))
         return status
 
     def _in_rows(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -133,7 +134,8 @@ class Frames:
 
     def __init__(self, table: Table, times_ns: npt.NDArray[np.int64], window: int) -> None:
         self._name, self._times_ns, self._window = table.name, times_ns, window
-        self._blocks = table.blocks((*_NEEDED, *_MORE))
+        self._wanted = (*_NEEDED, *_MORE, _OF_GROUPS if _OF_GROUPS in table.arrays else _OF_MODULES)
+        self._blocks = table.blocks(self._wanted)
         self._kept: list[tuple[int, Block]] = []
         self._next = 0
 
@@ -154,7 +156,7 @@ class Frames:
             end = first + len(block[TIME])
             inside = numbers[(numbers >= first) & (numbers < end)] - first
             if len(inside):
-                parts.append({name: block[name][inside] for name in (*_NEEDED, *_MORE)})
+                parts.append({name: block[name][inside] for name in self._wanted})
             if end > needed:
                 kept.append((first, block))
         self._kept = kept

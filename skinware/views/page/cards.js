@@ -52,7 +52,8 @@ class Card {
     const value = markOf(status) < NO_ACK ? shown?.value : null;
     setText(this.value, `${past ? "≈ " : ""}${measure(value, sheet.unit)}`);
     const isOld = sheet.driver.isOld && !past;
-    setText(this.status, isOld && status === 0 ? "stale: driver silent" : statusText(status));
+    const text = isOld && status === 0 ? "stale: driver silent" : statusText(status);
+    setText(this.status, shown?.untouched ? `${text}; only 0 so far` : text);
     this.status.dataset.fresh = String(status === 0 && !isOld);
     setText(this.cells.raw, figure(past ? null : shown?.raw));
     setText(this.cells.age, age(past ? null : shown?.age_ms));

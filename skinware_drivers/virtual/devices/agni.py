@@ -60,6 +60,14 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
             at += count
         return sent
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``sensor1`` and so on; other messages are answers."""
+        return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
+
+    def kinds(self) -> Sequence[str]:
+        """A message for each sensor."""
+        return [f"sensor{number}" for number, _ in enumerate(self.options.sensors, 1)]
+
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         """Commands that set something have no answer."""
         target, number = command[2:4]

@@ -43,6 +43,10 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
         """It sends by itself."""
         self.start(device, now_ns)
 
+    def kinds(self) -> Sequence[str]:
+        """Its two frames."""
+        return [self.kind_of(identifier, b"") for identifier in (0x054 << 2, 0x055 << 2)]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         """Two frames of eight pads."""
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
@@ -71,11 +75,19 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
         """It sends by itself."""
         self.start(device, now_ns)
 
+    def kinds(self) -> Sequence[str]:
+        """Its two frames."""
+        return [self.kind_of(identifier, b"") for identifier in (self._first << 2, self._first + 2 << 2)]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         """Two frames of two fingertips."""
         told = [value + self.options.air_pa for value in values]
-        first = 0x050 if self.options.as_in_manual else 0x0F0
-        return [(first << 2, struct.pack("<2i", *told[:2])), (first + 2 << 2, struct.pack("<2i", *told[2:]))]
+        first, second = self._first << 2, self._first + 2 << 2
+        return [(first, struct.pack("<2i", *told[:2])), (second, struct.pack("<2i", *told[2:]))]
+
+    @property
+    def _first(self) -> int:
+        return 0x050 if self.options.as_in_manual else 0x0F0
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -64,6 +64,17 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
         self.burst(device, now_ns)
         return True
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:
+        """The frames of all cells by identifier and part: ``0x569-0``."""
+        part = f"-{payload[0] >> 4}" if identifier & 0x41F == 0x409 else ""
+        return f"{super().kind_of(identifier, payload)}{part}"
+
+    def kinds(self) -> Sequence[str]:
+        """Five frames of all cells, or one of the ten strongest, from each puck."""
+        senders = [number << 5 | 0x400 for number in self.numbers]
+        whole = [self.kind_of(sender | 9, bytes([part << 4])) for sender in senders for part in range(5)]
+        return [*whole, *(self.kind_of(sender | 8, b"") for sender in senders)]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         """Five frames of all cells, or one of the ten strongest."""
         sender = device.number << 5 | 0x400

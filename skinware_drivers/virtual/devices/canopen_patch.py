@@ -102,6 +102,14 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         else:
             self.burst(device, time_ns)
 
+    def kinds(self) -> Sequence[str]:
+        """The TPDOs, the answers of SDO and the heartbeats of each node."""
+        found = []
+        for number in self.numbers:
+            node = _make_node(self.options.eds, number, None)
+            found += [*(identifier for identifier, _ in _tpdos(node)), 0x580 + number, 0x700 + number]
+        return [self.kind_of(identifier, b"") for identifier in found]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         """One frame for each TPDO."""
         found, rest = [], list(values)

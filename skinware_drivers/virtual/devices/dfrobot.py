@@ -6,7 +6,7 @@ Source: DFRobot/DFRobot_TactileSensor; the vectors in tests/modbus/test_dfrobot.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +40,7 @@ class EmulatedDfrobot(ModbusEmulator[EmulatedDfrobotOptions]):
     An array has those of its own shape.
     """
 
-    full_scale: ClassVar[int] = 4095
+    full_scale: int = 4095
     rest = 20
     swing = 3000
     function = 4

@@ -57,11 +57,22 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
         """The robot's program has started it."""
         self.start(device, now_ns)
 
+    def kinds(self) -> Sequence[str]:
+        """Name the CAN frames that the board's datagrams carry."""
+        triangles = range(self.options.triangles)
+        return [
+            f"0x{0x400 | board << 4 | triangle:03x}-{half}"
+            for board in self.numbers
+            for triangle in triangles
+            for half in ("head", "tail")
+        ]
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """One datagram with both halves of every triangle."""
         records = []
         for triangle in range(self.options.triangles):
             can = 0x400 | device.number << 4 | triangle
             twelve = bytes(values[12 * triangle : 12 * triangle + 12])
-            records += [(can, b"\x40" + twelve[:7]), (can, b"\xc0" + twelve[7:] + b"\0\0")]
+            halves = {"head": b"\x40" + twelve[:7], "tail": b"\xc0" + twelve[7:] + b"\0\0"}
+            records += [(can, data) for half, data in halves.items() if f"0x{can:03x}-{half}" not in self.silent]
         return [datagram(self.options.skin, records, device.cycle, device.sampled_ns // 1000)]

@@ -90,6 +90,14 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
             return False
         return True
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """Answers by their command: ``0xb1``; what the program asks and moves has no such kind."""
+        return "question" if payload == self._question(payload[0]) else f"0x{payload[0]:02x}"
+
+    def kinds(self) -> Sequence[str]:
+        """The commands that are answered with data."""
+        return [f"0x{command:02x}" for command in self._commands]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         """What was asked for; or a round of the program's questions, with the answers and a movement between them."""
         device.memory[_FELT] = values

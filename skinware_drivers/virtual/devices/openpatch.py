@@ -152,6 +152,15 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
             said += self._what_is_off(device, self._meant(arguments[0]))
         return said
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``module0`` and so on, ``boot``, ``report``; other messages are answers."""
+        body = unstuff(payload.split(b"\0")[0])
+        return f"module{body[1]}" if body[0] == _DATA else {_BOOT: "boot", _REPORT: "report"}.get(body[0], "answer")
+
+    def kinds(self) -> Sequence[str]:
+        """A message for each module, and those beside the data."""
+        return [*(f"module{module}" for module in range(self.options.modules)), "boot", "report"]
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A message for each module that is on."""
         memory = device.memory

@@ -37,7 +37,7 @@ class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_f
         Literal["converter", "high_speed"], Meta(description="sensors that are asked, or a hand that streams")
     ] = "converter"
     sensors: Annotated[tuple[int, ...], Meta(description="converter: ids of its sensors")] = (3,)
-    version: Annotated[str, Meta(description="converter: what its sensors say they are")] = (
+    sensor_version: Annotated[str, Meta(description="converter: version text of its sensors")] = (
         "PAXINI PXSR-STDDP03F-v1.0.5"
     )
     points: Annotated[int, Meta(ge=1, le=255, description="taxels of each sensor, or of each module on a finger")] = 31
@@ -75,7 +75,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
 
     def text(self) -> str:
         """What its sensors say they are."""
-        return self.options.version
+        return self.options.sensor_version
 
     def slots(self) -> Sequence[int]:
         """To which modules are connected."""
@@ -109,6 +109,12 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         if self.options.board == "high_speed":
             of_board = self._answer_of_hand
         return of_board(device, command, now_ns)
+
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        if self.options.board == "high_speed":
+            return "data" if payload[:2] == b"\xaa\x56" else "answer"
+        return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """What was asked for, or all modules."""

@@ -1,12 +1,12 @@
-"""An emulated Revo2 Touch hand of BrainCo: its registers.
+"""An emulated Revo2 hand of BrainCo with touch, in one of its four editions: its registers.
 
-Source: BrainCoTech/unitree-g1-brainco-hand, pull request 1; the vectors in tests/modbus/test_revo2.py.
+Source: what the maker's program bc_stark_sdk 2.0.8 reads and writes; the vectors in tests/modbus/test_revo2.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,45 +16,126 @@ from skinware_drivers.virtual.emulator import Device, on_a_grid
 from skinware_drivers.virtual.modbus_device import ModbusEmulator
 from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
 
+_EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
+_SWITCHES = {
+    "touch": range(4000, 4005),
+    "pressure": range(6200, 6206),
+    "array_pressure": range(8000, 8001),
+    "force3d": range(7001, 7005),
+}
+_OTHER_COMMANDS = {
+    "touch": range(4005, 4015),
+    "pressure": range(6310, 6316),
+    "array_pressure": range(8010, 8017),
+    "force3d": range(7006, 7010),
+}
+_N_VALUES = {"touch": 20, "pressure": 97, "array_pressure": 25, "force3d": 4 * 93 + 12}
+
 
 class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the hand is."""
 
     unit: Annotated[int, Meta(ge=1, le=254, description="its number")] = 127
+    side: Annotated[Literal["right", "left"], Meta(description="which hand it says it is")] = "right"
+    edition: Annotated[
+        Literal["touch", "pressure", "force3d", "array_pressure"], Meta(description="which sensors it has")
+    ] = "touch"
+    says_edition: Annotated[bool, Meta(description="it tells which they are, in register 970")] = True
+    kind: Annotated[Literal[0, 1, 2], Meta(description="values of the pressure edition: raw, calibrated, force")] = 0
     enabled: Annotated[bool, Meta(description="touch is on as soon as the hand has power")] = True
     touch: Annotated[bool, Meta(description="it is a hand with touch; others take commands and have no data")] = True
+    abnormal: Annotated[tuple[int, ...], Meta(description="fingers (0 to 4) whose status is 1, abnormal")] = ()
+    missing: Annotated[tuple[int, ...], Meta(description="fingers (0 to 4) whose status is 2, no sensor")] = ()
+    cold: Annotated[bool, Meta(description="array_pressure: its sensors never become warm")] = False
 
 
 class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
-    """One hand. Values: force, tangential force and direction of each finger from the thumb on; then proximities."""
+    """One hand. Values of the edition touch: force, tangential force and direction of each finger; then proximities.
 
-    full_scale: ClassVar[Sequence[int]] = [0xFFFE] * 15 + [0xFFFF_FFFE] * 5
-    rest: ClassVar[Sequence[int]] = [30, 5, 90] * 5 + [70_000] * 5
-    swing: ClassVar[Sequence[int]] = [2500, 300, 0] * 5 + [90_000] * 5
+    Of the others: their registers in order, where force3d has x, y and z of each point.
+    """
+
+    full_scale: int | Sequence[int] = [0xFFFE] * 15 + [0xFFFF_FFFE] * 5
+    rest: int | Sequence[int] = [30, 5, 90] * 5 + [70_000] * 5
+    swing: int | Sequence[int] = [2500, 300, 0] * 5 + [90_000] * 5
     function = 4
 
     def __init__(self, options: EmulatedRevo2Options, **more: object) -> None:
         self.numbers = (options.unit,)
+        if options.edition != "touch":
+            self.full_scale, self.rest, self.swing = (127, 3, 90) if options.edition == "force3d" else (0xFFFF, 30, 900)
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
         """Five fingers beside each other."""
-        return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
+        if self.options.edition == "touch":
+            return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
+        return on_a_grid(_N_VALUES[self.options.edition], 12)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
-        """30 input registers from 4200 on; the last five count."""
-        if not (self.options.touch and device.memory.get("on", self.options.enabled)):
-            return dict.fromkeys(range(4200, 4230), 0xFFFF)
-        words = list(values[:15])
-        for proximity in values[15:]:
-            words += [proximity & 0xFFFF, proximity >> 16]
-        return dict(enumerate([*words, device.cycle & 0xFFFF, 0, 0, 0, 0], 4200))
+        """Input registers with what is felt."""
+        options = self.options
+        on = options.touch and device.memory.get("on", options.enabled)
+        if options.edition == "touch":
+            return self._touch(values) if on else dict.fromkeys(range(4200, 4230), 0xFFFF)
+        felt = values if on else [0] * len(values)
+        if options.edition == "pressure":
+            return (
+                dict.fromkeys(range(6001, 6101), 0)
+                | dict(enumerate(felt[:91], 6010))
+                | dict(enumerate(felt[91:], 6001))
+            )
+        if options.edition == "array_pressure":
+            status = {8020: 0, 8021: int(not options.cold)}
+            return dict.fromkeys(range(8020, 8125), 0) | status | dict(enumerate(felt, 8100))
+        found = dict.fromkeys(range(7100, 7562), 0)
+        for first, address in zip(range(0, 5 * 93, 93), (7200, 7300, 7400, 7500, 7100), strict=True):
+            x, y, z = felt[first : first + 93 : 3], felt[first + 1 : first + 93 : 3], felt[first + 2 : first + 93 : 3]
+            for point, (along, across, normal) in enumerate(zip(x, y, z, strict=True)):
+                found[address + 2 * point] = (along & 0xFF) << 8 | across & 0xFF
+                found[address + 2 * point + 1] = normal
+        return found
+
+    def beside(self, device: Device) -> Mapping[int, int]:  # noqa: ARG002
+        """Firmware and serial number."""
+        prefix = "BCXTL" if self.options.side == "left" else "BCXTR"
+        return _text(3000, "1.0.14.U") | _text(3010, f"{prefix}0000000001")
+
+    def of_other_function(self, device: Device) -> Mapping[int, int]:
+        """What it says of itself."""
+        options = self.options
+        on = int(options.touch and device.memory.get("on", options.enabled))
+        said = {901: 2 if options.side == "left" else 1, **dict.fromkeys(_SWITCHES[options.edition], on)}
+        if options.says_edition:
+            said[970] = _EDITIONS[options.edition] if options.touch else 0
+        if options.edition == "pressure":
+            said[6000] = device.memory.get("kind", options.kind)
+        return said
 
     def written(self, device: Device, address: int, value: int) -> bool:
-        """Switches of touch, and of the calibration, which changes nothing here."""
-        if 4000 <= address <= 4004:
+        """Switches of touch; and calibrations, which change nothing here."""
+        if address in _SWITCHES[self.options.edition]:
             device.memory["on"] = bool(value)
-        return 4000 <= address <= 4004 or 4010 <= address <= 4014
+            return True
+        if address == 6000 and self.options.edition == "pressure":
+            device.memory["kind"] = value
+            return True
+        return address in _OTHER_COMMANDS[self.options.edition]
+
+    def _touch(self, values: Sequence[int]) -> Mapping[int, int]:
+        """The high word of a proximity comes first."""
+        words = list(values[:15])
+        for proximity in values[15:]:
+            words += [proximity >> 16, proximity & 0xFFFF]
+        options = self.options
+        status = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
+        return dict(enumerate([*words, *status], 4200))
+
+
+def _text(address: int, text: str) -> dict[int, int]:
+    """Ten registers of two characters."""
+    data = text.encode().ljust(20, b"\0")
+    return {address + place: int.from_bytes(data[2 * place : 2 * place + 2], "big") for place in range(10)}
 
 
 __all__ = ["EmulatedRevo2", "EmulatedRevo2Options"]

@@ -1,6 +1,7 @@
-"""An emulated Revo3 hand of BrainCo: its registers, in one of its two mappings.
+"""An emulated Revo3 hand of BrainCo: its registers, in the three forms that its maker's programs read.
 
-Source: BrainCoTech/brainco-revo3-sdk; the vectors in tests/modbus/test_revo3.py.
+Source: BrainCoTech/brainco-revo3-sdk 7ba96eb (2026-08-03), and what bc-revo3-sdk 1.5.1 and 2.3.2 ask; the vectors in
+tests/modbus/test_revo3.py.
 """
 
 from __future__ import annotations
@@ -16,20 +17,43 @@ from skinware_drivers.virtual.emulator import Device, on_a_grid
 from skinware_drivers.virtual.modbus_device import ModbusEmulator
 from skinware_drivers.virtual.serial_device import SerialEmulatorOptions
 
-_SHAPES = {4200: 36, 4250: 31, 4290: 57, 4350: 21, 4400: 52, 4460: 21, 4500: 52, 4560: 21, 4600: 52, 4660: 21, 4700: 52}
+_PRESSURE = {
+    4200: 36,
+    4250: 31,
+    4290: 57,
+    4350: 21,
+    4400: 52,
+    4460: 21,
+    4500: 52,
+    4560: 21,
+    4600: 52,
+    4660: 21,
+    4700: 52,
+}
 """First register and number of taxels of each pad."""
+_MATRIX = (53, 56, 22, 22, 27, 22, 27, 22, 27, 22, 27)
+_PACKED_AT = (5240, 5340, 5380, 5440, 5480, 5540, 5580, 5640, 5680, 5740, 5780)
+_VALUES = {"adc": 0, "raw": 1, "force": 2}
+_SERIAL_NUMBER = "BCUTR40000000001"
+_KIND = "4023"  # what was written there, in the memory of a device
 
 
 class EmulatedRevo3Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What the hand is."""
 
-    unit: Annotated[int, Meta(ge=1, le=254, description="its number")] = 127
-    mapping: Annotated[Literal["pressure", "matrix"], Meta(description="which registers it has")] = "pressure"
+    unit: Annotated[int, Meta(ge=1, le=254, description="its number")] = 1
+    side: Annotated[Literal["right", "left"], Meta(description="which hand it says it is")] = "right"
+    mapping: Annotated[Literal["pressure", "matrix", "packed"], Meta(description="which registers it has")] = "pressure"
+    says_mapping: Annotated[bool, Meta(description="it tells which of them it has, in register 135")] = True
+    points: Annotated[tuple[int, ...], Meta(description="taxels of its pads, if they are others than usual")] = ()
+    sums: Annotated[bool, Meta(description="mapping pressure: it sends sums of zones")] = False
+    values: Annotated[Literal["adc", "raw", "force"], Meta(description="what its values are")] = "adc"
+    adc_pads: Annotated[tuple[int, ...], Meta(description="matrix, packed: pads of values=force that send adc")] = ()
     enabled: Annotated[bool, Meta(description="its pads are on as soon as it has power; else they tell 0")] = True
 
 
 class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
-    """One hand. Values: those of the pads, one pad after the other."""
+    """One hand. Values: those of the pads, one pad after the other; or those of the 42 zones."""
 
     full_scale = 0xFFFF
     rest = 40
@@ -39,32 +63,98 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
     def __init__(self, options: EmulatedRevo3Options, **more: object) -> None:
         self.numbers = (options.unit,)
         self.function = 4 if options.mapping == "pressure" else 3
+        if options.mapping == "packed":
+            self.full_scale, self.swing = 0xFF, 150
+        self._points = options.points or (tuple(_PRESSURE.values()) if options.mapping == "pressure" else _MATRIX)
         super().__init__(options, **more)
 
     def places(self) -> npt.NDArray[np.float64]:
-        """All taxels."""
-        return on_a_grid(416, 16)
+        """All taxels, or zones."""
+        return on_a_grid(42 if self.options.sums else sum(self._points), 16)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
         """What is in no pad is 0."""
-        is_matrix = self.options.mapping == "matrix"
-        found = dict.fromkeys(range(5240, 5900) if is_matrix else range(4200, 4752), 0)
-        if not device.memory.get("on", self.options.enabled):
+        options = self.options
+        if options.mapping != "pressure":
+            found = dict.fromkeys(range(5240, 5900), 0)
+        elif self._sends_sums(device):
+            found = dict.fromkeys(range(4100, 4142), 0)
+        else:
+            found = dict.fromkeys(range(4200, 4752), 0)
+        if not device.memory.get("on", options.enabled):
             return found
+        if min(found) == 4100:
+            return dict(enumerate((*values, *[0] * 42)[:42], 4100))
         at = 0
-        for number, (first, n) in enumerate(_SHAPES.items()):
-            first = 5240 + 60 * number if is_matrix else first
-            found.update(enumerate(values[at : at + n], first))
+        for number, n in enumerate(self._points):
+            of_pad = values[at : at + n]
+            if options.mapping == "packed":
+                pairs = [*of_pad, 0][: n + n % 2]
+                found.update(enumerate(map(_pair, pairs[::2], pairs[1::2]), _PACKED_AT[number]))
+            else:
+                first = 5240 + 60 * number if options.mapping == "matrix" else [*_PRESSURE][number]
+                found.update(enumerate(of_pad, first))
             at += n
         return found
 
+    def beside(self, device: Device) -> Mapping[int, int]:
+        """What a matrix hand says of itself; its names and the part that it does not fill now, of a pressure hand."""
+        if self.options.mapping != "pressure":
+            return self._said(device)
+        not_filled = range(4200, 4752) if self._sends_sums(device) else range(4100, 4142)
+        return dict.fromkeys(not_filled, 0) | _TEXTS
+
+    def of_other_function(self, device: Device) -> Mapping[int, int]:
+        """What a pressure hand says of itself; of a matrix hand, its names."""
+        return self._said(device) if self.options.mapping == "pressure" else _TEXTS
+
     def written(self, device: Device, address: int, value: int) -> bool:
-        """Switches of the pads, and what sets them to zero, which changes nothing here."""
-        is_matrix = self.options.mapping == "matrix"
+        """Switches of the pads, what they send, and what sets them to zero, which changes nothing here."""
+        is_matrix = self.options.mapping != "pressure"
         if address in (range(5900, 5911) if is_matrix else range(4000, 4011)):
             device.memory["on"] = bool(value)
             return True
+        if address in (range(5202, 5214) if is_matrix else (4023, 4024)):
+            device.memory[str(address)] = value
+            device.memory.pop("sample", None)
+            return True
         return address == (5214 if is_matrix else 4011)
+
+    def _sends_sums(self, device: Device) -> bool:
+        return bool(device.memory.get(_KIND, self.options.sums))
+
+    def _said(self, device: Device) -> dict[int, int]:
+        options = self.options
+        is_matrix, on = options.mapping != "pressure", int(device.memory.get("on", options.enabled))
+        said = dict.fromkeys(
+            [*range(240, 261), *range(270, 291)], 0
+        )  # limits of joints, which the maker's program asks
+        said |= {101: 1 if options.side == "right" else 2, 108: options.unit}
+        if options.says_mapping:
+            said[135] = 2 if is_matrix else 1
+        said.update(dict.fromkeys(range(5900, 5911) if is_matrix else range(4000, 4011), on))
+        said.update(enumerate(self._points, 5191 if is_matrix else 4037))
+        if is_matrix:
+            modes = [int(options.values == "force" and pad not in options.adc_pads) for pad in range(11)]
+            said.update(enumerate([int(options.values == "force"), *modes], 5202))
+            said[5226] = 0
+        else:
+            said.update({4023: int(self._sends_sums(device)), 4024: _VALUES[options.values]})
+        return {address: device.memory.get(str(address), value) for address, value in said.items()}
+
+
+def _pair(first: int, second: int) -> int:
+    return first << 8 | second
+
+
+def _text(address: int, text: str) -> dict[int, int]:
+    """Ten registers of two characters."""
+    data = text.encode().ljust(20, b"\0")
+    return dict(enumerate(map(_pair, data[::2], data[1::2]), address))
+
+
+_TEXTS = _text(3030, "1.0.0") | _text(3040, "1.0") | _text(3050, _SERIAL_NUMBER)
+"""Firmware, hardware and serial number, read with function 4."""
 
 
 __all__ = ["EmulatedRevo3", "EmulatedRevo3Options"]

@@ -56,6 +56,14 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
             self.stop(device)
         return b""
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """Cells by the byte that names patch and cell: ``0x13``."""
+        return f"0x{payload[1]:02x}"
+
+    def kinds(self) -> Sequence[str]:
+        """A record for each cell."""
+        return [f"0x{patch << 4 | cell:02x}" for patch in self.options.patches for cell in range(self.options.cells)]
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A record for each cell."""
         return [

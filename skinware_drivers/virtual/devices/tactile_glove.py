@@ -41,6 +41,14 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
         """It sends by itself."""
         self.start(device, now_ns)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """Taxels by their first byte: ``0x3c``."""
+        return f"0x{payload[0]:02x}"
+
+    def kinds(self) -> Sequence[str]:
+        """A packet for each taxel."""
+        return [f"0x{0x3C + taxel:02x}" for taxel in range(self.options.taxels)]
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         """A packet for each taxel."""
         return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]

@@ -61,6 +61,10 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
             return b""
         return None
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        return "data" if payload[2] == 1 else "answer"
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """The answer to the question that wanted them."""
         motors, _ = _MOTORS_AND_FINGERS[self.options.hand]

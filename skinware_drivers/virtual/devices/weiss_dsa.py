@@ -67,6 +67,10 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
             return message(number, struct.pack("<H", _OK))
         return None
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        return "answer" if payload[3] else "data"
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """One message with all cells."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000 & 0xFFFF_FFFF

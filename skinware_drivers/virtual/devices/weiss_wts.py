@@ -53,6 +53,10 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
         status, answer = self._do(device, command, now_ns)
         return message(command[3], struct.pack("<H", status) + answer)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        return "answer" if payload[3] else "data"
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """One message with all cells, without run lengths."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000

@@ -63,6 +63,10 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
         status, answer = self._do(device, command, now_ns)
         return message(0x57, command[4:8] + bytes([status]) + answer)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``data``; other messages are answers."""
+        return "data" if payload[1] == 0x55 else "answer"
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """One message with all cells."""
         cells = [math.nan if at in self.options.invalid else value / 4096 for at, value in enumerate(values)]

@@ -57,6 +57,10 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
             self.start(device, now_ns)
         return True
 
+    def kinds(self) -> Sequence[str]:
+        """A frame for each taxel."""
+        return [self.kind_of(taxel, b"") for board in self.numbers for taxel in self._taxels(board)]
+
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         """A frame for each taxel."""
         xyz = zip(values[0::3], values[1::3], values[2::3], strict=True)

@@ -54,6 +54,15 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
             self.say(device, json.dumps({"message": "Welcome"}).encode() + b"\n", now_ns)
         self.start(device, now_ns)
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        """``sensor1`` and so on; the welcome is another."""
+        told = json.loads(payload)
+        return next((f"sensor{number}" for number in self.numbers if str(number) in told), "welcome")
+
+    def kinds(self) -> Sequence[str]:
+        """A message for each sensor."""
+        return [f"sensor{number}" for number in self.numbers]
+
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """A message with one sensor."""
         time_s = device.sampled_ns / 1e9

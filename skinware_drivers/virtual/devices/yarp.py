@@ -1,13 +1,14 @@
-"""An emulated port of an iCub's skin: what it says to a reader that asked for text.
+"""An emulated port of an iCub's skin: the vectors that it sends in a binary carrier.
 
-Source: YARP's manual; the vectors in tests/yarp/test_text.py. A device is a port. That it has a name, and is found and
-called by it, is made by the bus: ``skin-emulate --driver yarp --bus yarp://HOST:PORT/NAME``.
+Source: exchanges with YARP 3.8.1 and 4.0.0; the vectors in tests/yarp/test_messages.py. A device is a port. The bus
+makes its name, and the name server that knows it: ``skin-emulate --driver yarp --bus yarp://HOST:PORT/NAME``.
 """
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -17,12 +18,14 @@ from skinware_drivers.virtual.emulator import Device, on_a_grid
 from skinware_drivers.virtual.serial_device import SerialEmulator, SerialEmulatorOptions
 
 _BOOT_TIME_S = 1_700_000_000.0
+_TAGS = {3: 256 + 10, 4: 256 + 20}
 
 
 class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What it sends."""
 
     length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
+    version: Annotated[Literal[3, 4], Meta(description="of YARP: it decides how a list of doubles is marked")] = 4
     envelope: Annotated[bool, Meta(description="tell number and time of each message")] = True
     period_ms: Annotated[float, Meta(ge=1, description="time between two messages, ms")] = 20
 
@@ -44,7 +47,10 @@ class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
         self.start(device, now_ns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """One vector, as YARP writes doubles."""
-        told = " ".join(f"{value}.0" for value in values)
-        envelope = f"o {device.cycle} {_BOOT_TIME_S + device.sampled_ns / 1e9:.6f}" if self.options.envelope else "o"
-        return [f"d{envelope}\r\n{told}\r\n".encode()]
+        """One vector, as YARP sends it in its binary carriers."""
+        text = f"D {device.cycle} {_BOOT_TIME_S + device.sampled_ns / 1e9:.6f}\0".encode()
+        command = struct.pack("<i", len(text)) + b"~\0\0\1" + text if self.options.envelope else b"\0\0\0\0~D\0\1"
+        head = struct.pack("<ii", _TAGS[self.options.version], len(values))
+        numbers = struct.pack(f"<{len(values)}d", *values)
+        index = struct.pack("<3ii", len(command), len(head), len(numbers), 0)
+        return [b"YA\n\0\0\0RP\3\1" + 8 * b"\xff" + index + command + head + numbers]

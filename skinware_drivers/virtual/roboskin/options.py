@@ -47,6 +47,11 @@ class RoboskinOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     foreign_hz: Annotated[
         float, Meta(ge=0, le=10_000, description="frames per second from other devices on the bus")
     ] = 0.0
+    silence: Annotated[
+        tuple[str, ...],
+        Meta(description="kinds of frames that the boards stop sending, after silence_after_s, as 0x470-head"),
+    ] = ()
+    silence_after_s: Annotated[Seconds, Meta(description="seconds from power-up to that silence")] = 2.0
     dead: Annotated[tuple[int, ...], Meta(description="boards that die, after dead_after_s or dead_after_cycles")] = ()
     dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to their death")] = 0.0
     dead_after_cycles: Annotated[

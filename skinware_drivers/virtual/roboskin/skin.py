@@ -69,6 +69,31 @@ class EmulatedRoboskin(Stage):
         """
         return self._skin.press(press, self.run_to(now_ns))
 
+    def kind_of(self, identifier: int, payload: bytes) -> str:
+        """Name the halves of a triangle by identifier and half: ``0x470-head``; other frames by identifier."""
+        from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL
+
+        name = super().kind_of(identifier, payload)
+        if identifier >> 8 == INERTIAL:
+            return name
+        if identifier >> 8 in (DATA, self._options.tail_class) and payload:
+            return f"{name}-{'tail' if payload[0] & 0x80 else 'head'}"
+        return name
+
+    def kinds(self) -> Sequence[str]:
+        """Name the kinds of frames with data that the boards send."""
+        from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL
+        from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
+
+        found = []
+        for board in self._options.boards:
+            for triangle in range(TRIANGLES):
+                low = board << 4 | triangle
+                found.append(self.kind_of(DATA << 8 | low, b"\x40"))
+                found.append(self.kind_of(self._options.tail_class << 8 | low, b"\xc0"))
+            found += [self.kind_of(INERTIAL << 8 | board << 4 | sensor, b"") for sensor in (0, 1, 3)]
+        return found
+
     def hear(self, identifier: int, payload: bytes, now_ns: int) -> list[int]:
         """Let all boards hear a command; those that obeyed or answered, by the address they had before."""
         if not payload:
@@ -133,6 +158,7 @@ class EmulatedRoboskin(Stage):
             if board.address in options.restart:
                 restart = partial(board.restart, boot_ns=round(options.boot_s * 1e9))
                 self.schedule(now_ns + round(options.restart_after_s * 1e9), restart)
+        self.plan_silence(options.silence, self.kinds(), options.silence_after_s, now_ns)
         return [*self._boards, *make_foreign_traffic(options, self.wire, self.log, self.counts, now_ns)]
 
 

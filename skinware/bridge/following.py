@@ -23,6 +23,7 @@ from skinware.bridge.mirror import Mirror
 from skinware.bridge.pacing import Pacing
 from skinware.bridge.peer import ANSWER_S, Peer
 from skinware.errors import BadRecording, BridgeError, SkinwareError
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.transfer.codec import Decoder
 from skinware.transfer.collecting import CLOSED, DEAD, LIVE, PAUSED
@@ -138,7 +139,12 @@ class Follower:
             self._pull_all()
         elif self._is_gone and not self._open:
             self._pull()
-        if self._pacing.wants_probe(time_ns) and time_ns > self._probe_until_ns and self._count is not None:
+        round_trip_ns = self._peer.clock.round_trip_ns
+        if (
+            self._pacing.wants_probe(time_ns, round_trip_ns)
+            and time_ns > self._probe_until_ns
+            and self._count is not None
+        ):
             self._probe()
 
     def start_over(self) -> None:
@@ -188,7 +194,8 @@ class Follower:
             about, head = split_generation(payload)
             generation = Generation(head, self._name)
             _check(generation)
-            self._peer.room.take(self._name, len(head) + generation.slot_count * generation.slot_stride)
+            ring = generation.slot_count * generation.slot_stride
+            self._peer.room.take(self._name, len(head) + ring)
         except (BridgeError, BadRecording) as error:
             self._refuse(f"service {self._name!r}", error)
             return
@@ -197,7 +204,7 @@ class Follower:
             return
         self._generation, self._decoder = generation, None
         if before is None or before.period_ns != generation.period_ns:
-            self._pacing = Pacing(generation.period_ns, self._mode)
+            self._pacing = Pacing(generation.period_ns, self._mode, generation.slot_stride)
             self.subscribe()
         self._mirror.operations[self._name] = about.operations
         if self._held:
@@ -257,6 +264,8 @@ class Follower:
             return
         frame = self._frame_of(message) if message else None
         is_open = self._open.pop(pull, None) is not None  # a late answer begins no second round
+        if message is not None:  # answers come in order: those to earlier questions were left out on the link
+            self._open = {later: until_ns for later, until_ns in self._open.items() if later > pull}
         if is_open and self._pacing.pulls and message is not None and self._peer.is_connected:
             self._pull_all(frame)  # the next ones are on their way while this one is published
         if frame is not None:
@@ -378,6 +387,12 @@ def _check(generation: Generation) -> None:
     if generation.published_before > MOST_FRAMES or generation.period_ns < 0:
         raise BadRecording(
             f"a generation after {generation.published_before} frames with a period of {generation.period_ns} ns"
+        )
+    ring = generation.slot_count * generation.slot_stride
+    if generation.slot_stride > LIMITS.slot_size or ring > LIMITS.ring_size:
+        raise BadRecording(
+            f"{generation.slot_count} slots of {generation.slot_stride} bytes; at most {LIMITS.slot_size} each, and"
+            f" {LIMITS.ring_size} together"
         )
 
 

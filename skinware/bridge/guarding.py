@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 from skinware.bridge.link import Question
 from skinware.errors import BridgeError, SkinwareError
+from skinware.limits import LIMITS
 
-MOST_MEMORY = 1 << 29
-"""Bytes that the structures and rings of a robot may take."""
 _LONGEST = 160
 _MOST_KINDS = 256
 
@@ -81,7 +80,7 @@ class Room:
         most: bytes for all of them.
     """
 
-    def __init__(self, most: int = MOST_MEMORY) -> None:
+    def __init__(self, most: int = LIMITS.robot_size) -> None:
         self._most = most
         self._taken: dict[str, int] = {}
 

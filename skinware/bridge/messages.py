@@ -46,6 +46,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import BridgeError, ConfigurationError
+from skinware.limits import LIMITS, read_json, unpack
 from skinware.memory.ring import Frame
 from skinware.tactile.choosing import SensorChoice
 from skinware.tactile.regions import Region, Regions
@@ -56,12 +57,6 @@ RAW, CODED = 0, 1
 _HEAD = struct.Struct("<B7xQ")
 _CODED_HEAD = struct.Struct("<BB6x")
 _SIZE = struct.Struct("<I")
-LONGEST_TEXT = 1 << 20
-"""Bytes of the JSON of a message."""
-LONGEST_HEAD = 1 << 26
-"""Bytes of a service's file up to its slots, unpacked."""
-MOST_SERVICES = 256
-"""Of a robot."""
 MOST_FRAMES = 1 << 53
 """More frames than any robot ever published: a number above it is wrong."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,46}")
@@ -107,7 +102,7 @@ class Services(msgspec.Struct, frozen=True):
     instance: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{16}$")]
     start: _Word = ""
     callers: Annotated[tuple[_Word, ...], msgspec.Meta(max_length=256)] = ()
-    services: Annotated[dict[_Name, Service], msgspec.Meta(max_length=MOST_SERVICES)] = {}
+    services: Annotated[dict[_Name, Service], msgspec.Meta(max_length=LIMITS.services)] = {}
     missing: _Line = ""
     host: _Word = ""
 
@@ -178,7 +173,7 @@ class Summary(msgspec.Struct, frozen=True):
     """
 
     namespace: _Name
-    drivers: Annotated[dict[_Name, DriverSummary], msgspec.Meta(max_length=MOST_SERVICES)] = {}
+    drivers: Annotated[dict[_Name, DriverSummary], msgspec.Meta(max_length=LIMITS.services)] = {}
     services: _Count = 0
     lost: _Count = 0
     host: _Word = ""
@@ -217,11 +212,9 @@ def read_text(message: bytes, kind: type[_Kind]) -> _Kind:
     Raises:
         BridgeError: it is longer, deeper or otherwise than such a message can be; says what is wrong.
     """
-    if len(message) > LONGEST_TEXT:
-        raise BridgeError(f"{len(message)} bytes of JSON; at most {LONGEST_TEXT}")
     try:
-        return msgspec.json.decode(message, type=kind)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
+        return read_json(message, kind)
+    except ValueError as error:
         raise BridgeError(str(error)) from None
 
 
@@ -383,10 +376,6 @@ def split_generation(message: bytes) -> tuple[About, bytes]:
         (size,) = _SIZE.unpack_from(message)
         begin = _SIZE.size + size
         about = read_text(message[_SIZE.size : begin], About)
-        unpacker = zlib.decompressobj()
-        head = unpacker.decompress(memoryview(message)[begin:], LONGEST_HEAD)
-    except (struct.error, BridgeError, zlib.error) as error:
-        raise BridgeError(f"what a generation is cannot be read ({error})") from None
-    if unpacker.unconsumed_tail:
-        raise BridgeError(f"the file of a generation has more than {LONGEST_HEAD} bytes before its slots")
-    return about, head
+        return about, unpack(memoryview(message)[begin:], LIMITS.head_size)
+    except (struct.error, BridgeError, ValueError) as error:
+        raise BridgeError(f"a generation that is not one ({error})") from None

@@ -26,10 +26,18 @@ _PROBES = 3
 """The fastest of so many counts: others had to wait for something else."""
 _OF_ROUND_TRIP = 0.25
 """Of a round trip, what frames may wait: on a long link they come unevenly."""
+_MOST_SPARE_NS = 300_000_000
+"""Questions that wait on the robot end after half a second there."""
+_FEW = 8
 _KEPT_NS = 30 * NS_PER_S
 """For how long the least age is remembered: clocks drift, and routes change."""
-MOST_OPEN = 512
-"""Questions for frames."""
+MOST_OPEN, _LEAST_PERIOD_NS = 512, 1_000_000
+"""Questions for frames; with a shorter period there are no more."""
+_LATE_LOOKS, _SHORTEST_REST, _LONGEST_REST = 3, 4, 128
+"""Looks at which frames are late until fewer are asked for at once, since TCP begins slowly, and machines are busy at
+times; and looks from then on until more are."""
+_ONE_FLIGHT, _LONG_NS = 14_000, 30_000_000
+"""Bytes that TCP sends at once before it waits for an answer; a round trip from which on that is long."""
 _FIRST_RETRY_NS, _LAST_RETRY_NS = 10 * NS_PER_S, 320 * NS_PER_S
 
 
@@ -53,12 +61,16 @@ class _Waits:
             self._ages.popleft()
 
     def look(self, at_ns: int) -> int:
-        """The median wait of the frames that are counted."""
+        """How long all but a few of the frames that are counted waited.
+
+        In a queue that stands all frames wait. Behind a packet that TCP sends once more only some do, and fewer
+        questions would not help them.
+        """
         ages = sorted(age for _, age in self._ages)
         self._least.append((at_ns, ages[0]))
         while at_ns - self._least[0][0] > _KEPT_NS:
             self._least.popleft()
-        return ages[len(ages) // 2] - min(age for _, age in self._least)
+        return ages[len(ages) // _FEW] - min(age for _, age in self._least)
 
     def forget_ages(self) -> None:
         """Only what comes from now on counts at the next look."""
@@ -71,30 +83,36 @@ class Pacing:
     Args:
         period_ns: of its writer, 0 if it has none.
         fixed: ``push`` or ``pull``, if a person wants it; None: it finds out.
+        size: of a frame as it would be pushed, bytes.
 
     Attributes:
         pulls: frames are to be asked for.
         open: so many at once.
     """
 
-    def __init__(self, period_ns: int, fixed: str | None = None) -> None:
-        self._period_ns, self._fixed = max(0, period_ns), fixed
+    def __init__(self, period_ns: int, fixed: str | None = None, size: int = 0) -> None:
+        self._period_ns, self._fixed, self._size = max(0, period_ns), fixed, size
         self.pulls: bool = fixed != "push"
         self.open: int = 1
         self._waits = _Waits()
         self._took: list[int] = []
         self._retry_ns = _FIRST_RETRY_NS
         self._looked_ns = self._probe_ns = 0
-        self._more_ns, self._more_retry_ns = 0, _FIRST_RETRY_NS  # when more may be asked for at once
+        self._late = 0  # looks in a row at which frames waited
+        self._rest, self._next_rest = 0, _SHORTEST_REST  # looks until more may be asked for at once
 
     @property
     def mode(self) -> str:
         """``push`` or ``pull``."""
         return "pull" if self.pulls else "push"
 
-    def wants_probe(self, at_ns: int) -> bool:
-        """Whether a frame is to be asked for as it would be pushed, now."""
-        return self.pulls and self._fixed is None and at_ns >= self._probe_ns
+    def wants_probe(self, at_ns: int, round_trip_ns: int) -> bool:
+        """Whether a frame is to be asked for as it would be pushed, now.
+
+        On a long link a large one holds up those behind it for several round trips, and asking is as good as pushing.
+        """
+        may_probe = self._size <= _ONE_FLIGHT or round_trip_ns <= _LONG_NS
+        return self.pulls and self._fixed is None and may_probe and at_ns >= self._probe_ns
 
     def probed(self, at_ns: int, took_ns: int) -> bool:
         """How long such a frame was on its way, beyond what an empty answer takes; whether that changes the mode."""
@@ -135,23 +153,32 @@ class Pacing:
         return True
 
     def _saw_pulled(self, at_ns: int, age_ns: int, round_trip_ns: int) -> None:
-        """As many questions at once as a round trip has periods, unless frames wait in queues then."""
+        """As many questions at once as a round trip has periods, unless frames wait in queues then.
+
+        As many more wait on the robot for frames to come, since TCP may hold them back for a round trip.
+        """
         period_ns = self._period_ns or _WITHOUT_PERIOD_NS
         every_ns = max(_EVERY_NS, 5 * round_trip_ns // 4)
         self._waits.add(at_ns, age_ns, every_ns)
-        wanted = min(MOST_OPEN, math.ceil(round_trip_ns / period_ns) + 2)
+        wanted = math.ceil((round_trip_ns + min(round_trip_ns, _MOST_SPARE_NS)) / max(period_ns, _LEAST_PERIOD_NS)) + 2
+        wanted = min(MOST_OPEN, wanted)
         self.open = min(self.open, wanted)
-        if at_ns - self._looked_ns < (every_ns if self.open > 1 else _EVERY_NS):
+        if at_ns - self._looked_ns < every_ns:
             return
         self._looked_ns = at_ns
-        wait_ns, most_ns = self._waits.look(at_ns), max(_OLD_PERIODS * period_ns, _LEAST_OLD_NS) / 2
+        most_ns = max(_OLD_PERIODS * period_ns / 2, _LEAST_OLD_NS / 2, _OF_ROUND_TRIP * round_trip_ns)
+        is_late = self._waits.look(at_ns) > most_ns
         self._waits.forget_ages()
-        if self.open > 1 and wait_ns > max(most_ns, _OF_ROUND_TRIP * round_trip_ns):
+        self._late = self._late + 1 if is_late else 0
+        self._rest -= 1
+        if self._late >= _LATE_LOOKS and self.open > 1:
             self.open = max(1, min(self.open - 1, self.open * 3 // 4))
-            self._more_ns = at_ns + self._more_retry_ns
-            self._more_retry_ns = min(2 * self._more_retry_ns, _LAST_RETRY_NS)
-        elif self.open < wanted and at_ns >= self._more_ns:
-            self.open = min(wanted, 2 * self.open)
+            self._late, self._rest, self._next_rest = 0, self._next_rest, min(2 * self._next_rest, _LONGEST_REST)
+        elif not is_late and self.open < wanted and self._rest <= 0:
+            is_first = self._next_rest == _SHORTEST_REST
+            self.open = min(wanted, 2 * self.open if is_first else self.open + max(1, self.open // 4))
+        elif self._rest < -_LONGEST_REST:
+            self._next_rest = _SHORTEST_REST
 
     @property
     def _most_ns(self) -> float:

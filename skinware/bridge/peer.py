@@ -22,7 +22,7 @@ _PATIENCE_NS = 3 * NS_PER_S
 _PING_NS = 150_000_000
 _SILENCE_NS = 400_000_000
 """Without round trips: on a long link the answer to a ping needs that, too."""
-_ROUND_TRIPS = 2
+_ROUND_TRIPS, _LONGEST_ROUND_TRIP_NS = 2, NS_PER_S
 """The answer to a ping, and once more where a packet of it got lost."""
 _MOST_TROUBLE, _MOST_BRIDGES = 256, 256
 
@@ -192,7 +192,8 @@ class Peer:
         if time_ns >= self._next_clock_ns:
             self._ask_clock()
         if self.is_connected and time_ns - self._heard_ns > _SILENCE_NS - _PING_NS:
-            if time_ns - self._heard_ns > _SILENCE_NS + _ROUND_TRIPS * self.clock.round_trip_ns:
+            round_trip_ns = self.clock.round_trip_ns if self.clock.is_known else _LONGEST_ROUND_TRIP_NS
+            if time_ns - self._heard_ns > _SILENCE_NS + _ROUND_TRIPS * round_trip_ns:
                 self._lose("nothing comes over the link")
             elif time_ns - self._pinged_ns > _PING_NS:
                 self._ask_clock()
@@ -235,6 +236,7 @@ class Peer:
         if not self.is_connected:
             return
         self.is_connected, self.since_ns = False, now_ns()
+        self._next_why_ns = self.since_ns + _PATIENCE_NS  # another bridge may serve it
         self._watcher.lost()
         self.tell({"event": "disconnected", "robot": self.robot, "why": why})
 

@@ -34,6 +34,7 @@ from skinware.bridge.parts import Parts
 from skinware.bridge.pinging import answering
 from skinware.bridge.summaries import Summaries, Summarised
 from skinware.errors import BadRecording, BridgeError, ConfigurationError
+from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Frame
@@ -270,7 +271,10 @@ class Server:
 
     def _told(self) -> bytes:
         with self._lock:
-            services = {name: served.told for name, served in self._services.items()}
+            services = {name: served.told for name, served in list(self._services.items())[: LIMITS.services]}
+            left_out = len(self._services) - len(services)
+        if left_out:
+            self.guard.refuse("a service", f"{left_out} are left out: a robot may have {LIMITS.services}")
         return msgspec.json.encode(Services(self._instance, self._start, self._callers, services, host=host_name()))
 
     def _tell_part(self, question: Question) -> None:

@@ -23,11 +23,10 @@ from skinware.bridge.messages import (
 )
 from skinware.bridge.pinging import Pinger
 from skinware.errors import BridgeError
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 
 _TICK_S = 0.05
-_MOST = 1024
-"""Bridges that are watched."""
 
 Bridge = tuple[str, str]
 """(robot, number of the bridge that serves it)."""
@@ -113,8 +112,8 @@ class Watcher:
         gone = None
         with self._lock:
             if there:
-                if len(self._seen) >= _MOST and (robot, instance) not in self._seen:
-                    raise BridgeError(f"more than {_MOST} bridges are reached")
+                if len(self._seen) >= LIMITS.robots and (robot, instance) not in self._seen:
+                    raise BridgeError(f"more than {LIMITS.robots} bridges are reached")
                 self._seen.setdefault((robot, instance), Seen(robot, instance)).version = version
             else:
                 gone = self._seen.pop((robot, instance), None)

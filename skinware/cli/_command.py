@@ -9,6 +9,7 @@ A command is a module with a click command and::
 from __future__ import annotations
 
 import contextlib
+import io
 import math
 import os
 import signal
@@ -20,6 +21,7 @@ from typing import Any, NoReturn, TypeVar
 import click
 
 from skinware.cli._output import patient_output
+from skinware.cli._terminal import Formatter, echo
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
@@ -102,27 +104,18 @@ def version_option(command: _Decorated) -> _Decorated:
     return click.version_option(package_name="skinware", message="%(prog)s %(version)s")(command)
 
 
-def print_json(data: object) -> None:
-    """One object on one line, at once. Numbers that JSON does not have (``nan``, ``inf``) become null."""
-    import msgspec
-
-    click.echo(msgspec.json.encode(data).decode())
-
-
 def warn(text: str) -> None:
     """One line on stderr under the running command's name, for what is worth knowing but no error."""
-    click.echo(f"{click.get_current_context().info_name}: {text}", err=True)
+    echo(f"{click.get_current_context().info_name}: {text}", err=True)
 
 
 def log_to_stderr(verbose: bool) -> None:
     """Warnings, or more, on stderr under the running command's name."""
     import logging
 
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING,
-        format=f"{click.get_current_context().info_name}: %(message)s",
-        stream=sys.stderr,
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(Formatter(f"{click.get_current_context().info_name}: %(message)s"))
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
 
 
 @contextlib.contextmanager
@@ -180,21 +173,27 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
     except click.exceptions.Exit as done:
         return done.exit_code
     except click.ClickException as error:
-        error.show()
+        _show(error)
         return error.exit_code
     except BrokenPipeError:
         _discard_output()
         return EXIT_DONE
     except SkinwareError as error:
-        click.echo(f"{name}: {error}", err=True)
+        echo(f"{name}: {error}", err=True)
         if isinstance(error, ConfigurationError):
             return EXIT_USAGE
         return EXIT_NO_BUS if isinstance(error, BusNotAvailable) else EXIT_FAILED
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        click.echo(f"{name}: {where}{error.strerror or error}", err=True)
+        echo(f"{name}: {where}{error.strerror or error}", err=True)
         _discard_output()
         return EXIT_FAILED
+
+
+def _show(error: click.ClickException) -> None:
+    text = io.StringIO()
+    error.show(file=text)
+    echo(text.getvalue(), nl=False, err=True)
 
 
 def _flush_output() -> None:

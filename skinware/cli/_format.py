@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 import click
 
+from skinware.cli._terminal import repaint
+
 NO_VALUE = "-"
 NOT_FRESH = "not fresh"
 """Shown instead of ``live`` where frames come, but not one sensor of them is fresh."""
@@ -109,6 +111,4 @@ def redraw(lines: list[str]) -> None:
     height = shutil.get_terminal_size().lines - 1
     if len(lines) > height:
         lines = [*lines[: height - 1], f"... {len(lines) - height + 1} more lines; make the window higher"]
-    if click.get_current_context().color is False:
-        lines = [click.unstyle(line) for line in lines]
-    click.echo("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in lines) + "\x1b[J", nl=False, color=True)
+    repaint(lines)

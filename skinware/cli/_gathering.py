@@ -6,14 +6,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import numpy.typing as npt
 
-from skinware.cli._command import print_json, warn
+from skinware.cli._command import warn
 from skinware.cli._coverage import SIGNS, bars, picture
 from skinware.cli._driver_frames import after, enter_pressed, frames_until
 from skinware.cli._format import terminal_width
+from skinware.cli._terminal import echo, print_json
 from skinware.driver_service import DriverReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.sessions import Session
@@ -86,7 +86,7 @@ class Gathering:
             if self._as_json:
                 print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})
             else:
-                click.echo(f"\nwhat was gathered is in {self._state_path}; the same command goes on with it")
+                echo(f"\nwhat was gathered is in {self._state_path}; the same command goes on with it")
             raise
 
     def _tell_coverage(self) -> None:
@@ -95,11 +95,11 @@ class Gathering:
             return
         structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
         for line in bars(structure, type_name, coverage):
-            click.echo(line)
-        click.echo()
+            echo(line)
+        echo()
         for line in picture(structure, type_name, coverage, min(terminal_width() or _WIDTH, _WIDTH)):
-            click.echo(line)
-        click.echo(f"\n{SIGNS[0]} nothing   {SIGNS[1]} to {SIGNS[-2]} some   {SIGNS[-1]} all that is wanted")
+            echo(line)
+        echo(f"\n{SIGNS[0]} nothing   {SIGNS[1]} to {SIGNS[-2]} some   {SIGNS[-1]} all that is wanted")
 
     def _run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
         gathers = duration_s is None or duration_s > 0
@@ -129,7 +129,7 @@ class Gathering:
 
     def _wait_for_rest(self) -> None:
         if not self._source.ready and not self._as_json:
-            click.echo("leave the skin alone for some seconds ...")
+            echo("leave the skin alone for some seconds ...")
         refused = 0.0
         for frame in frames_until(self._reader, lambda: self._source.ready):
             self._source.loads(frame)
@@ -150,8 +150,8 @@ class Gathering:
             print_json({"event": "ready", **told, **self._figures()})
             return
         if self.restored:
-            click.echo(f"going on with what is in {self._state_path}")
-        click.echo(what_to_do)
+            echo(f"going on with what is in {self._state_path}")
+        echo(what_to_do)
 
     def _tell_progress(self) -> None:
         structure, coverage = self.structure, self._session.coverage
@@ -169,7 +169,7 @@ class Gathering:
         if mean != self._told:
             self._told = mean
             gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
-            click.echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
+            echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
 
 
 __all__ = ["Gathering"]

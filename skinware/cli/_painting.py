@@ -13,6 +13,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
+from skinware._printable import printable
 from skinware.cli import _heat_map as heat
 from skinware.cli._format import figure_text
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Label
@@ -80,7 +81,7 @@ def segments_of(
     for label in labels:
         end = label.column + len(label.text)
         before, _, after = Segment.divide(segments, [label.column, end, max(end, len(pairs))])
-        segments = [*before, Segment(label.text, _MARK if label.is_mark else _LABEL), *after]
+        segments = [*before, Segment(printable(label.text), _MARK if label.is_mark else _LABEL), *after]
     return segments
 
 

@@ -11,9 +11,8 @@ import tty
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-import click
-
 from skinware.cli._format import terminal_width
+from skinware.cli._terminal import echo, overwrite
 
 if TYPE_CHECKING:
     from skinware.recording.replaying import Replayer
@@ -82,7 +81,7 @@ class Terminal:
     def draw(self) -> None:
         """Show where it is."""
         if self._before is not None and self.is_ours:
-            click.echo(f"\r{self.line(terminal_width() or 80)}\x1b[K", nl=False)
+            overwrite(self.line(terminal_width() or 80))
 
     def line(self, width: int) -> str:
         """Where it is, in a line that is not wider than that."""
@@ -103,7 +102,7 @@ class Terminal:
         self._replayer.unwatch(0)
         if self._before is not None and self.is_ours:
             termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
-            click.echo()
+            echo()
 
     def _hear(self) -> None:
         try:

@@ -18,7 +18,6 @@ from skinware.cli._command import (
     examples,
     insecure_option,
     json_option,
-    print_json,
     signals_end,
     tls_option,
 )
@@ -33,6 +32,7 @@ from skinware.cli._format import (
     table,
     terminal_width,
 )
+from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
 
@@ -108,7 +108,7 @@ def route(
             if as_json:
                 print_json({"event": "ready", "listen": list(places.listen), "connect": list(places.connect)})
             else:
-                click.echo(f"router: {places} (Ctrl-C ends)")
+                echo(f"router: {places} (Ctrl-C ends)")
             watcher.run(_Routed(watcher, as_json).tell)
 
 
@@ -125,7 +125,7 @@ class _Routed:
             print_json({"event": "status", "robots": dict(count)})
         for robot in sorted({*count, *self._known} if not self._as_json else ()):
             if count[robot] != self._known.get(robot, 0):
-                click.echo(f"robot {robot}: {_PRESENCE.get(count[robot]) or f'{count[robot]} robots have this name'}")
+                echo(f"robot {robot}: {_PRESENCE.get(count[robot]) or f'{count[robot]} robots have this name'}")
         self._known = dict(count)
 
 
@@ -195,7 +195,7 @@ class _Listed:
         elif self._watch and sys.stdout.isatty():
             redraw(_as_text(found))
         else:
-            click.echo("\n".join(_as_text(found)))
+            echo("\n".join(_as_text(found)))
 
 
 def _report(robots: Sequence[Seen]) -> dict[str, Any]:
@@ -217,7 +217,7 @@ def _as_text(found: dict[str, Any]) -> list[str]:
     rows = [row for robot in found["robots"] for row in _rows_of(robot, count[robot["robot"]] > 1)]
     if rows:
         lines += table(_TITLES, rows, left=3, width=terminal_width())
-    return [*lines, *(click.style("problem: ", fg="red") + text for text in found["problems"])]
+    return [*lines, *(style("problem: ", fg="red") + text for text in found["problems"])]
 
 
 def _report_of(seen: Seen) -> dict[str, Any]:

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-import click
 import numpy as np
 
-from skinware.cli._command import print_json
 from skinware.cli._format import age_text, count_text, plural, table, terminal_width, wrapped
+from skinware.cli._terminal import echo, print_json, style
 from skinware.driver_service import DriverReader
 from skinware.errors import BadServiceFile, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.memory.namespace import Namespace
@@ -31,7 +30,7 @@ def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> 
     if as_json:
         print_json(found)
     else:
-        click.echo("\n".join(part for line in as_text(found) for part in wrapped(line, terminal_width())))
+        echo("\n".join(part for line in as_text(found) for part in wrapped(line, terminal_width())))
 
 
 def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any]:
@@ -65,15 +64,15 @@ def as_text(found: dict[str, Any]) -> list[str]:
     for entry in found["health"]:
         counts = {name.replace("_", " "): count for name, count in entry["kinds"].items() if count}
         told = ", ".join(f"{count_text(count)} {name}" for name, count in counts.items())
-        name = click.style(entry["driver"], bold=True)
+        name = style(entry["driver"], bold=True)
         age = "" if entry["state"] == "live" else f" ({entry['state']}, as of {age_text(entry['age_ms'] * 1e6)} ago)"
         lines += [f"{name} in namespace {entry['namespace']}: {plural(entry['sensors'], 'sensor')}: {told}{age}"]
         rows = [(fault["name"], fault["type"], fault["kind"], fault["evidence"]) for fault in entry["faults"]]
         head, *body = table(("sensor", "type", "fault", "evidence"), rows, left=4)
-        lines += [f"  {head}", *(click.style(f"  {line}", fg=_FAULT_COLOUR) for line in body)] if rows else []
+        lines += [f"  {head}", *(style(f"  {line}", fg=_FAULT_COLOUR) for line in body)] if rows else []
         lines += [""]
     lines = lines[:-1] or [_NOTHING]
-    return lines + [click.style("problem: ", fg="red") + text for text in found["problems"]]
+    return lines + [style("problem: ", fg="red") + text for text in found["problems"]]
 
 
 def _entry(namespace: Namespace, name: str, driver: str | None) -> dict[str, Any] | None:

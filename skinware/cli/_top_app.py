@@ -15,6 +15,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical
 from textual.widgets import DataTable, Footer, Static
 
+from skinware._printable import printable
 from skinware.cli import _bridges
 from skinware.cli._contacts import labels_of, lines_of
 from skinware.cli._format import NOT_FRESH, plural
@@ -351,8 +352,17 @@ class SkinTop(App[None]):
 
 def _say(line: Static, text: str | Text) -> None:
     """Change a line of text, if it is another one."""
+    text = _printable(text)
     if line.content != text:
         line.update(text)
+
+
+def _printable(text: str | Text) -> str | Text:
+    """A text that came from others, as :func:`skinware._printable.printable` has it; its colours stay."""
+    if isinstance(text, str):
+        return printable(text, "\n")
+    text.plain = printable(text.plain, "\n")
+    return text
 
 
 def _cells(row: Row) -> list[Text]:
@@ -368,7 +378,7 @@ def _cells(row: Row) -> list[Text]:
 
 def _cell(text: str, column: int) -> Text:
     justify: JustifyMethod = "left" if column in _LEFT_COLUMNS else "right"
-    return Text(text, justify=justify, no_wrap=True, overflow="ellipsis")
+    return Text(printable(text), justify=justify, no_wrap=True, overflow="ellipsis")
 
 
 def _text_key(key: RowKey) -> str:

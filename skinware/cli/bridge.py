@@ -16,7 +16,6 @@ from skinware.cli._command import (
     insecure_option,
     json_option,
     namespace_option,
-    print_json,
     run,
     signals_end,
     tls_option,
@@ -25,6 +24,7 @@ from skinware.cli._command import (
 )
 from skinware.cli._regions import regions_asked_for, regions_option
 from skinware.cli._robots import list_robots, route
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.bridge import Server, Wish
@@ -109,7 +109,7 @@ def serve(
                 told = {"robot": robot, "namespace": place.name}
                 print_json({"event": "ready", **told, "listen": list(places.listen), "connect": list(places.connect)})
             else:
-                click.echo(f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
+                echo(f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
             status = _Serving(server, as_json)
             server.run(status.tell)
 
@@ -134,7 +134,7 @@ class _Serving:
             print_json({"event": "status", **counts, "services": services})
         for name, (state, count, _) in frames.items():
             if not self._as_json and self._known.get(name) != state:
-                click.echo(f"{name}: {state}")
+                echo(f"{name}: {state}")
             self._known[name], self._before[name] = state, count
 
 
@@ -206,7 +206,7 @@ def join(
             if as_json:
                 print_json({"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)})
             else:
-                click.echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
+                echo(f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
             joiner.run(status.tell)
 
 
@@ -231,9 +231,9 @@ class _Joined:
         elif event["event"] == "trouble":
             warn(event["why"])
         elif event["event"] == "mode":
-            click.echo(f"{event['service']}: {_MODES[event['mode']]}")
+            echo(f"{event['service']}: {_MODES[event['mode']]}")
         else:
-            click.echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
+            echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
     def tell(self, bridge: BridgeState) -> None:
         from skinware.cli._bridges import as_data
@@ -241,7 +241,7 @@ class _Joined:
         for name, service in bridge.services.items():
             shown = service.state, service.mode
             if not self._as_json and self._known.get(name) != shown:
-                click.echo(f"{name}: {service.state}")
+                echo(f"{name}: {service.state}")
             self._known[name] = shown
         if self._as_json:
             print_json({"event": "status"} | as_data(bridge))

@@ -14,10 +14,10 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     signals_end,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -135,7 +135,7 @@ def command(
                 told = {"rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
                 print_json({"event": "ready", **told})
             else:
-                click.echo(f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
+                echo(f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
             status = _Status(server, as_json)
             server.run(status.tell)
 
@@ -172,7 +172,7 @@ class _Router:
         if self._as_json:
             print_json({"event": "router", "is_there": is_there, "why": line})
         elif is_there:
-            click.echo(line)
+            echo(line)
         else:
             warn(line)
 
@@ -190,5 +190,5 @@ class _Status:
             print_json({"event": "status", "drivers": {name: asdict(told) for name, told in drivers.items()}})
         for name, told in drivers.items():
             if not self._as_json and self._known.get(name) != told.state:
-                click.echo(f"{name}: {told.state}")
+                echo(f"{name}: {told.state}")
             self._known[name] = told.state

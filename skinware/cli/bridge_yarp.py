@@ -13,10 +13,10 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     signals_end,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def command(
                 {"event": "ready", "namespace": place.name, "server": f"{told.host}:{told.port}", "listen": host}
             )
         else:
-            click.echo(f"namespace {place.name!r} as ports {wanted.prefix}/..., {told} (Ctrl-C ends)")
+            echo(f"namespace {place.name!r} as ports {wanted.prefix}/..., {told} (Ctrl-C ends)")
         outlet.run(lambda: status.tell(outlet))
 
 
@@ -128,7 +128,7 @@ class _Status:
         elif event["event"] == "trouble":
             warn(f"{event['about']}: {event['why']}")
         else:
-            click.echo(f"{event['port']}: driver {event['driver']}")
+            echo(f"{event['port']}: driver {event['driver']}")
 
     def tell(self, outlet: Outlet) -> None:
         ports = outlet.ports()

@@ -18,11 +18,11 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -287,7 +287,7 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
         if how.as_json:
             print_json({"event": "finding", **finding_data(finding, structure, type_name)})
         else:
-            click.echo(finding_text(finding, structure, type_name))
+            echo(finding_text(finding, structure, type_name))
     _tell_done(
         how.as_json,
         {"file": str(file), "findings": len(found), "compared": session.sums.frames > 0},
@@ -373,7 +373,7 @@ def _tell_done(as_json: bool, told: Mapping[str, Any], words: str) -> None:
     if as_json:
         print_json({"event": "done", **told})
     else:
-        click.echo(words)
+        echo(words)
 
 
 def main() -> None:

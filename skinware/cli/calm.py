@@ -15,12 +15,12 @@ from skinware.cli._command import (
     json_option,
     log_to_stderr,
     namespace_option,
-    print_json,
     run,
     signals_end,
     verbose_option,
     version_option,
 )
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.tactile.calm_service import CalmService
@@ -129,7 +129,7 @@ def command(
     )
     if name not in source.services():
         there_are = ", ".join(source.services()) or "none"
-        click.echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
+        echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
     with signals_end(service.stop):
         service.run((lambda: _tell_status(service)) if as_json else lambda: None)
     if as_json:
@@ -158,10 +158,10 @@ def _tell_ready(service: CalmService, as_json: bool) -> None:
             f"{name} [{units[name]}] through {', '.join(s.name for s in st)}" for name, st in chain.stages.items() if st
         ]
         restored = f"; goes on with {service.restored} baselines" if service.restored else ""
-        click.echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
+        echo(f"{service.name}: {'; '.join(through) or 'nothing changed'}{restored}")
         there = ", ".join(filter(None, beside.values()))
         there = f" and, beside it, {there}" if there else ""
-        click.echo(f"publishing it{there} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
+        echo(f"publishing it{there} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
 
 
 def _services_beside(service: CalmService) -> dict[str, str]:

@@ -12,7 +12,6 @@ from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
     json_option,
-    print_json,
     run,
     seconds,
     signals_end,
@@ -21,6 +20,7 @@ from skinware.cli._command import (
 )
 from skinware.cli._learning import asked_for, learning_options, learning_set
 from skinware.cli._regions import regions_asked_for, regions_option
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.conversion import Selection
@@ -111,7 +111,7 @@ def command(
         print_json({"event": "converted", **told, "notes": converted.notes})
         return
     frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
-    click.echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
+    echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
 
 
 def _written(

@@ -13,12 +13,12 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -82,7 +82,7 @@ def command(
             else:
                 lost = f"  lost {reader.lost}" if reader.lost and rate_hz is None else ""
                 line = f"{reader.name} {as_line(frame, type_name, counts)}{lost}"
-                click.echo("\n".join(wrapped(line, terminal_width())))
+                echo("\n".join(wrapped(line, terminal_width())))
             taken += 1
             if taken == count:
                 return

@@ -16,7 +16,6 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     version_option,
 )
@@ -33,6 +32,7 @@ from skinware.cli._format import (
     terminal_width,
     wrapped,
 )
+from skinware.cli._terminal import echo, print_json, style
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -104,11 +104,11 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
         if as_json:
             print_json(found)
         else:
-            click.echo("\n".join(as_text(found)))
+            echo("\n".join(as_text(found)))
 
 
 def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
-    """The report for people, as lines with colours (which ``click.echo`` takes out where there is no terminal).
+    """The report for people, as lines with colours (which ``echo`` takes out where there is no terminal).
 
     On a terminal no line is wider than it.
 
@@ -128,7 +128,7 @@ def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
     if found["why_python"]:
         lines += ["", f"programs of this installation read without compiled code: {found['why_python']}"]
     if found["problems"]:
-        lines += ["", *(click.style("problem: ", fg="red") + text for text in found["problems"])]
+        lines += ["", *(style("problem: ", fg="red") + text for text in found["problems"])]
     return [part for line in lines for part in wrapped(line, terminal_width())]
 
 
@@ -289,9 +289,9 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     life, age = entry["state"], age_text(None if entry["age_ms"] is None else entry["age_ms"] * 1e6)
     patches = entry.get("patch_list", ())
     shown = state_shown(life, sum(patch["fresh"] for patch in patches), entry.get("sensors", 0))
-    parts = [click.style(life, fg=_LIFE_COLOURS.get(shown), bold=True)]
+    parts = [style(life, fg=_LIFE_COLOURS.get(shown), bold=True)]
     if shown == NOT_FRESH:
-        parts.append(click.style("but no sensor is fresh", fg="red"))
+        parts.append(style("but no sensor is fresh", fg="red"))
     if entry["age_ms"] is None:
         parts.append("nothing published yet")
     elif life == "dead":
@@ -305,7 +305,7 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     if entry["before_boot"]:
         parts.append(f"{plural(entry['before_boot'], 'frame')} stamped before this machine booted")
     parts.append(f"pid {entry['pid']}")
-    return f"{what} {click.style(entry['name'], bold=True)}: {', '.join(parts)}"
+    return f"{what} {style(entry['name'], bold=True)}: {', '.join(parts)}"
 
 
 _OWN_KEYS = {"name", "state", "reason", "state_age_s", "load", "load_unknown", "samples", "data_path"}
@@ -375,7 +375,7 @@ def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
         print_json(rows)
         return
     cells = [[str(position), row["name"], row["type"], f"{row['uid']:#x}"] for position, row in enumerate(rows)]
-    click.echo("\n".join(table(("position", "name", "type", "uid"), cells, left=3)))
+    echo("\n".join(table(("position", "name", "type", "uid"), cells, left=3)))
 
 
 def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
@@ -396,7 +396,7 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
             fits = len(lines) < shutil.get_terminal_size().lines
             redraw(lines if fits else as_text(found, brief=True))
         else:
-            click.echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
+            echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
         time.sleep(_WATCH_PERIOD_S)
 
 

@@ -11,10 +11,10 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     version_option,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, ServiceNotFound, SkinwareError
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def command(
         print_json({"name": name, "pressed": pressed})
         return
     for bus, nearest in pressed.items():
-        click.echo(f"{name} on {bus}: {force_n:g} N for {seconds:g} s; the nearest taxel: {_in_words(nearest)}")
+        echo(f"{name} on {bus}: {force_n:g} N for {seconds:g} s; the nearest taxel: {_in_words(nearest)}")
 
 
 def _the_only_one(namespace: Namespace) -> str:

@@ -17,7 +17,6 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     signals_end,
@@ -25,6 +24,7 @@ from skinware.cli._command import (
     warn,
 )
 from skinware.cli._enter_key import is_there, pressed_calls
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
@@ -175,7 +175,7 @@ class _Report:
         else:
             what = ", ".join(names) or "all drivers and services"
             keys = f"{'Enter saves, ' * (is_past and is_there())}Ctrl-C ends"
-            click.echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
+            echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
         """How it goes, once a second."""
@@ -193,10 +193,10 @@ class _Report:
         self._before = messages
         lost = f", lost {self._recorder.lost}" if self._recorder.lost else ""
         passed = time.strftime("%H:%M:%S", time.gmtime(time.monotonic() - self._begin_s))
-        click.echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{lost}")
+        echo(f"{passed}  {self._target.size / 1e6:.1f} MB  {', '.join(rates) or 'nothing yet'}{lost}")
         saved, self._saved = self._saved, self._target.paths if self._is_past else []
         for path in self._saved[len(saved) :]:
-            click.echo(f"saved {path}")
+            echo(f"saved {path}")
 
     def _news(self) -> None:
         """Report what happened to the clocks of the machine."""
@@ -220,10 +220,10 @@ class _Report:
                 print_json({"event": "stopped", **ends, **self._figures(messages)})
             return
         for name, count in messages.items():
-            click.echo(f"{name}: {count} messages")
+            echo(f"{name}: {count} messages")
         lost = f", {self._recorder.lost} frames lost" if self._recorder.lost else ", nothing lost" * is_complete
         ended = "complete" if is_complete else "ended early"
-        click.echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{lost}")
+        echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{lost}")
 
     def _figures(self, messages: dict[str, int]) -> dict[str, Any]:
         return {"messages": messages, "lost": self._recorder.lost, "bytes": self._target.size}

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, version_option
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, run, version_option
+from skinware.cli._terminal import echo, print_json
 
 
 @click.command(
@@ -42,9 +43,9 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
         print_json({"event": "recovered", "file": str(target), "messages": recovered.messages, **damaged})
         return
     for channel, count in recovered.messages.items():
-        click.echo(f"{channel}: {count} messages")
+        echo(f"{channel}: {count} messages")
     what = "it was whole" if recovered.was_whole else f"{recovered.damaged} damaged chunks left out"
-    click.echo(f"{target}: written; {what}")
+    echo(f"{target}: written; {what}")
 
 
 def main() -> None:

@@ -13,12 +13,12 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
 )
 from skinware.cli._regions import DEFAULT_REGIONS, regions_of
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,7 +63,7 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
             print_json({"region": name, "sensors": of_type})
         else:
             found = ", ".join(plural(count, f"{type_name} sensor") for type_name, count in of_type.items() if count)
-            click.echo(f"{name}: {found or 'nothing in the drivers that run'}")
+            echo(f"{name}: {found or 'nothing in the drivers that run'}")
 
 
 @command.command(
@@ -124,7 +124,7 @@ def paint(
         print_json({"event": "done", **told})
     else:
         holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
-        click.echo(f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
+        echo(f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
 
 
 def _refuse_early(file: Path, name: str, force: bool) -> None:
@@ -194,7 +194,7 @@ class _Painter:
             told = {"driver": self._reader.name, "type": self.type_name}
             print_json({"event": event, **(told if event == "ready" else {}), "touched": int(stroked.sum())})
         else:
-            click.echo(text)
+            echo(text)
 
 
 def main() -> None:

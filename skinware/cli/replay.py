@@ -14,13 +14,13 @@ from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
     json_option,
-    print_json,
     run,
     seconds,
     signals_end,
     version_option,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.recording import Recording
@@ -120,7 +120,7 @@ def command(
         with contextlib.closing(replayer), signals_end(replayer.stop, continued):
             _ready(recording, names, place.name, as_json)
             if has_keys:
-                click.echo(KEYS)
+                echo(KEYS)
                 with terminal.keys():
                     replayer.run(terminal.draw, _DRAW_EVERY_S)
             else:
@@ -137,7 +137,7 @@ def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json
         print_json({"event": "ready", **told, "duration_s": recording.duration_s, "is_whole": recording.is_whole})
     else:
         what = ", ".join(published) or "nothing"
-        click.echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
+        echo(f"{recording.path}, {recording.duration_s:.1f} s: {what} in namespace {namespace!r} (Ctrl-C ends)")
 
 
 def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
@@ -146,7 +146,7 @@ def _tell(event: str, replayer: Replayer, as_json: bool) -> None:
             print_json({"event": event, **replayer.replay(), "frames": dict(replayer.frames)})
         elif event == "stopped":
             late = f", {replayer.late} of them late" if replayer.late else ""
-            click.echo(f"{replayer.frames.total()} frames published{late}")
+            echo(f"{replayer.frames.total()} frames published{late}")
 
 
 def main() -> None:

@@ -15,13 +15,13 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
     warn,
 )
 from skinware.cli._regions import regions_of, regions_option
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -143,16 +143,16 @@ def _print_lines(drivers: LiveDrivers, contacts: LiveSources[ContactsFrame], as_
             print_json(as_data(driver.health(), [_contacts.as_data(place) for place in places]))
         else:
             for line in (plain_line(driver.health()), *map(_contacts.plain_text, places)):
-                click.echo(line)
+                echo(line)
     if not found and not as_json:
-        click.echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
+        echo(f"no driver runs in namespace {drivers.namespace.name!r}; start one: skin-driver --bus virtual")
 
 
 def _print_bridges(bridges: LiveBridges) -> None:
     from skinware.cli._bridges import as_data, summary
 
     for bridge in bridges.states():
-        click.echo(summary(bridge.robot, as_data(bridge)))
+        echo(summary(bridge.robot, as_data(bridge)))
 
 
 def main() -> None:

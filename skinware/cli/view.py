@@ -25,11 +25,11 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     version_option,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import MissingExtra
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def command(
             print_json({"event": "ready", "url": url, "namespace": place.name, "names": list(names)})
         else:
             what = ", ".join(names) or f"all drivers of namespace {place.name!r}"
-            click.echo(f"{url} shows {what} (Ctrl-C ends)")
+            echo(f"{url} shows {what} (Ctrl-C ends)")
         if not no_browser and _has_screen():
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
@@ -142,7 +142,7 @@ def command(
         asyncio.run(_serve(follower, access, host, port, ready))
     except OSError as error:
         where = f"{host}, port {DEFAULT_PORT if port is None else port}"
-        click.echo(f"skin-view: {where}: {_why(error)}", err=True)
+        echo(f"skin-view: {where}: {_why(error)}", err=True)
         click.get_current_context().exit(EXIT_FAILED)
     finally:
         follower.close()

@@ -16,12 +16,12 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
 )
 from skinware.cli._format import count_text, figure_text, plural
+from skinware.cli._terminal import echo, overwrite, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,7 +111,7 @@ class _Wipe:
         else:
             more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
             tested = plural(self._n_tested, f"{self._type.name} sensor")
-            click.echo(f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
+            echo(f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
         is_due = after(_TELL_EVERY_S)
         for frame, physical in self._frames(duration_s):
             self._test.follow(physical, frame.status == 0)
@@ -138,9 +138,9 @@ class _Wipe:
         if self._as_json:
             print_json({"event": "done", "answered": answered, "sensors": self._n_tested, "never": named})
         else:
-            click.echo("\n" * self._is_redrawing + self._progress() + (", never:" if never else ""))
+            echo("\n" * self._is_redrawing + self._progress() + (", never:" if never else ""))
             for one in named:
-                click.echo(f"  {one['name']}{self._why(one['status'])}")
+                echo(f"  {one['name']}{self._why(one['status'])}")
         return not never
 
     @property
@@ -180,9 +180,9 @@ class _Wipe:
             answered = self._n_tested - len(self._never_answered())
             print_json({"event": "wiping", "answered": answered, "sensors": self._n_tested})
         elif self._is_redrawing:
-            click.echo(f"\r{self._progress()}\x1b[K", nl=False)
+            overwrite(self._progress())
         else:
-            click.echo(self._progress())
+            echo(self._progress())
 
     def _why(self, status: int) -> str:
         """What the driver itself says of a sensor."""

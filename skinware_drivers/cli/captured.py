@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from skinware.cli._command import print_json
+from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware_drivers.cli.hardware_options import value_of
 
@@ -98,11 +98,11 @@ def _tell(capture: Path, compared: Comparison, as_json: bool) -> None:
         )
         return
     counts = f"{compared.then} updates of modules then, {compared.now} now, {compared.compared} compared"
-    click.echo(f"{capture}: {counts}")
+    echo(f"{capture}: {counts}")
     if difference is None:
-        click.echo(click.style("equal", fg="green"))
+        echo(style("equal", fg="green"))
     else:
-        click.echo(f"{click.style('different', fg='red')} {difference}")
+        echo(f"{style('different', fg='red')} {difference}")
 
 
 __all__ = ["compare_capture"]

@@ -16,11 +16,11 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def command(
     if as_json:
         print_json({"target": target, "driver": owner, "operation": operation, **outcome})
     else:
-        click.echo("\n".join(_lines(outcome["operations" if operation is None else "results"])))
+        echo("\n".join(_lines(outcome["operations" if operation is None else "results"])))
 
 
 def _owner(target: str, namespace: str) -> tuple[RunningDriver | None, str | None]:
@@ -223,7 +223,7 @@ def _ask_back(what: str, description: str, yes: bool) -> None:
         raise ConfigurationError(
             f"{what}: this makes changes, and there is no terminal to ask for confirmation; add --yes"
         )
-    click.echo(f"{what}\n  {description}", err=True)
+    echo(f"{what}\n  {description}", err=True)
     if not click.confirm("Go on?", err=True):
         raise Declined("nothing was changed")
 

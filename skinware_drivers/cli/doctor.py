@@ -14,11 +14,11 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
 )
+from skinware.cli._terminal import echo, overwrite, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,7 +68,7 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
     else:
         from skinware_drivers.cli.doctor_text import as_text
 
-        click.echo("\n".join(as_text(evidence, found, None if report is None else str(report))))
+        echo("\n".join(as_text(evidence, found, None if report is None else str(report))))
     if found.findings:
         click.get_current_context().exit(EXIT_FAILED)
 
@@ -139,9 +139,9 @@ def _progress() -> Callable[[float], None]:
 
     def tell(passed_s: float) -> None:
         if is_terminal and passed_s < 0:
-            click.echo("\r\x1b[K", nl=False, err=True, color=True)
+            overwrite("", err=True)
         elif is_terminal:
-            click.echo(f"\rlooking ... {passed_s:.1f} s", nl=False, err=True, color=True)
+            overwrite(f"looking ... {passed_s:.1f} s", err=True)
 
     return tell
 

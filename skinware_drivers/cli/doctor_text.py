@@ -8,6 +8,7 @@ from itertools import groupby
 import click
 
 from skinware.cli._format import age_text, plural
+from skinware.cli._terminal import style
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import Examination
 from skinware_drivers.doctor.finding import Finding, Severity
@@ -18,7 +19,7 @@ _SIGNS = {Severity.ERROR: ("✗", "red"), Severity.WARNING: ("!", "yellow"), Sev
 
 
 def as_text(evidence: Evidence, found: Examination, report: str | None = None) -> list[str]:
-    """All of it, with colours (which ``click.echo`` takes out where there is no terminal).
+    """All of it, with colours (which ``echo`` takes out where there is no terminal).
 
     Args:
         evidence: what was seen.
@@ -28,17 +29,15 @@ def as_text(evidence: Evidence, found: Examination, report: str | None = None) -
     lines = [*_verdict(evidence, found), ""]
     for finding in found.findings:
         lines += [*_finding(finding), ""]
-    lines += [click.style("looked at", underline=True)]
+    lines += [style("looked at", underline=True)]
     for area, looked in groupby(found.looked, key=lambda one: one.area):
         for number, one in enumerate(looked):
-            lines += _row("" if number else area, f"{click.style(one.what, bold=True)}: {one.seen}", width=14)
+            lines += _row("" if number else area, f"{style(one.what, bold=True)}: {one.seen}", width=14)
     if found.not_looked:
-        lines += ["", click.style("not looked at", underline=True)]
+        lines += ["", style("not looked at", underline=True)]
         for area, not_looked in groupby(found.not_looked, key=lambda one: one.area):
             for number, missing in enumerate(not_looked):
-                lines += _row(
-                    "" if number else area, f"{click.style(missing.what, bold=True)}: {missing.why}", width=14
-                )
+                lines += _row("" if number else area, f"{style(missing.what, bold=True)}: {missing.why}", width=14)
                 lines += [f"{'':16}$ {command}" for command in missing.commands]
     if report is not None:
         lines += ["", f"written to {report}; read it before you give it to others"]
@@ -53,17 +52,17 @@ def _verdict(evidence: Evidence, found: Examination) -> Iterator[str]:
     else:
         about = f"namespace {evidence.namespace}, {drivers}, looked at for {span}"
     counts = [
-        click.style(plural(count, severity.name.lower()), fg=_SIGNS[severity][1], bold=True)
+        style(plural(count, severity.name.lower()), fg=_SIGNS[severity][1], bold=True)
         for severity in sorted(Severity, reverse=True)
         if (count := sum(one.severity == severity for one in found.findings))
     ]
-    verdict = ", ".join(counts) or click.style("nothing found", fg="green", bold=True)
-    yield from _wrapped(f"{verdict}  {click.style(f'({about})', dim=True)}", "", "")
+    verdict = ", ".join(counts) or style("nothing found", fg="green", bold=True)
+    yield from _wrapped(f"{verdict}  {style(f'({about})', dim=True)}", "", "")
 
 
 def _finding(finding: Finding) -> Iterator[str]:
     sign, colour = _SIGNS[finding.severity]
-    head = f"{click.style(f'{sign} {finding.area}', fg=colour, bold=True)}  {click.style(finding.what, bold=True)}"
+    head = f"{style(f'{sign} {finding.area}', fg=colour, bold=True)}  {style(finding.what, bold=True)}"
     yield from _wrapped(head, "", "    ")
     for label, text in (
         ("where", finding.where),
@@ -72,12 +71,12 @@ def _finding(finding: Finding) -> Iterator[str]:
     ):
         yield from _row(label, text)
     for command in finding.commands:
-        yield f"{'':{_LABEL + 2}}{click.style('$ ' + command, fg='green')}"
-    yield from _row("see", click.style(f"docs/{finding.see}", dim=True))
+        yield f"{'':{_LABEL + 2}}{style('$ ' + command, fg='green')}"
+    yield from _row("see", style(f"docs/{finding.see}", dim=True))
 
 
 def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
-    head = "  " + click.style(f"{label:<{width}}", dim=True)
+    head = "  " + style(f"{label:<{width}}", dim=True)
     yield from _wrapped(head + text, "", " " * (width + 2))
 
 

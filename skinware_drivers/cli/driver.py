@@ -20,11 +20,11 @@ from skinware.cli._command import (
     json_option,
     log_to_stderr,
     namespace_option,
-    print_json,
     run,
     verbose_option,
     version_option,
 )
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError, DriverError, SkinwareError
 from skinware_drivers.cli.driver_events import report, tell_capture, tell_patches, tell_ready
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values, value_of
@@ -84,7 +84,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     from importlib.resources import files
 
     text = (files("skinware_drivers") / "data" / UNIT_FILE).read_text()
-    click.echo(text.replace(_UNIT_PROGRAM, str(Path(sys.argv[0]).absolute())), nl=False)
+    echo(text.replace(_UNIT_PROGRAM, str(Path(sys.argv[0]).absolute())), nl=False)
     context.exit()
 
 

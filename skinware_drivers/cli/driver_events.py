@@ -6,10 +6,8 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from skinware.cli._command import print_json
 from skinware.cli._format import plural
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware_drivers.cli.capturing import Capture
@@ -33,9 +31,9 @@ def tell_ready(runner: Runner, as_json: bool) -> None:
     else:
         patches, modules = plural(structure.n_patches, "patch", "patches"), plural(structure.n_modules, "module")
         what = f"{patches}, {modules}, {plural(structure.n_sensors, 'sensor')} on {', '.join(buses)}"
-        click.echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
+        echo(f"{runner.name}: {what}; publishing (skin-top shows it, Ctrl-C ends)")
         if runner.generation.why_python:
-            click.echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
+            echo(f"{runner.name}: frames go through Python: {runner.generation.why_python}")
 
 
 def tell_patches(runner: Runner, change: PatchChange) -> None:
@@ -50,11 +48,11 @@ def tell_capture(capture: Capture, as_json: bool) -> None:
         if as_json:
             print_json({"event": "captured", "file": str(capture.path), **capture.told})
         elif capture.told["problem"]:
-            click.echo(f"{capture.path}: ended early: {capture.told['problem']}", err=True)
+            echo(f"{capture.path}: ended early: {capture.told['problem']}", err=True)
         else:
             lost = f", {capture.told['lost']} frames lost" if capture.told["lost"] else ""
             size = capture.told["bytes"] / 1e6
-            click.echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
+            echo(f"{capture.path}: {size:.1f} MB{lost}; skin-driver --bus replay:{capture.path} decodes it again")
 
 
 async def report(runner: Runner) -> None:

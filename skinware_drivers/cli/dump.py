@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, print_json, run, warn
+from skinware.cli._command import CONTEXT_SETTINGS, examples, run, warn
+from skinware.cli._terminal import echo, print_json
 from skinware.cli.dump import command as frames_command
 from skinware_drivers.bus_names import NETWORKS
 
@@ -70,7 +71,7 @@ def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json:
                     }
                 )
             if not as_json and frames:
-                click.echo("\n".join(frame.line(name) for frame in frames))
+                echo("\n".join(frame.line(name) for frame in frames))
             if left is not None:
                 left -= len(frames)
                 if not left:

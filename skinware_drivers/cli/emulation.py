@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import select
 import signal
 import socket
@@ -15,6 +14,7 @@ from typing import Any, Protocol, Self, TextIO
 
 import msgspec
 
+from skinware.cli._terminal import json_text, shown
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
@@ -45,7 +45,7 @@ class JsonReport:
 
     def event(self, name: str, **facts: Any) -> None:
         """Write one line at once."""
-        self._stream.write(json.dumps({"event": name, **facts}) + "\n")
+        self._stream.write(json_text({"event": name, **facts}) + "\n")
         self._stream.flush()
 
 
@@ -66,7 +66,7 @@ class HumanReport:
             text = "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
         else:
             text = f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
-        self._stream.write(text + "\n")
+        self._stream.write(shown(text) + "\n")
         self._stream.flush()
 
 

@@ -11,12 +11,12 @@ from skinware.cli._command import (
     CONTEXT_SETTINGS,
     examples,
     json_option,
-    print_json,
     run,
     seconds,
     version_option,
     warn,
 )
+from skinware.cli._terminal import echo, print_json
 
 if TYPE_CHECKING:
     from skinware_drivers.finding.interfaces import CanInterface
@@ -78,7 +78,7 @@ def command(
     else:
         from skinware_drivers.cli.find_text import as_text
 
-        click.echo("\n".join(as_text(found)))
+        echo("\n".join(as_text(found)))
 
 
 async def look(
@@ -265,7 +265,7 @@ def _print_rules(buses: tuple[str, ...], as_json: bool) -> None:
     if as_json:
         print_json({"place": PLACE, "rules": rules, "then": list(RELOAD)})
     else:
-        click.echo(rules, nl=False)
+        echo(rules, nl=False)
         warn(f"to use them: skin-find --udev | sudo tee {PLACE}; {'; '.join(RELOAD)}")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from skinware.cli._format import count_text, plural
+from skinware.cli._terminal import style
 from skinware_drivers.bus_names import is_only_asked
 
 _WIDTH = 80
@@ -15,7 +16,7 @@ _MOST_CLASSES = 6
 
 
 def as_text(found: dict[str, Any]) -> list[str]:
-    """The whole report, with colours (which ``click.echo`` takes out where there is no terminal)."""
+    """The whole report, with colours (which ``echo`` takes out where there is no terminal)."""
     can = found["can"]
     lines: list[str] = []
     if can["interfaces"] or can["advice"]:
@@ -29,7 +30,7 @@ def as_text(found: dict[str, Any]) -> list[str]:
         lines += ["", _title("other CAN adapters, by python-can")]
         for adapter in found["adapters"]:
             details = ", ".join(f"{key} {value}" for key, value in adapter.details.items())
-            lines += _wrapped(f"{click.style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
+            lines += _wrapped(f"{style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
         lines += _advice([found["adapters_problem"]] if found["adapters_problem"] else [])
     if found["ports"]:
         lines += ["", _title("serial ports")]
@@ -41,7 +42,7 @@ def as_text(found: dict[str, Any]) -> list[str]:
 
 
 def _interface_lines(one: dict[str, Any]) -> list[str]:
-    state = click.style("up", fg="green") if one["up"] else click.style("down", fg="yellow")
+    state = style("up", fg="green") if one["up"] else style("down", fg="yellow")
     parts = [state, f"kernel driver {one['driver']}" if one["driver"] else one["kind"]]
     if one["bit_rate"]:
         parts.append(_bit_rate(one))
@@ -53,7 +54,7 @@ def _interface_lines(one: dict[str, Any]) -> list[str]:
     counts = one["statistics"]
     went = [f"received {count_text(counts['rx_packets'])}", f"sent {count_text(counts['tx_packets'])}"]
     went += [f"{name.replace('_', ' ')} {count_text(count)}" for name, count in _troubles(one).items()]
-    lines = [*_wrapped(f"{click.style(one['name'], bold=True)}  {', '.join(parts)}", first="")]
+    lines = [*_wrapped(f"{style(one['name'], bold=True)}  {', '.join(parts)}", first="")]
     return [*lines, *_wrapped(", ".join(went)), *_bus_lines(one), *_advice(one["advice"])]
 
 
@@ -93,7 +94,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
             share = "all frames" if one.share == 1 else f"{100 * one.share:.0f} % of the frames"
             patches = ", ".join(one.patches)
             how = "looks like" if one.likely else "or perhaps"
-            name = click.style(one.driver, bold=one.likely)
+            name = style(one.driver, bold=one.likely)
             lines += _wrapped(f"{how} {name}{'' if one.likely else '?'}: {patches} ({share})")
         if heard.frames and not heard.guesses:
             lines += _wrapped("no installed driver knows these frames")
@@ -123,7 +124,7 @@ def _port_lines(port: dict[str, Any]) -> list[str]:
         parts.append(f"serial number {usb['serial_number']}" if usb["serial_number"] else "no serial number")
     if port["driver"]:
         parts.append(f"kernel driver {port['driver']}")
-    lines = _wrapped(f"{click.style(port['path'], bold=True)}  {', '.join(parts)}", first="")
+    lines = _wrapped(f"{style(port['path'], bold=True)}  {', '.join(parts)}", first="")
     for link in port["links"]:
         lines.append(f"  {link}")
     if port["used_by"] is not None:
@@ -140,7 +141,7 @@ def _advice(texts: list[str]) -> list[str]:
     lines = []
     for text in texts:
         why, colon, commands = text.partition(": sudo ")
-        mark = click.style("!", fg="yellow")
+        mark = style("!", fg="yellow")
         lines += _wrapped(f"{mark} {why}{':' if colon else ''}")
         if colon:
             lines += [f"      sudo {command}" for command in commands.replace("; sudo ", ";").split(";")]
@@ -148,7 +149,7 @@ def _advice(texts: list[str]) -> list[str]:
 
 
 def _title(text: str) -> str:
-    return click.style(text, underline=True)
+    return style(text, underline=True)
 
 
 def _wrapped(text: str, first: str = "  ") -> list[str]:

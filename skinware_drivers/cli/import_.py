@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, print_json, run, version_option
+from skinware.cli._command import CONTEXT_SETTINGS, examples, json_option, run, version_option
+from skinware.cli._terminal import echo, print_json
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -106,13 +107,13 @@ def icub(
         return
     _report(notes.all(), verbose)
     if output is None:
-        click.echo(_configuration(done.parts[0], root), nl=False)
+        echo(_configuration(done.parts[0], root), nl=False)
         if done.parts[0].groups:
-            click.echo("skin-import: with -o DIR, there is a geometry file too", err=True)
+            echo("skin-import: with -o DIR, there is a geometry file too", err=True)
         return
     for part in done.parts:
         figures = part.figures()
-        click.echo(
+        echo(
             f"{output / part.name}.toml: {sum(len(bus.options.boards) for bus in part.buses)} boards,"
             f" {figures['triangles']} triangles, {figures['sensors']} sensors,"
             f" {figures['sensors_with_a_place']} with a place"
@@ -193,11 +194,11 @@ def _report(notes: Sequence[Note], verbose: bool) -> None:
         if not of_level:
             continue
         if level == "info" and not verbose:
-            click.echo(f"{heading}: {len(of_level)} (-v names them)", err=True)
+            echo(f"{heading}: {len(of_level)} (-v names them)", err=True)
             continue
-        click.echo(f"{heading}:", err=True)
+        echo(f"{heading}:", err=True)
         for note in of_level:
-            click.echo(f"  {note}", err=True)
+            echo(f"  {note}", err=True)
 
 
 def main() -> None:

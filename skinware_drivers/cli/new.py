@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from skinware.cli._command import CONTEXT_SETTINGS, examples, run, version_option
+from skinware.cli._terminal import echo
 
 _HOW_TO_RUN = {
     "can": ("skin-driver --driver {name} --bus virtual",),
@@ -58,10 +59,10 @@ def command(name: str, transport: str) -> None:
     check_name(name)
     made = make_package(name, transport, Path.cwd())
     steps = [f"cd {name}", "pip install -e '.[test]'", "pytest", *_HOW_TO_RUN[transport]]
-    click.echo(f"{name}/: {len(made)} files; next:")
+    echo(f"{name}/: {len(made)} files; next:")
     for step in steps:
-        click.echo(f"  {step.format(name=name)}")
-    click.echo(f"then make it the driver of your hardware: {name}/src/{name}/driver.py says where to begin")
+        echo(f"  {step.format(name=name)}")
+    echo(f"then make it the driver of your hardware: {name}/src/{name}/driver.py says where to begin")
 
 
 def main() -> None:

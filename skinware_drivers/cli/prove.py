@@ -25,12 +25,12 @@ from skinware.cli._command import (
     examples,
     json_option,
     namespace_option,
-    print_json,
     run,
     seconds,
     version_option,
     warn,
 )
+from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import DriverError, SkinwareError
 
 if TYPE_CHECKING:
@@ -311,7 +311,7 @@ class _AtTerminal:
         if self._as_json:
             print_json({"event": "step", "wanted": step.wanted, "module": step.module, "text": step.text})
         else:
-            click.echo(f"> {click.style(step.text, bold=True)}")
+            echo(f"> {style(step.text, bold=True)}")
 
     def skips(self) -> bool:
         """Whether a line says so."""
@@ -328,15 +328,15 @@ def _tell(proof: Proof, files: ProofFiles, as_json: bool) -> None:
         print_json({"event": "done", "files": files.written, **proof.as_data()})
         return
     for check in proof.checks:
-        verdict = click.style(f"{check.verdict.value:>10}", fg=_COLOURS[check.verdict.value])
-        click.echo(f"{verdict}  {check.what}{f', {check.where}' if check.where else ''}: {check.seen}")
+        verdict = style(f"{check.verdict.value:>10}", fg=_COLOURS[check.verdict.value])
+        echo(f"{verdict}  {check.what}{f', {check.where}' if check.where else ''}: {check.seen}")
     if "ended early" in proof.about:
-        click.echo(f"ended early: {proof.about['ended early']}")
-    click.echo(click.style("proven" if proof.is_proven else "not proven", bold=True))
+        echo(f"ended early: {proof.about['ended early']}")
+    echo(style("proven" if proof.is_proven else "not proven", bold=True))
     if files.captured.get("problem"):
         warn(f"{files.capture} ended early: {files.captured['problem']}")
     if files.written:
-        click.echo(f"written to {', '.join(files.written)}; read them before you give them to others")
+        echo(f"written to {', '.join(files.written)}; read them before you give them to others")
 
 
 def main() -> None:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from skinware.cli._command import CONTEXT_SETTINGS, examples, print_json, run, signals_end, warn
+from skinware.cli._command import CONTEXT_SETTINGS, examples, run, signals_end, warn
+from skinware.cli._terminal import echo, print_json
 from skinware.cli.replay import command as frames_command
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ def _replay_wires(
             if as_json:
                 print_json({"event": "ready", "file": str(file), "buses": told, "duration_s": recording.duration_s})
             else:
-                click.echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in told.items())} (Ctrl-C ends)")
+                echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in told.items())} (Ctrl-C ends)")
             sender.send_all(loop=loop)
         for problem in recording.problems:
             warn(problem)
@@ -84,7 +85,7 @@ def _replay_wires(
         print_json({"event": "stopped", "frames": dict(sender.sent), "failed": sender.failed})
     else:
         failed = f", {sender.failed} not taken by their bus" if sender.failed else ""
-        click.echo(f"{sender.sent.total()} frames sent{failed}")
+        echo(f"{sender.sent.total()} frames sent{failed}")
 
 
 def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireTrack, Bus]]:

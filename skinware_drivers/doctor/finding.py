@@ -77,9 +77,4 @@ class NotLooked:
 Note = Finding | Looked | NotLooked
 
 
-def printable(text: str) -> str:
-    """A text on one line; whatever could move the cursor of a terminal, or begin another line, is a question mark."""
-    return "".join(sign if sign.isprintable() else "?" for sign in text)
-
-
-__all__ = ["Finding", "Looked", "NotLooked", "Note", "Severity", "printable"]
+__all__ = ["Finding", "Looked", "NotLooked", "Note", "Severity"]

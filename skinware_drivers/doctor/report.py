@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from skinware._printable import printable
 from skinware.cli._format import age_text, plural
 from skinware_drivers.doctor.evidence import Counted, Counts, DriverSeen, Evidence
 from skinware_drivers.doctor.examining import Examination
-from skinware_drivers.doctor.finding import Finding, printable
+from skinware_drivers.doctor.finding import Finding
 from skinware_drivers.doctor.scrubbing import Secrets, scrubbed
 
 

@@ -7,6 +7,8 @@ from typing import Literal
 
 import msgspec
 
+from skinware._printable import printable
+
 Level = Literal["todo", "odd", "unknown", "missing", "info"]
 """``todo``: the user must fill in or decide; ``odd``: understood, but hardly what its author wanted; ``unknown``: not
 understood; ``missing``: named, but not there; ``info``: nothing to do."""
@@ -39,7 +41,7 @@ _LONGEST = 400
 
 def shown(text: object) -> str:
     """A text from a foreign file as a terminal or a comment can show it: without control characters, not too long."""
-    visible = "".join(c if c.isprintable() else "?" for c in str(text))
+    visible = printable(str(text))
     return visible if len(visible) <= _LONGEST else f"{visible[:_LONGEST]} ..."
 
 

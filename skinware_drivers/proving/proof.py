@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from skinware_drivers.doctor.finding import printable
+from skinware._printable import printable
 from skinware_drivers.doctor.scrubbing import Secrets, scrubbed
 
 

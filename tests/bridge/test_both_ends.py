@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, Skin
+from skinware.bridge.giving import Stream
 from skinware.bridge.messages import coded_part, parts_of
 from skinware.errors import Paused, PeerGone, RequestError, RequestFailed, RequestRefused, StructureChanged
 from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Frame
 from skinware.service import ServiceReader, ServiceWriter
-from skinware.transfer.codec import HEADER
+from skinware.transfer.codec import HEADER, CodedColumn
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.net import NetLink
 from tests.bridge.rig import ROBOT, Ends, joined, publish, serving, structure
@@ -115,6 +117,50 @@ def test_a_pulled_frame_is_the_difference_to_one_that_is_kept_and_comes_once(nam
     assert set(others) - {0, *kept} <= {min(others)}, "kept before this test looked"
     assert sum(after > 0 for after in others) > len(others) / 2  # all, unless something was asked for again
     assert len(set(sequences)) > 0.75 * len(sequences)
+
+
+class _Asked:
+    """A question of a puller, with its answers."""
+
+    def __init__(self, others: int, base: int = 0) -> None:
+        self.key, self.payload = "", b""
+        self.parameters = {"who": "x", "others": str(others), "base": str(base)}
+        self.answers: list[bytes] = []
+
+    def reply(self, payload: bytes) -> None:
+        self.answers.append(payload)
+
+    def fail(self, error: bytes) -> None:
+        raise AssertionError(error)
+
+
+def test_each_of_several_open_questions_has_a_frame_of_its_own(namespace: Namespace) -> None:
+    class NoSender:
+        is_heard = False
+
+    stream = Stream(NoSender(), lambda work, *arguments: work(*arguments))  # type: ignore[arg-type]
+    with driver(namespace) as writer, ServiceReader[Frame]("arm", namespace=namespace) as reader:
+        publish(writer)
+        first = reader.read()
+        stream.begin(first.generation, [CodedColumn.of(column) for column in reader._ring.segment.layout.slot])
+        asked = [_Asked(others) for others in range(4)]
+        for question in asked:
+            stream.asked(question)
+        for _ in range(5):
+            stream.take(reader.read())
+            publish(writer)
+        heads = [np.frombuffer(coded_part(question.answers[0])[0], HEADER, 1)[0] for question in asked]
+        assert [int(head["sequence"]) for head in heads] == [1, 2, 3, 4]
+        assert [coded_part(question.answers[0])[1] for question in asked] == [True, False, False, False]
+        again = [_Asked(0, base=1), _Asked(1, base=1), _Asked(2, base=99)]
+        for question in again:
+            stream.asked(question)
+        for _ in range(2):
+            stream.take(reader.read())
+            publish(writer)
+        heads = [np.frombuffer(coded_part(question.answers[0])[0], HEADER, 1)[0] for question in again]
+        assert [int(head["sequence"]) for head in heads] == [5, 6, 7]
+        assert [int(head["after"]) for head in heads] == [1, 1, 0], "who does not have the frame gets a whole one"
 
 
 def until_read(there: DriverReader, value: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -123,16 +124,16 @@ PERIOD_NS = 10 * MS
 def test_it_begins_by_asking_and_is_pushed_where_the_link_is_fast() -> None:
     pacing = Pacing(PERIOD_NS)
     assert pacing.mode == "pull"
-    assert pacing.wants_probe(0)
+    assert pacing.wants_probe(0, MS)
     assert pacing.probed(0, MS)
     assert pacing.mode == "push"
-    assert not pacing.wants_probe(NS_PER_S)
+    assert not pacing.wants_probe(NS_PER_S, MS)
 
 
 def test_a_slow_link_is_tried_again_ever_more_rarely() -> None:
     pacing, at_ns, tried = Pacing(PERIOD_NS), 0, []
     while at_ns < 1000 * NS_PER_S:
-        if pacing.wants_probe(at_ns):
+        if pacing.wants_probe(at_ns, MS):
             assert not pacing.probed(at_ns, 90 * MS)
             tried.append(at_ns)
         at_ns += NS_PER_S // 4
@@ -160,13 +161,76 @@ def test_pushed_frames_that_grow_old_are_asked_for() -> None:
         at_ns += PERIOD_NS
         assert at_ns < 13 * NS_PER_S
     assert pacing.mode == "pull"
-    assert not pacing.wants_probe(at_ns + NS_PER_S)
+    assert not pacing.wants_probe(at_ns + NS_PER_S, MS)
+
+
+@pytest.mark.parametrize("delay_ns", [20 * MS, 100 * MS, 300 * MS])
+def test_delay_alone_is_no_reason_to_ask_for_single_frames(delay_ns: int) -> None:
+    pacing = Pacing(PERIOD_NS, size=5_000)
+    assert pacing.wants_probe(0, 2 * delay_ns)
+    assert pacing.probed(0, MS)
+    at_ns = 0
+    for jitter_ns in np.random.default_rng(3).integers(0, 20 * MS, 3000).tolist():
+        assert not pacing.saw(at_ns, delay_ns + jitter_ns, 2 * delay_ns)
+        at_ns += PERIOD_NS
+
+
+def test_a_large_frame_is_no_probe_of_a_long_link() -> None:
+    pacing = Pacing(PERIOD_NS, size=170_000)
+    assert pacing.wants_probe(0, MS)
+    assert not pacing.wants_probe(0, 200 * MS)
+
+
+def asked_at_once(pacing: Pacing, until_ns: int, wait_of: Callable[[int], int], round_trip_ns: int) -> Iterator[int]:
+    """How many questions are open after each frame; ``wait_of``: how long a frame waits with so many, ns."""
+    at_ns = 0
+    while at_ns < until_ns:
+        pacing.saw(at_ns, round_trip_ns // 2 + wait_of(pacing.open), round_trip_ns)
+        at_ns += max(PERIOD_NS, round_trip_ns // pacing.open)
+        yield pacing.open
+
+
+@pytest.mark.parametrize(("round_trip_ns", "wanted"), [(MS // 5, 3), (40 * MS, 10), (600 * MS, 92)])
+def test_as_many_questions_are_open_as_a_round_trip_has_periods(round_trip_ns: int, wanted: int) -> None:
+    assert list(asked_at_once(Pacing(PERIOD_NS, "pull"), 20 * NS_PER_S, lambda _: 0, round_trip_ns))[-1] == wanted
+
+
+def test_no_more_questions_are_open_than_the_link_takes() -> None:
+    """A link with a round trip of 0.2 s that takes a frame every 40 ms: a sixth one waits."""
+    pacing = Pacing(PERIOD_NS, "pull")
+    seen = list(asked_at_once(pacing, 400 * NS_PER_S, lambda count: 40 * MS * max(0, count - 5), 200 * MS))
+    later = seen[len(seen) // 2 :]
+    assert 4 <= np.mean(later) <= 7
+    assert max(later) <= 9
+
+
+@pytest.mark.parametrize("mode", ["push", "pull"])
+def test_frames_behind_a_lost_packet_are_no_queue(mode: str) -> None:
+    """Each second some frames in a row come a round trip late, at once."""
+    pacing, at_ns = Pacing(PERIOD_NS, "pull" if mode == "pull" else None), 0
+    if mode == "push":
+        assert pacing.probed(0, MS)
+    for number in range(4000):
+        late_ns = max(0, 120 * MS - number % 20 * PERIOD_NS)
+        pacing.saw(at_ns, 50 * MS + late_ns, 100 * MS)
+        at_ns += PERIOD_NS
+    assert pacing.mode == mode
+    assert mode == "push" or pacing.open == 22
+
+
+def test_a_moment_of_waiting_changes_little() -> None:
+    pacing = Pacing(PERIOD_NS, "pull")
+    list(asked_at_once(pacing, 20 * NS_PER_S, lambda _: 0, 200 * MS))
+    wanted = pacing.open
+    pacing.saw(21 * NS_PER_S, 900 * MS, 200 * MS)
+    pacing.saw(22 * NS_PER_S, 900 * MS, 200 * MS)
+    assert pacing.open == wanted
 
 
 @pytest.mark.parametrize("mode", ["push", "pull"])
 def test_a_mode_that_a_person_wants_stays(mode: str) -> None:
     pacing = Pacing(PERIOD_NS, mode)
-    assert not pacing.wants_probe(0)
+    assert not pacing.wants_probe(0, MS)
     assert not any(pacing.saw(at_ns, NS_PER_S, MS) for at_ns in range(0, 9 * NS_PER_S, PERIOD_NS))
     assert pacing.mode == mode
 

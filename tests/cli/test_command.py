@@ -6,7 +6,8 @@ import json
 import click
 import pytest
 
-from skinware.cli._command import examples, exit_status, print_json, seconds, warn
+from skinware.cli._command import examples, exit_status, seconds, warn
+from skinware.cli._terminal import print_json
 from skinware.errors import BadServiceFile, BusNotAvailable, BusSendError, ConfigurationError, ServiceNotFound
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from skinware import BusReason, BusState, Column, DriverReader, Namespace, ServiceWriter, native
 from skinware.cli._command import exit_status
+from skinware.cli._terminal import shown
 from skinware.cli.info import as_text, command
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS
 from skinware.realtime import now_ns
@@ -398,7 +399,7 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
 
 def test_colours_are_there_for_terminals_only(namespace: Namespace) -> None:
     report = {"namespace": "x", "why_python": "no compiler", "drivers": [], "services": [], "problems": ["refused"]}
-    assert "\x1b[31mproblem: \x1b[0mrefused" in as_text(report)
+    assert "\x1b[31mproblem: \x1b[0mrefused" in map(shown, as_text(report))
 
 
 def test_watch_prints_blocks_without_a_terminal_until_interrupted() -> None:

@@ -1,10 +1,12 @@
 """A bridge between two network namespaces: ages, rates, losses and processor time, on a fast link and on a slow one.
 
 tools/bench bridge [--seconds S] [--sensors N ...] [--slow-mbit M] [--loopback]
+tools/bench bridge [--seconds S] [--sensors N ...] --far MS ... [--jitter MS] [--loss SHARE] [--tcp bbr]
 
 A driver publishes at 100 Hz on one side. A reader beside it, and one on the other side, take every frame; ages are from
 the driver's stamp to the reader, both of one clock. With a slow link there is a second receiver on a fast one, which
-must not notice. Where network namespaces cannot be made (not root), ``--loopback``: the fast link only.
+must not notice. ``--far`` measures links with delay instead, with ``--jitter``, ``--loss`` and another ``--tcp``. Where
+network namespaces cannot be made (not root), ``--loopback``: the fast link only.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 from links import LOOPBACK, PATIENCE_S, Command, connect, machine
+from long_links import Far, long_link
 from processes import Processes, answer, own_namespace
 from record import LARGE, RATE_HZ, SMALL, driving
 
@@ -60,14 +63,17 @@ def told(what: str, result: tuple[int, int, list[int]], seconds: float, beside: 
     )
 
 
-def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) -> None:
+def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool, far: Far | None = None) -> None:
     print(f"  {sensors} sensors at {RATE_HZ} Hz, {seconds:g} s, load {os.getloadavg()[0]:.1f}")
     with ExitStack() as stack:
         namespace = stack.enter_context(own_namespace())
         stack.enter_context(driving(namespace.name, sensors, "analogue"))
         receivers: dict[str, tuple[str | None, str]] = {"fast": (None, LOOPBACK)}
         robot = None if loopback else stack.enter_context(machine("robot"))
-        if robot is not None:
+        if far is not None and robot is not None:
+            there = stack.enter_context(machine("far"))
+            receivers = {"far": (there, stack.enter_context(long_link(robot, there, 1, far)))}
+        elif robot is not None:
             for number, name in enumerate(("fast",) if mbit is None else ("fast", "slow"), 1):
                 there = stack.enter_context(machine(name))
                 receivers[name] = there, connect(robot, there, number, mbit if name == "slow" else None)
@@ -84,7 +90,7 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
         readers |= {f"{name} link": processes.start(read_all, place) for name, place in places.items()}
         for pipe in readers.values():
             answer(pipe, PATIENCE_S)
-        time.sleep(8 if mbit else 3)  # the clocks, and the mode of the slow one
+        time.sleep(12 if far else 8 if mbit else 3)  # the clocks, and the mode of the slow one
         for command in (serving, *joins.values()):
             command.begin()
         for pipe in readers.values():
@@ -107,6 +113,9 @@ def measure(sensors: int, seconds: float, mbit: float | None, loopback: bool) ->
             wrong = f"clock wrong by {abs(clock['offset_ms']):.3f} ms, told {clock['error_ms']:.3f}"
             more = f", {service['mode']}, {service['bytes_per_s'] / 1e6:.2f} MB/s, {wrong}"
         print(f"    {name:<6} {100 * share:5.1f} % of a core{more}")
+        for event in events[name]:
+            if event["event"] not in ("ready", "status", "connected"):
+                print(f"           {event}")
 
 
 def main() -> None:
@@ -114,9 +123,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("--sensors", type=int, nargs="+", default=[SMALL, LARGE])
     parser.add_argument("--slow-mbit", type=float, default=16)
+    parser.add_argument("--far", type=float, nargs="+", default=[], metavar="MS")
+    parser.add_argument("--jitter", type=float, default=0.0, metavar="MS")
+    parser.add_argument("--loss", type=float, default=0.0, metavar="SHARE")
+    parser.add_argument("--tcp", choices=["cubic", "bbr"], default="cubic")
     parser.add_argument("--loopback", action="store_true")
     options = parser.parse_args()
-    for sensors in options.sensors:
+    for delay_ms in options.far:
+        far = Far(delay_ms, options.jitter, options.loss, options.tcp)
+        print(far)
+        for sensors in options.sensors:
+            measure(sensors, options.seconds, None, False, far)
+    for sensors in options.sensors if not options.far else ():
         print("fast link")
         measure(sensors, options.seconds, None, options.loopback)
         if not options.loopback:

@@ -32,7 +32,12 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 _CLONE_NEWNET = 0x40000000
 
 
-def _run(*command: str) -> str:
+def run(*command: str) -> str:
+    """What a command prints.
+
+    Raises:
+        OSError: it failed, or is not installed.
+    """
     try:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout
     except FileNotFoundError:
@@ -49,12 +54,12 @@ def machine(role: str) -> Iterator[str]:
         OSError: it cannot be made.
     """
     name = f"skin-{os.getpid()}-{role}"
-    _run("ip", "netns", "add", name)
+    run("ip", "netns", "add", name)
     try:
-        _run("ip", "-n", name, "link", "set", "lo", "up")
+        run("ip", "-n", name, "link", "set", "lo", "up")
         yield name
     finally:
-        _run("ip", "netns", "del", name)
+        run("ip", "netns", "del", name)
 
 
 def connect(here: str, there: str, number: int, mbit: float | None) -> str:
@@ -67,13 +72,13 @@ def connect(here: str, there: str, number: int, mbit: float | None) -> str:
         OSError: it cannot be made.
     """
     device = device_of(number)
-    _run("ip", "-n", here, "link", "add", device, "type", "veth", "peer", "name", device, "netns", there)
+    run("ip", "-n", here, "link", "add", device, "type", "veth", "peer", "name", device, "netns", there)
     for end, place in enumerate((here, there), 1):
-        _run("ip", "-n", place, "addr", "add", f"10.77.{number}.{end}/24", "dev", device)
-        _run("ip", "-n", place, "link", "set", device, "up")
+        run("ip", "-n", place, "addr", "add", f"10.77.{number}.{end}/24", "dev", device)
+        run("ip", "-n", place, "link", "set", device, "up")
         if mbit is not None:
             shape = ("tbf", "rate", f"{mbit:g}mbit", "burst", "32kb", "latency", "50ms")
-            _run("tc", "-n", place, "qdisc", "add", "dev", device, "root", *shape)
+            run("tc", "-n", place, "qdisc", "add", "dev", device, "root", *shape)
     return f"10.77.{number}.1"
 
 
@@ -84,7 +89,7 @@ def device_of(number: int) -> str:
 
 def sent_bytes(place: str, number: int) -> int:
     """What an end of a link has sent until now, with the headers of TCP, IP and Ethernet."""
-    told = json.loads(_run("ip", "-n", place, "-s", "-j", "link", "show", "dev", device_of(number)))
+    told = json.loads(run("ip", "-n", place, "-s", "-j", "link", "show", "dev", device_of(number)))
     return int(told[0]["stats64"]["tx"]["bytes"])
 
 

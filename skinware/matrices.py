@@ -13,7 +13,7 @@ from skinware._columns import frozen, group
 from skinware.errors import StructureError
 
 ModuleKey = tuple[str, str, str]
-"""Names of a driver, of its patch, and of a module in there: empty for the only module of a patch, if it has no name."""
+"""Names of a driver, of its patch, and of a module in there: empty for an unnamed module that is alone in its patch."""
 Key = TypeVar("Key", bound=ModuleKey | str)
 
 _KIND = re.compile(r"([1-9]\d*)x([1-9]\d*)")

@@ -10,8 +10,11 @@ from pathlib import Path
 import click
 import pytest
 
+from skinware import Namespace
 from skinware.cli._command import EXIT_FAILED, EXIT_USAGE, exit_status
-from tests.commands import refused
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin
+from tests.commands import refused, running
 
 COMMANDS = {e.name: e.module for e in entry_points(group="console_scripts") if e.name.startswith("skin-")}
 
@@ -95,6 +98,19 @@ def test_an_unknown_driver_or_namespace_is_a_failure(line: str, elsewhere: bool)
     done = refused(*line.split(), *(["--namespace", "nonesuch"] if elsewhere else []))
     assert done.returncode == EXIT_FAILED, done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_calm_names_the_driver_that_may_be_meant(namespace: Namespace) -> None:
+    with FakeSkin("torso"), running("skin-calm", "torzo") as calm:
+        wait_until(lambda: "There are" in calm.errors)
+        assert (
+            f"waiting for driver 'torzo' in '{namespace.name}'; did you mean 'torso'? There are: torso" in calm.errors
+        )
+
+
+def test_calmed_drivers_of_another_namespace_have_a_place_of_their_own() -> None:
+    assert Namespace("default").calm_name == "calm"
+    assert Namespace("lab").calm_name == "lab-calm"
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))

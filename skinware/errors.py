@@ -118,7 +118,7 @@ class BusError(SkinwareError):
 
 
 class BusNotAvailable(BusError):
-    """The bus does not exist, is down, or may not be opened. Commands exit with 3.
+    """The bus does not exist, is down, or may not be opened. Commands exit with 1.
 
     Attributes:
         is_down: the interface is there, but down; otherwise it is not there (or not for us).

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import Never
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import frozen, group
 from skinware.errors import StructureError
+
+ModuleKey = tuple[str, str, str]
+"""Names of a driver, of its patch, and of a module in there: empty for an unnamed module that is alone in its patch."""
+Key = TypeVar("Key", bound=ModuleKey | str)
 
 _KIND = re.compile(r"([1-9]\d*)x([1-9]\d*)")
 _MOST_NAMES = 20
@@ -29,39 +33,76 @@ def filled_by(kind: str, count: int) -> tuple[int, int] | None:
     return shape if shape is not None and shape[0] * shape[1] == count else None
 
 
-class Matrices(dict[str, npt.NDArray[np.int64]]):
-    """Where the sensors of a type are in each module that is a matrix of them, by the module's name.
+class _NotHere(StructureError, KeyError):
+    """A matrix that is missing: a KeyError for ``get`` and ``in``."""
+
+    __str__ = StructureError.__str__
+
+
+class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
+    """Where the sensors of a type are in each module that is a matrix of them, by the module's key.
 
     Values are (rows, columns) int64, read-only: positions among the sensors of the type. So they are indices for all
-    arrays of that type. A name that is not here raises a StructureError, which says why.
+    arrays of that type. A key that is not here raises a StructureError, which says why.
 
     Args:
         type_name: of the sensors.
-        names: of all modules.
+        keys: of all modules.
         kinds: likewise.
         module_of: (n,) the module of each sensor; in a matrix, they are row by row.
+        names: of all modules; a name that only one of them has is as good as its key.
     """
 
     def __init__(
-        self, type_name: str, names: Sequence[str], kinds: Sequence[str], module_of: npt.NDArray[np.int64]
+        self,
+        type_name: str,
+        keys: Sequence[Key],
+        kinds: Sequence[str],
+        module_of: npt.NDArray[np.int64],
+        names: Sequence[str] = (),
     ) -> None:
-        super().__init__()
-        self._type_name, self._kind_of = type_name, dict(zip(names, kinds, strict=True))
+        self._type_name, self._kind_of = type_name, dict(zip(keys, kinds, strict=True))
+        self._keys_of: dict[str, list[Key]] = {}
+        for name, key in zip(names, keys, strict=bool(names)):
+            self._keys_of.setdefault(name, []).append(key)
+        self._matrices: dict[Key, npt.NDArray[np.int64]] = {}
         positions = np.arange(len(module_of))
-        for name, kind, index in zip(names, kinds, group(module_of.astype(np.uint32), len(names)), strict=True):
+        for key, kind, index in zip(keys, kinds, group(module_of.astype(np.uint32), len(keys)), strict=True):
             shape = filled_by(kind, len(positions[index]))
             if shape is not None:
-                self[name] = frozen(positions[index].reshape(shape))
+                self._matrices[key] = frozen(positions[index].reshape(shape))
 
-    def __missing__(self, name: str) -> Never:
-        if name not in self._kind_of:
-            more = f" ... ({len(self)} in all)" if len(self) > _MOST_NAMES else ""
-            there_are = ", ".join(map(repr, list(self)[:_MOST_NAMES])) or "none"
-            raise StructureError(f"no module {name!r} here; matrices of {self._type_name}: {there_are}{more}")
-        kind = self._kind_of[name]
+    def __getitem__(self, key: Key | str) -> npt.NDArray[np.int64]:
+        """(rows, columns) int64 of a module.
+
+        Raises:
+            StructureError: no such module, several of that name, or it is no matrix of these sensors.
+        """
+        known = [key] if key in self._kind_of else self._keys_of.get(str(key), [])
+        if len(known) != 1:
+            raise _NotHere(self._which(key, known))
+        (one,) = known
+        if one not in self._matrices:
+            raise _NotHere(self._why_no_matrix(key, self._kind_of[one]))
+        return self._matrices[one]
+
+    def __iter__(self) -> Iterator[Key]:
+        return iter(self._matrices)
+
+    def __len__(self) -> int:
+        return len(self._matrices)
+
+    def _which(self, key: Key | str, known: Sequence[Key]) -> str:
+        if known:
+            return f"several drivers have a module {key!r}; say which: {', '.join(map(repr, known))}"
+        more = f" ... ({len(self)} in all)" if len(self) > _MOST_NAMES else ""
+        there_are = ", ".join(map(repr, list(self)[:_MOST_NAMES])) or "none"
+        return f"no module {key!r} here; matrices of {self._type_name}: {there_are}{more}"
+
+    def _why_no_matrix(self, key: Key | str, kind: str) -> str:
         if rows_and_columns(kind) is None:
-            raise StructureError(f"module {name!r} is no matrix but {kind!r}; its geometry tells where its sensors are")
-        raise StructureError(f"module {name!r} is {kind}, but does not have a {self._type_name} sensor at each place")
+            return f"module {key!r} is no matrix but {kind!r}; its geometry tells where its sensors are"
+        return f"module {key!r} is {kind}, but does not have a {self._type_name} sensor at each place"
 
 
-__all__ = ["Matrices", "filled_by", "rows_and_columns"]
+__all__ = ["Matrices", "ModuleKey", "filled_by", "rows_and_columns"]

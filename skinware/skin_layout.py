@@ -12,8 +12,14 @@ from skinware import _names
 from skinware._columns import texts
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
-from skinware.matrices import Matrices
+from skinware.matrices import Matrices, ModuleKey
 from skinware.structure import Index, Structure
+
+
+def _module_keys(driver: str, structure: Structure) -> list[ModuleKey]:
+    patches = structure.module_patch.tolist()
+    names = _names.names_in_patches(texts(structure.module_name), texts(structure.module_kind), patches)
+    return [(driver, structure.patch_names[patch], name) for patch, name in zip(patches, names, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,25 +141,29 @@ class SkinLayout:
         module = self.modules[self.module_of(type_name)[position]]
         return _names.joined(module, self.structures[driver].name_in_module(row))
 
-    def matrices(self, type_name: str) -> Matrices:
+    def matrices(self, type_name: str) -> Matrices[ModuleKey]:
         """Where the sensors of a type are in modules that are matrices: indices for arrays in the same order.
 
-        ``snapshot.physical("pressure")[layout.matrices("pressure")["index tip"]]`` is (rows, columns).
+        ``snapshot.physical("pressure")[layout.matrices("pressure")["inspire", "right hand", "index top"]]`` is
+        (rows, columns). The name that the module has in its driver, ``"right hand, index top"``, does as well while one
+        driver has it.
 
         Returns:
-            By names of modules, (rows, columns) int64.
+            By driver, patch and module, (rows, columns) int64. Drivers that join or leave do not change these keys.
 
         Raises:
             StructureError: no driver has such sensors.
         """
         module_of = self.module_of(type_name)
         if type_name not in self._matrices:
+            keys = [key for pair in zip(self.drivers, self.structures, strict=True) for key in _module_keys(*pair)]
             kinds = [kind for structure in self.structures for kind in texts(structure.module_kind)]
-            self._matrices[type_name] = Matrices(type_name, self.modules, kinds, module_of)
+            names = [name for structure in self.structures for name in structure.module_names]
+            self._matrices[type_name] = Matrices(type_name, keys, kinds, module_of, names)
         return self._matrices[type_name]
 
     @cached_property
-    def _matrices(self) -> dict[str, Matrices]:
+    def _matrices(self) -> dict[str, Matrices[ModuleKey]]:
         return {}
 
     def geometry(self, type_name: str) -> Geometry:

@@ -339,7 +339,7 @@ class Structure:
         """(n,) int64, index of the patch of each sensor of a type, likewise."""
         return self.module_patch[self.module_of(type_name)].astype(np.int64)
 
-    def matrices(self, type_name: str) -> Matrices:
+    def matrices(self, type_name: str) -> Matrices[str]:
         """Where the sensors of a type are in modules that are matrices: indices for arrays in the order of ``index``.
 
         Returns:
@@ -354,7 +354,7 @@ class Structure:
         return self._matrices[type_name]
 
     @cached_property
-    def _matrices(self) -> dict[str, Matrices]:
+    def _matrices(self) -> dict[str, Matrices[str]]:
         return {}
 
     def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:

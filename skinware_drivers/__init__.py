@@ -82,3 +82,8 @@ def __getattr__(name: str) -> Any:
             if name in vars(module):
                 return vars(module)[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """List the public names, too, although most are not imported yet: for completion."""
+    return sorted({*globals(), *__all__})

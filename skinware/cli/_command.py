@@ -22,9 +22,9 @@ import click
 
 from skinware.cli._output import patient_output
 from skinware.cli._terminal import Formatter, echo
-from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
+from skinware.errors import BadRecording, ConfigurationError, SkinwareError
 
-EXIT_DONE, EXIT_FAILED, EXIT_USAGE, EXIT_NO_BUS = 0, 1, 2, 3
+EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 CONTEXT_SETTINGS = {"help_option_names": ["-h", "--help"]}
 """For ``click.command(context_settings=...)``, so that ``-h`` helps everywhere."""
@@ -153,7 +153,7 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
 
 
 def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
-    """Run a command: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 bus not available.
+    """Run a command: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, files that it names included.
 
     Every expected error becomes one line on stderr. Output that nobody reads any more (``| head -1``) ends the command
     in silence. ``NO_COLOR`` in the environment takes the colours away.
@@ -180,14 +180,12 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
         return EXIT_DONE
     except SkinwareError as error:
         echo(f"{name}: {error}", err=True)
-        if isinstance(error, ConfigurationError):
-            return EXIT_USAGE
-        return EXIT_NO_BUS if isinstance(error, BusNotAvailable) else EXIT_FAILED
+        return EXIT_USAGE if isinstance(error, ConfigurationError | BadRecording) else EXIT_FAILED
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         echo(f"{name}: {where}{error.strerror or error}", err=True)
         _discard_output()
-        return EXIT_FAILED
+        return EXIT_USAGE if isinstance(error, FileNotFoundError) else EXIT_FAILED
 
 
 def _show(error: click.ClickException) -> None:

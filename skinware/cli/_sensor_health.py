@@ -25,8 +25,14 @@ _FAULT_COLOUR = "yellow"
 
 
 def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> None:
-    """Print it: see :func:`health`."""
+    """Print it: see :func:`health`.
+
+    Raises:
+        ServiceNotFound: no service reports the health of that driver.
+    """
     found = health(namespaces, driver)
+    if driver is not None and not (found["health"] or found["problems"]):
+        raise ServiceNotFound(f"no service reports the health of driver {driver!r}; start one: skin-calm {driver}")
     if as_json:
         print_json(found)
     else:

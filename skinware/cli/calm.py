@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from skinware.cli._command import (
     signals_end,
     verbose_option,
     version_option,
+    warn,
 )
 from skinware.cli._terminal import echo, print_json
 
@@ -37,7 +39,11 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("name")
-@click.option("--into", metavar="NAMESPACE", default="calm", show_default=True, help="Where the calmed driver is.")
+@click.option(
+    "--into",
+    metavar="NAMESPACE",
+    help="Where the calmed driver is.  [default: calm; of drivers in another namespace than 'default', NAMESPACE-calm]",
+)
 @click.option(
     "--config",
     metavar="FILE",
@@ -56,7 +62,7 @@ if TYPE_CHECKING:
     metavar="NAME",
     default="contacts",
     show_default=True,
-    help="Name of the service of its contacts, beside it; empty: none.",
+    help="Name of the service of its contacts, beside it; NAME-contacts, if that is taken; empty: none.",
 )
 @click.option(
     "--regions",
@@ -81,7 +87,7 @@ if TYPE_CHECKING:
 @verbose_option
 def command(
     name: str,
-    into: str,
+    into: str | None,
     config: Path | None,
     state_path: Path | None,
     contacts: str,
@@ -93,7 +99,7 @@ def command(
     as_json: bool,
     verbose: bool,
 ) -> None:
-    """Calm driver NAME: 0 = no touch, whatever drifts, under the same name in namespace calm.
+    """Calm driver NAME: 0 = no touch, whatever drifts, under the same name in another namespace.
 
     The first seconds it measures what untouched sensors read. It goes on when the driver restarts or changes; what it
     learned is kept for 10 minutes over a restart of its own. Programs may ask it to tare, hold and change settings.
@@ -114,7 +120,8 @@ def command(
     for service_name in filter(None, (contacts, motion, health)):
         check_name(service_name, "service")
     settings = ChainSettings.calm() if config is None else ChainSettings.read(config)
-    source, target = Namespace(namespace), Namespace(into)
+    source = Namespace(namespace)
+    target = Namespace(into or source.calm_name)
     service = CalmService(
         name,
         settings,
@@ -127,9 +134,12 @@ def command(
         health=health or None,
         on_ready=lambda: _tell_ready(service, as_json),
     )
-    if name not in source.services():
-        there_are = ", ".join(source.services()) or "none"
-        echo(f"skin-calm: waiting for driver {name!r} in {source.name!r}; there are: {there_are}", err=True)
+    services = source.services()
+    if name not in services:
+        nearest = difflib.get_close_matches(name, services, n=1)
+        hint = f"; did you mean {nearest[0]!r}?" if nearest else "."
+        there_are = ", ".join(services) or "none"
+        warn(f"waiting for driver {name!r} in {source.name!r}{hint} There are: {there_are}")
     with signals_end(service.stop):
         service.run((lambda: _tell_status(service)) if as_json else lambda: None)
     if as_json:
@@ -168,7 +178,7 @@ def _services_beside(service: CalmService) -> dict[str, str]:
     """Names of the services of contacts, motion and health; empty: there is none."""
     contacts, health = service.contacts, service.health
     return {
-        "contacts": contacts.name if contacts is not None and contacts.type_name else "",
+        "contacts": contacts.name if contacts is not None else "",
         "motion": contacts.motion_name if contacts is not None else "",
         "health": health.name if health is not None else "",
     }

@@ -90,7 +90,7 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
 
         if sensors or watch:
             raise click.UsageError("--health stands alone: without --sensors and --watch")
-        show([place] if namespace else [place, Namespace("calm")], name, as_json)
+        show([place] if namespace else [place, Namespace(place.calm_name)], name, as_json)
     elif sensors:
         if name is None:
             raise click.UsageError("--sensors lists one driver: give its NAME")

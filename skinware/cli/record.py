@@ -129,6 +129,8 @@ def command(
     if last_s is not None and (split_size or max_size):
         raise click.UsageError("--last keeps the past in memory: --split and --max-size are for files")
     for name in names:
+        if name.endswith(".mcap"):
+            raise click.UsageError(f"{name} is a file, and NAME a driver or service: give -o {name}")
         check_name(name, "service")
     place = Namespace(namespace)
     path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))

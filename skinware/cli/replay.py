@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,8 +21,10 @@ from skinware.cli._command import (
     warn,
 )
 from skinware.cli._terminal import echo, print_json
+from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
 if TYPE_CHECKING:
+    from skinware.memory.namespace import Namespace
     from skinware.recording import Recording
     from skinware.recording.replaying import Replayer
 
@@ -70,7 +72,7 @@ def speed(text: str) -> float:
 @click.option(
     "--namespace",
     metavar="NAME",
-    help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{_NAMESPACE}']",
+    help=f"Namespace to publish in.  [default: $SKINWARE_NAMESPACE, else '{_NAMESPACE}', if nothing runs there]",
 )
 @json_option
 @version_option
@@ -101,6 +103,8 @@ def command(
     from skinware.recording.replaying import Replayer
 
     place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or _NAMESPACE)
+    if not namespace:
+        _refuse_beside_others(place)
     with skinware.recording.open(file) as recording:
         replayer = Replayer(
             recording,
@@ -128,6 +132,26 @@ def command(
         for problem in recording.problems:
             warn(problem)
     _tell("stopped", replayer, as_json)
+
+
+def _refuse_beside_others(place: Namespace) -> None:
+    """Keep recorded frames away from living ones, unless the namespace was given on purpose.
+
+    Raises:
+        ConfigurationError: services run in the namespace that is the default.
+    """
+    from skinware.service import ServiceReader
+
+    living = []
+    for name in place.services():
+        with contextlib.suppress(BadServiceFile, ServiceNotFound):
+            with ServiceReader[Any](name, namespace=place, announce=False) as reader:
+                living += [name] if reader.alive else []
+    if living:
+        raise ConfigurationError(
+            f"{', '.join(living)} run in namespace {place.name!r}: give another one with --namespace, or"
+            f" --namespace {place.name} to publish beside them"
+        )
 
 
 def _ready(recording: Recording, names: tuple[str, ...], namespace: str, as_json: bool) -> None:

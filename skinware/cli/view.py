@@ -78,9 +78,7 @@ def token_text(text: str) -> str:
     "--calm",
     "calm_name",
     metavar="NAMESPACE",
-    default="calm",
-    show_default=True,
-    help="Where calmed drivers and their contacts are, if anywhere.",
+    help="Where calmed drivers and their contacts are, if anywhere.  [default: where skin-calm publishes them]",
 )
 @click.option(
     "--links",
@@ -97,7 +95,7 @@ def command(
     port: int | None,
     host: str,
     token: str | None,
-    calm_name: str,
+    calm_name: str | None,
     links: Path | None,
     no_browser: bool,
     namespace: str | None,
@@ -119,6 +117,7 @@ def command(
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
+    calm_name = calm_name or place.calm_name
     calm = None if place.name == calm_name else Namespace(calm_name)
     if token is None and not is_loopback(host):
         token = secrets.token_urlsafe(16)

@@ -143,6 +143,11 @@ class Namespace:
                 f" {_user_name(self.path.stat().st_uid)} to add you to its group"
             ) from None
 
+    @property
+    def calm_name(self) -> str:
+        """Name of the namespace in which ``skin-calm`` publishes the drivers of this one, unless another is given."""
+        return "calm" if self.name == "default" else f"{self.name}-calm"
+
     def ring_path(self, service: str) -> Path:
         """The file that readers of a service map."""
         return self.path / f"{service}.ring"

@@ -128,7 +128,7 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
         descriptor.close()
         raise NameInUse(
             f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
-            " stop it (skin-info shows its pid), or choose another name (--name) or namespace (SKINWARE_NAMESPACE)"
+            " stop it (skin-info shows its pid), or choose another name or namespace (SKINWARE_NAMESPACE)"
         )
     try:
         _remove_leftovers(namespace, name)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +21,8 @@ from skinware.tactile.regions import Regions
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
+Writer = TypeVar("Writer")
+
 _FIRST_CHOICE = "pressure"
 
 
@@ -33,6 +37,24 @@ class WatchedRegions:
 
     regions: Regions
     name: str = NAME
+
+
+def named_beside(driver: str, name: str, make: Callable[[str], Writer]) -> Writer:
+    """Make a service beside a calmed driver; if another program has the name, with the driver's name before it.
+
+    Args:
+        driver: name of the driver.
+        name: of the service.
+        make: makes it, under the name that it is given.
+
+    Raises:
+        NameInUse: another program has both names.
+        ConfigurationError: the longer name is too long.
+    """
+    try:
+        return make(name)
+    except NameInUse:
+        return make(f"{driver}-{name}")
 
 
 class CalmContacts:
@@ -59,13 +81,19 @@ class CalmContacts:
         group: str | None = None,
         watched: WatchedRegions | None = None,
     ) -> None:
-        self.name, self.type_name, self.count = name, "", 0
+        self.type_name, self.count = "", 0
+        self._name = name
         self._watched = watched
         self._driver, self._into, self._group = driver, into, group
         self._chain: Chain | None = None
         self._stage: BaselineStage | None = None
         self._writer: ContactsWriter | None = None
         self._motion: MotionWriter | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the service; empty: there is none."""
+        return "" if self._writer is None else self._writer.name
 
     @property
     def motion_name(self) -> str:
@@ -134,14 +162,18 @@ class CalmContacts:
         self.type_name, self.count = "", 0
 
     def _made(self, structure: Structure, type_name: str, rate_hz: float | None) -> ContactsWriter:
-        return ContactsWriter(
-            structure,
-            type_name,
-            driver=self._driver,
-            name=self.name,
-            namespace=self._into,
-            rate_hz=rate_hz,
-            group=self._group,
+        return named_beside(
+            self._driver,
+            self._name,
+            lambda name: ContactsWriter(
+                structure,
+                type_name,
+                driver=self._driver,
+                name=name,
+                namespace=self._into,
+                rate_hz=rate_hz,
+                group=self._group,
+            ),
         )
 
     def _follow_regions(self, structure: Structure, rate_hz: float | None) -> None:
@@ -152,16 +184,21 @@ class CalmContacts:
         if self._watched is None or self._writer is None:
             return
         try:
-            self._motion = MotionWriter(
-                structure,
-                self.type_name,
-                self._watched.regions,
-                self._writer.frames,
-                driver=self._driver,
-                name=self._watched.name,
-                namespace=self._into,
-                rate_hz=rate_hz,
-                group=self._group,
+            frames, regions = self._writer.frames, self._watched.regions
+            self._motion = named_beside(
+                self._driver,
+                self._watched.name,
+                lambda name: MotionWriter(
+                    structure,
+                    self.type_name,
+                    regions,
+                    frames,
+                    driver=self._driver,
+                    name=name,
+                    namespace=self._into,
+                    rate_hz=rate_hz,
+                    group=self._group,
+                ),
             )
         except (ConfigurationError, NameInUse) as error:  # no region of such sensors; another program's motion
             log.warning("no motion of %r: %s", self._driver, str(error))

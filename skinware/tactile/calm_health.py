@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import NameInUse
+from skinware.errors import ConfigurationError, NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
+from skinware.tactile.calm_contacts import named_beside
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.chain_health import ChainHealth
 from skinware.tactile.health_service import RATE_HZ, HealthWriter
@@ -46,7 +47,7 @@ class CalmHealth:
     @property
     def name(self) -> str:
         """Name of the service; empty: there are no such sensors, or another program has the name."""
-        return "" if self._writer is None else self._name
+        return "" if self._writer is None else self._writer.name
 
     def follow(self, chain: Chain) -> None:
         """Go on with another chain, of other sensors: of which nothing is known yet, unless it is restored.
@@ -62,10 +63,14 @@ class CalmHealth:
             elif self._writer is not None:
                 self._writer.restructure(chain.structure)
             elif self._name:
-                self._writer = HealthWriter(
-                    chain.structure, self._driver, name=self._name, namespace=self._into, group=self._group
+                self._writer = named_beside(
+                    self._driver,
+                    self._name,
+                    lambda name: HealthWriter(
+                        chain.structure, self._driver, name=name, namespace=self._into, group=self._group
+                    ),
                 )
-        except NameInUse as error:
+        except (ConfigurationError, NameInUse) as error:
             self._give_up(error)
 
     def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:

@@ -137,6 +137,11 @@ class HealthWriter:
             description=f"health of the sensors of {driver}",
         )
 
+    @property
+    def name(self) -> str:
+        """Name of the service."""
+        return self._service.name
+
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
         """Publish what is known now.
 

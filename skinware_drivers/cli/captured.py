@@ -11,7 +11,7 @@ import click
 from click.core import ParameterSource
 
 from skinware.cli._terminal import echo, print_json, style
-from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.errors import ConfigurationError
 from skinware_drivers.cli.hardware_options import value_of
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_j
 
     Raises:
         BadRecording: it is no recording.
-        ConfigurationError: it has no wire, or those of several drivers; or the arguments are wrong.
-        BusNotAvailable: it cannot be read.
+        ConfigurationError: it cannot be read, has no wire, or those of several drivers; or the arguments are wrong.
         DriverError: the driver failed.
     """
     from skinware_drivers.proving import updates
@@ -46,7 +45,7 @@ def compare_capture(capture: Path, arguments: Sequence[str], *, save: bool, as_j
             updates.save(now, expected_of(capture))
         compared, now = check_capture(capture, driver, options)
     except OSError as error:
-        raise BusNotAvailable(f"{error.filename or capture}: {error.strerror}") from None
+        raise ConfigurationError(f"{error.filename or capture}: {error.strerror}") from None
     if not compared.then:
         raise ConfigurationError(
             f"{capture}: nothing was decoded then, {compared.now} updates are now; if they are right: --save"

@@ -84,7 +84,7 @@ def command(
 
     Values are JSON (hz=50, on=false) or plain text. patch=NAME selects one patch.
 
-    Exit status: 0 done, 1 failed or declined, 2 wrong usage or a bus in use, 3 bus not available.
+    Exit status: 0 done, 1 failed or declined, 2 wrong usage or configuration.
     """
     from skinware.memory.namespace import Namespace
 

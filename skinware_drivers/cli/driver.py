@@ -200,7 +200,7 @@ def command(
     So is the geometry file.
     Closing the terminal also sends SIGHUP; the driver then ends.
 
-    Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
+    Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
     from skinware.geometry import read_geometry
     from skinware.memory.namespace import Namespace

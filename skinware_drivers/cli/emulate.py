@@ -85,7 +85,7 @@ def command(
 ) -> None:
     """Emulate skin patches on a bus, with faults on request, until interrupted.
 
-    Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration, 3 no bus available.
+    Exit status: 0 done or interrupted, 1 failed, 2 wrong usage or configuration.
     """
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus

@@ -65,7 +65,7 @@ def command(
     With BUS, such as can0 or /dev/ttyUSB0: only that. --probe sends no discovery where boards are sending, because this
     would silence some of them; --force does.
 
-    Exit status: 0 done, 1 failed, 2 wrong usage, 3 a BUS is not available.
+    Exit status: 0 done, 1 failed, or a BUS is not available, 2 wrong usage.
     """
     if force and not probe:
         raise click.UsageError("--force is about --probe: give both")

@@ -33,7 +33,6 @@ from skinware_drivers.doctor.evidence import DriverSeen, HealthSeen, TaxelFault,
 from skinware_drivers.doctor.judging import TaxelJudge
 
 _LOOK_EVERY_S = 0.02
-_CALM = "calm"
 _POLICIES = {os.SCHED_FIFO: "SCHED_FIFO", os.SCHED_RR: "SCHED_RR"}
 
 
@@ -183,7 +182,7 @@ def _by_calm(reader: DriverReader, life: str) -> HealthSeen | None:
     if life == "dead":
         return None
     with contextlib.suppress(NamespaceError):
-        found = health([reader.namespace, Namespace(_CALM)], reader.name)
+        found = health([reader.namespace, Namespace(reader.namespace.calm_name)], reader.name)
         for entry in found["health"]:
             if entry["state"] == "live" and entry["sensors"] == reader.structure.n_sensors:
                 return _calm_health(entry)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import msgspec
 
-from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.errors import ConfigurationError
 from skinware_drivers.bus import Bus
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.options import options_from_strings
@@ -132,10 +132,10 @@ def replayed_bus(
         note: is told of all that is given; see :class:`.recorded_wire.RecordedWire`.
 
     Raises:
-        ConfigurationError: an option is unknown or has a bad value, or nothing, or more than one bus, is meant.
+        ConfigurationError: an option is unknown or has a bad value, the file cannot be read, or nothing, or more than
+            one bus, is meant.
         BadRecording: the file is no recording.
         MissingExtra: recordings need packages that are not installed.
-        BusNotAvailable: it cannot be read.
     """
     wanted = options_from_strings(ReplayOptions, options or {})
     recording = _open(channel)
@@ -162,7 +162,7 @@ def recorded_driver(bus_name: str) -> Recorded:
         bus_name: ``replay:FILE?key=value``.
 
     Raises:
-        ConfigurationError, BadRecording, MissingExtra, BusNotAvailable: as for :func:`replayed_bus`.
+        ConfigurationError, BadRecording, MissingExtra: as for :func:`replayed_bus`.
     """
     _, channel, options = parse_bus_name(bus_name)
     wanted = options_from_strings(ReplayOptions, options)
@@ -179,7 +179,7 @@ def _open(path: str) -> Recording:
     try:
         return skinware.recording.open(path)
     except OSError as error:
-        raise BusNotAvailable(f"{path}: {error.strerror}") from None
+        raise ConfigurationError(f"{path}: {error.strerror}") from None
 
 
 def medium_of(recording: Recording, wire: WireTrack) -> str:

@@ -260,13 +260,13 @@ def test_real_fingertip_data_reaches_a_reader_unchanged(vcan: Callable[[], str])
         emulator.close()
 
 
-def test_an_interface_that_is_down_is_exit_code_3(vcan: Callable[[], str]) -> None:
+def test_an_interface_that_is_down_is_a_failure(vcan: Callable[[], str]) -> None:
     bus = vcan()
     ip("link", "set", bus, "down")
     result = run("skin-driver", "--bus", bus)
-    assert result.returncode == 3
+    assert result.returncode == 1
     assert f"ip link set {bus} up" in result.stderr
-    assert run("skin-driver", "--bus", "vcan99").returncode == 3
+    assert run("skin-driver", "--bus", "vcan99").returncode == 1
 
 
 def test_python_cans_own_socketcan_users_hear_us(vcan: Callable[[], str]) -> None:

@@ -33,7 +33,7 @@ def command_that(raises: BaseException | None = None) -> click.Command:
         (BusSendError("no such skin"), 1),
         (ConfigurationError("no such skin"), 2),
         (click.UsageError("no such skin"), 2),
-        (BusNotAvailable("no such skin"), 3),
+        (BusNotAvailable("no such skin"), 1),
         (OSError(errno.ENOSPC, "no such skin"), 1),
         (BrokenPipeError(errno.EPIPE, "nobody reads"), 0),
     ],

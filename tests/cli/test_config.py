@@ -117,7 +117,7 @@ def test_the_drivers_namespace_does_not_hide_it(capsys: pytest.CaptureFixture[st
     with driving(emulated(boards=(7,))):
         data = configured_data(capsys, "bus0", "versions", "--namespace", "elsewhere")
         assert data["driver"]["namespace"] == namespace.name
-        text = configured(capsys, "roboskin", "versions", "--namespace", "elsewhere", status=3)
+        text = configured(capsys, "roboskin", "versions", "--namespace", "elsewhere", status=1)
         assert "no driver 'roboskin' runs in namespace 'elsewhere'" in text
 
 
@@ -151,7 +151,7 @@ def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
         ([VIRTUAL, "versions", "-o", "boards"], 2, "KEY=VALUE"),
         ([VIRTUAL, "versions", "-o", "board=7"], 2, "did you mean 'boards'"),
         (["virtual?boards=7&streaming=yes", "rebaseline", "--yes"], 2, "another program may be using the bus"),
-        (["torso", "versions"], 3, "no driver 'torso' runs in namespace"),
+        (["torso", "versions"], 1, "no driver 'torso' runs in namespace"),
         ([VIRTUAL, "versions", "--config", "/no/such.toml"], 2, "/no/such.toml"),
     ],
 )

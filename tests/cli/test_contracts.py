@@ -139,7 +139,7 @@ def test_mistakes_get_one_clear_line_and_the_right_exit_code(arguments: list[str
     assert words in result.stderr
 
 
-@pytest.mark.parametrize(("arguments", "code", "words"), [(["--bus", "no-such-can0"], 3, "CAN"), ([], 2, "which bus?")])
+@pytest.mark.parametrize(("arguments", "code", "words"), [(["--bus", "no-such-can0"], 1, "CAN"), ([], 2, "which bus?")])
 def test_the_exit_code_is_that_of_the_process(arguments: list[str], code: int, words: str) -> None:
     result = run("skin-driver", *arguments)
     assert result.returncode == code, result.stderr

@@ -48,9 +48,19 @@ def test_others_see_what_was_recorded(file: Path, namespace: Namespace) -> None:
 
 def test_a_name_in_use_is_one_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("torso"):
-        assert exit_status(replay, [str(file)]) == 1
+        assert exit_status(replay, [str(file), "--namespace", Namespace().name]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("skin-replay: a running driver or service is called 'torso'")
+
+
+def test_it_does_not_publish_beside_living_drivers_unless_it_is_asked_to(
+    file: Path, namespace: Namespace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with FakeSkin("arm"):
+        assert exit_status(replay, [str(file)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"arm run in namespace '{namespace.name}': give another one with --namespace" in line
+        assert exit_status(replay, [str(file), "--namespace", namespace.name, "--end", "0.1"]) == 0
 
 
 def test_it_waits_for_programs_and_stays_at_its_end(file: Path, namespace: Namespace) -> None:
@@ -96,8 +106,8 @@ def test_without_a_namespace_it_stays_away_from_the_robot(
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["nothing.mcap"], 1, "nothing.mcap: No such file or directory"),
-        (["text.mcap"], 1, "text.mcap: not a recording (not an MCAP file)"),
+        (["nothing.mcap"], 2, "nothing.mcap: No such file or directory"),
+        (["text.mcap"], 2, "text.mcap: not a recording (not an MCAP file)"),
         (["walk.mcap", "arm"], 2, "no service 'arm' in walk.mcap; there are: torso"),
         (["walk.mcap", "--speed", "0"], 2, "a speed is above 0"),
         (["walk.mcap", "--namespace", "a b"], 2, "namespace name 'a b'"),

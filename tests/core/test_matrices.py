@@ -73,7 +73,39 @@ def test_many_matrices_are_not_all_listed() -> None:
 def test_matrices_of_two_hands_have_the_names_and_places_of_the_whole_skin(structure: Structure) -> None:
     layout = SkinLayout(("left", "right"), (structure, hand(TIP)))
     matrices = layout.matrices("pressure")
-    assert list(matrices) == ["hand of left, tip", "hand of left, pad", "hand of left, back", "hand of right, tip"]
-    assert (layout.driver_of("pressure")[matrices["hand of right, tip"]] == 1).all()
-    assert layout.uids("pressure")[matrices["hand of right, tip"]].tolist() == [[0, 1, 2], [3, 4, 5]]
+    assert list(matrices) == [
+        ("left", "hand", "tip"),
+        ("left", "hand", "pad"),
+        ("left", "hand", "back"),
+        ("right", "hand", "tip"),
+    ]
+    right = matrices["right", "hand", "tip"]
+    assert (layout.driver_of("pressure")[right] == 1).all()
+    assert layout.uids("pressure")[right].tolist() == [[0, 1, 2], [3, 4, 5]]
     assert layout.matrices("pressure") is matrices
+
+
+def test_another_driver_changes_no_key_and_no_name_that_it_does_not_have(structure: Structure) -> None:
+    alone = SkinLayout(("left",), (structure,)).matrices("pressure")
+    both = SkinLayout(("left", "right"), (structure, hand(TIP))).matrices("pressure")
+    assert list(alone) == list(both)[:3]
+    for matrices in (alone, both):
+        assert matrices["hand, pad"] is matrices["left", "hand", "pad"]
+        with pytest.raises(StructureError, match="no module 'hand, toe' here"):
+            matrices["hand, toe"]
+    assert ("left", "hand", "tip") in both
+    assert ("left", "hand", "toe") not in both
+    assert alone["hand, tip"] is alone["left", "hand", "tip"]
+    which = r"\('left', 'hand', 'tip'\), \('right', 'hand', 'tip'\)"
+    with pytest.raises(StructureError, match=rf"several drivers have a module 'hand, tip'; say which: {which}$"):
+        both["hand, tip"]
+
+
+def test_a_module_that_is_the_whole_patch_has_no_name_in_its_key() -> None:
+    matrices = SkinLayout(("pad",), (hand(Module(taxels(6), 0, "2x3")),)).matrices("pressure")
+    assert list(matrices) == [("pad", "hand", "")]
+    assert matrices["hand"].shape == (2, 3)
+    with pytest.raises(
+        StructureError, match=r"no module \('pad', 'foot', ''\) here; matrices of pressure: \('pad', 'hand', ''\)$"
+    ):
+        matrices["pad", "foot", ""]

@@ -13,7 +13,7 @@ import pytest
 
 import skinware.recording
 from skinware import DriverReader
-from skinware.errors import BadRecording, BusNotAvailable, ConfigurationError
+from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording import Series, WireItem
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus, FrameBatch
@@ -333,7 +333,7 @@ def test_what_is_not_clear_is_refused(tmp_path: Path, options: str, words: str) 
 
 
 def test_files_that_cannot_be_replayed(tmp_path: Path) -> None:
-    with pytest.raises(BusNotAvailable, match="No such file"):
+    with pytest.raises(ConfigurationError, match="No such file"):
         make_bus(f"replay:{tmp_path}/nothing.mcap")
     (tmp_path / "text").write_text("text")
     with pytest.raises(BadRecording, match="not a recording"):

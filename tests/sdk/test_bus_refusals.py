@@ -1,4 +1,4 @@
-"""A bus that cannot be used is told in one clear line with exit code 3, whatever the reason."""
+"""A bus that cannot be used is told in one clear line with exit code 1, whatever the reason."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ def test_a_can_interface_that_cannot_be_opened(
 ) -> None:
     assert interface_flags == [IFF_UP]
     monkeypatch.setattr(CanSocket, attribute, number)
-    assert exit_status(command, ["--bus", "can0"]) == 3
+    assert exit_status(command, ["--bus", "can0"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"skin-driver: {words}")
 
 
 def test_a_can_interface_that_is_down(interface_flags: list[int], capsys: pytest.CaptureFixture[str]) -> None:
     interface_flags[0] = 0
-    assert exit_status(command, ["--bus", "can0"]) == 3
+    assert exit_status(command, ["--bus", "can0"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "skin-driver: bus can0 is down; bring it up: ip link set can0 up"
 
@@ -118,7 +118,7 @@ def test_error_frames_are_asked_for(interface_flags: list[int], monkeypatch: pyt
 
 
 def test_a_port_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(command, ["--bus", "slcan:/dev/no-such-port"]) == 3
+    assert exit_status(command, ["--bus", "slcan:/dev/no-such-port"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("skin-driver: bus slcan:/dev/no-such-port cannot be opened: ")
 

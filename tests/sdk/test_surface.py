@@ -23,6 +23,12 @@ def test_every_name_that_is_listed_is_there(place: str) -> None:
         assert getattr(module, name) is not None
 
 
+@pytest.mark.parametrize("place", [*PLACES, "skinware", "skinware.aio", "skinware.recording", "skinware.tactile"])
+def test_completion_offers_every_name_before_it_is_imported(place: str) -> None:
+    code = f"import {place} as place; assert set(place.__all__) <= set(dir(place)), dir(place)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
 def test_type_checkers_are_told_of_the_names_that_are_there() -> None:
     tree = ast.parse(Path(skinware_drivers.__file__).read_text())
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]

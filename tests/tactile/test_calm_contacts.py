@@ -89,6 +89,28 @@ def test_contacts_stand_beside_the_calmed_driver(into: Namespace) -> None:
         assert frame.contacts.id.tolist() == [first.id]
 
 
+def test_a_second_calmed_driver_has_contacts_and_health_too(into: Namespace) -> None:
+    left, right = FakeSkin("left", placed_structure()), FakeSkin("right", placed_structure())
+    press(left)
+    press(right)
+    with ExitStack() as running:
+        for skin in (left, right):
+            running.enter_context(publishing(skin))
+        first = running.enter_context(calming(into, "left"))
+        second = running.enter_context(calming(into, "right"))
+        assert first.contacts is not None
+        assert first.health is not None
+        assert second.contacts is not None
+        assert second.health is not None
+        assert (first.contacts.name, first.health.name) == ("contacts", "health")
+        assert (second.contacts.name, second.health.name) == ("right-contacts", "right-health")
+        contacts = running.enter_context(ContactsReader("right-contacts", namespace=into, timeout_s=10))
+        assert contacts.source.driver == "right"
+        tare(into, "right")
+        press(right, 22)
+        assert read_until(contacts, lambda frame: len(frame.contacts) == 1).contacts[0].taxels.tolist() == [22]
+
+
 def test_what_says_nothing_now_touches_nothing(into: Namespace) -> None:
     skin = FakeSkin("fake", placed_structure())
     press(skin)
@@ -135,21 +157,28 @@ def test_contacts_follow_another_structure(into: Namespace) -> None:
             assert len(contacts.source.uid) == 20
 
 
-def test_two_calmed_drivers_need_two_names(into: Namespace, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_name_can_be_chosen_and_a_service_left_out(into: Namespace) -> None:
     structure = fake_structure(1, 2)
-    with publishing(FakeSkin("arm", structure)), publishing(FakeSkin("leg", structure)), calming(into, "arm"):
-        wait_until(lambda: "contacts" in into.services())
-        with caplog.at_level(logging.WARNING), calming(into, "leg") as second:
-            assert second.contacts is not None
-            assert second.contacts.type_name == ""
-            assert "no contacts of 'leg': " in caplog.text
-            with DriverReader("leg", namespace=into, timeout_s=10) as reader:
-                reader.read(timeout_s=10)
+    with publishing(FakeSkin("leg", structure)):
         with calming(into, "leg", contacts="leg_contacts"):
             with ContactsReader("leg_contacts", namespace=into, timeout_s=10) as contacts:
                 assert contacts.source.driver == "leg"
         with calming(into, "leg", contacts=None, health=None):
-            assert sorted(into.services()) == ["arm", "contacts", "health", "leg"]
+            assert into.services() == ["leg"]
+
+
+def test_contacts_whose_names_are_both_taken_cost_only_the_contacts(
+    into: Namespace, caplog: pytest.LogCaptureFixture
+) -> None:
+    structure = fake_structure(1, 2)
+    with ExitStack() as others:
+        for name in ("contacts", "leg-contacts"):
+            others.enter_context(FakeSkin(name, structure, into))
+        others.enter_context(publishing(FakeSkin("leg", structure)))
+        with caplog.at_level(logging.WARNING), calming(into, "leg") as service:
+            assert service.contacts is not None
+            assert service.contacts.name == ""
+            assert "no contacts of 'leg': " in caplog.text
 
 
 def test_a_driver_that_feels_no_pressure_has_no_contacts(into: Namespace) -> None:
@@ -176,5 +205,4 @@ def test_the_command_tells_of_its_contacts(into: Namespace, tmp_path: Path, monk
             assert sorted(into.services()) == ["fake", "health"]
         with ContactsWriter(skin.structure, namespace=into, name="mine"):
             with running("skin-calm", "fake", "--into", into.name, "--contacts", "mine") as command:
-                assert command.wait_for("ready")["contacts"] == ""
-                wait_until(lambda: "no contacts of 'fake'" in command.errors)
+                assert command.wait_for("ready")["contacts"] == "fake-mine"

@@ -162,7 +162,11 @@ def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace)
 def test_a_name_that_another_program_has_costs_only_the_service(
     into: Namespace, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with HealthWriter(fake_structure(), "other", namespace=into), calmed(into) as skin:
+    with (
+        HealthWriter(fake_structure(), "other", namespace=into),
+        HealthWriter(fake_structure(), "other", name="fake-health", namespace=into),
+        calmed(into) as skin,
+    ):
         assert "no health of 'fake': " in caplog.text
         assert skin.health.name == ""
         skin.go_on(SETTLED_NS)

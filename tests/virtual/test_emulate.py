@@ -355,7 +355,7 @@ def test_a_run_without_options_is_silent_and_ends_well(
         (("--bus", "host", "--boards", "x"), 2, "option boards=x"),
         (("--bus", "host", "--bords", "7"), 2, "--boards"),
         (("--bus", "nonsense"), 2, "no such bus"),
-        (("--bus", "down"), 3, "host: down"),
+        (("--bus", "down"), 1, "host: down"),
         (("--bus", "host", "--driver", "robskin"), 2, "did you mean 'roboskin'"),
         (("--bus", "host", "--driver=robskin"), 2, "did you mean 'roboskin'"),
         (("--bus", "host", "--log", "/nonexistent/x", "-T", "0"), 2, "cannot write the log"),

@@ -11,6 +11,8 @@ import numpy.typing as npt
 _PERIODS = 3
 _LEAST_NS = 200_000_000
 _WITHOUT_PERIOD_NS = 1_000_000_000
+_AHEAD_NS = 200_000_000
+"""How far ahead of the clock a stamp may be: clocks of two machines differ a little. Beyond it, no age is known."""
 LONGEST_PERIOD_S = 86_400.0
 """That anything may have: a day."""
 
@@ -41,6 +43,7 @@ def is_fresh(
         status: (..., n) bits of :class:`skinware.Status`.
         time_ns: (..., n) time of each sensor's data (that of its update group), 0: never seen.
         at_ns: the moment at which they are looked at, on the clock of ``time_ns``.
+            Stamps of more than 0.2 s later are not fresh.
         max_age_ns: the age beyond which nothing is fresh, or (n,) that of each sensor; see ``age_limit_ns``.
         alive: the driver lived when the frame was taken.
 
@@ -49,5 +52,6 @@ def is_fresh(
     """
     if not alive:
         return np.zeros(status.shape, bool)
-    fresh: npt.NDArray[np.bool_] = (status == 0) & (time_ns > 0) & (time_ns >= at_ns - max_age_ns)
+    is_recent = (time_ns >= at_ns - max_age_ns) & (time_ns <= at_ns + _AHEAD_NS)
+    fresh: npt.NDArray[np.bool_] = (status == 0) & (time_ns > 0) & is_recent
     return fresh

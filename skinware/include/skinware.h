@@ -1252,6 +1252,8 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
     return count;
 }
 
+#define SKINWARE__AHEAD_NS 200000000 /* how far ahead of the clock a stamp may be: clocks of two machines differ a little */
+
 static int64_t skinware__age_limit_ns(int64_t period_ns) {
     const int64_t most_ns = (int64_t)86400 * 1000000000; /* of a forged file */
     if (period_ns <= 0)
@@ -1284,7 +1286,8 @@ size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame
         const int64_t own_ns = own_period_ns != NULL && own < periods->count ? own_period_ns[own] : 0;
         const int64_t limit_ns = max_age_ns != 0 ? max_age_ns : skinware__age_limit_ns(own_ns > 0 ? own_ns : period_ns);
         const int64_t acquired_ns = own < times->count ? time_ns[own] : 0;
-        out[i] = !frame->stale && bits[positions[i]] == 0 && acquired_ns > 0 && acquired_ns >= now_ns - limit_ns;
+        out[i] = !frame->stale && bits[positions[i]] == 0 && acquired_ns > 0 && acquired_ns >= now_ns - limit_ns &&
+                 acquired_ns <= now_ns + SKINWARE__AHEAD_NS;
         fresh += out[i];
     }
     return fresh;

@@ -84,7 +84,8 @@ class Announcement:
         if self._descriptor is None or self._descriptor.fd < 0:
             return
         text = msgspec.json.encode(record)[: _SIZE - 9].ljust(_SIZE - 9)
-        os.pwrite(self._descriptor.fd, b"%08x " % zlib.crc32(text) + text, 0)
+        with contextlib.suppress(OSError):  # /dev/shm is full
+            os.pwrite(self._descriptor.fd, b"%08x " % zlib.crc32(text) + text, 0)
 
     def close(self) -> None:
         """Take the announcement back. Idempotent."""

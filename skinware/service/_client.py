@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import select
 import socket
@@ -22,7 +23,7 @@ from skinware.memory.locks import ForkGuard
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service._server import short_path
-from skinware.service.messages import CANCEL, ENCODING_ERRORS, MAX_PACKET, Answer, Ask, decode, receive
+from skinware.service.messages import CANCEL, ENCODING_ERRORS, MAX_PACKET, TO_ALL, Answer, Ask, decode, receive
 
 _ERRORS: dict[str, type[Exception]] = {
     "refused": RequestRefused,
@@ -126,6 +127,10 @@ class RequestClient(ForkGuard):
         except BlockingIOError:
             raise RequestTimeout(f"{self.name}: its writer has not taken the requests before this one") from None
         except OSError:
+            with contextlib.suppress(BlockingIOError):
+                if refusal := self._refusal(decode(receive(connection), Answer)):
+                    self._lose()
+                    raise refusal from None
             self._lose()
             raise PeerGone(f"{self.name}: its writer died or was closed") from None
         pending = self._pending[number] = PendingRequest(self, connection, number, operation)
@@ -146,6 +151,9 @@ class RequestClient(ForkGuard):
                 return
             if answer is None:
                 self._lose()
+                return
+            if refusal := self._refusal(answer):
+                self._lose(refusal)
                 return
             pending = self._pending.pop(answer.id, None)  # None: cancelled, or too late
             if pending is not None:
@@ -194,12 +202,21 @@ class RequestClient(ForkGuard):
         self._connection = connection
         return connection
 
-    def _lose(self) -> None:
+    def _refusal(self, answer: Answer | None) -> RequestRefused | None:
+        """Why the service takes nothing from this connection, if it says so."""
+        if answer is None or answer.id != TO_ALL:
+            return None
+        return RequestRefused(f"{self.name}: {answer.error}")
+
+    def _lose(self, why: RequestRefused | None = None) -> None:
         connection, self._connection = self._connection, None
         pending, self._pending = self._pending, {}
         if connection is not None:
             connection.close()
         for request in pending.values():
             request.deliver(
-                PeerGone(f"{self.name}: its writer died or was restarted; {request.operation!r} may not have been done")
+                why
+                or PeerGone(
+                    f"{self.name}: its writer died or was restarted; {request.operation!r} may not have been done"
+                )
             )

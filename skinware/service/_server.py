@@ -23,6 +23,7 @@ from skinware.service.messages import (
     ENCODING_ERRORS,
     MAX_PACKET,
     OPERATIONS,
+    TO_ALL,
     Answer,
     Ask,
     decode,
@@ -33,6 +34,8 @@ from skinware.service.messages import (
 _MAX_PEERS = 64
 _MAX_PEERS_OF_A_STRANGER = 16
 _MAX_OPEN_OF_A_PEER = 64
+_IDLE_NS = 10 * NS_PER_S
+"""A program that asks for nothing for so long makes room for another; its client connects again when it asks."""
 _MAX_BYTES_OF_A_STRANGER = 1 << 12
 _MAX_PARTS_OF_A_STRANGER = 128
 MOST_TURN_NS = 1_000_000
@@ -48,6 +51,7 @@ class _Peer:
     connection: socket.socket
     user: int
     is_stranger: bool
+    heard_ns: int
     open: dict[int, Request] = field(default_factory=dict)
 
 
@@ -233,19 +237,34 @@ class RequestServer(ForkGuard):
             return
         user = _user_of(connection)
         stranger = user != os.geteuid()
-        of_this_user = sum(peer.user == user for peer in self._peers.values())
-        if len(self._peers) >= _MAX_PEERS or (stranger and of_this_user >= _MAX_PEERS_OF_A_STRANGER):
+        connection.setblocking(False)
+        if full := self._is_full_for(user, stranger):
+            with contextlib.suppress(OSError):
+                connection.send(msgspec.json.encode(Answer(TO_ALL, error=full, why="refused")), socket.MSG_NOSIGNAL)
             connection.close()
             return
-        connection.setblocking(False)
-        self._peers[connection.fileno()] = _Peer(connection, user, stranger)
+        self._peers[connection.fileno()] = _Peer(connection, user, stranger, now_ns())
         self._epoll.register(connection, select.EPOLLIN)
+
+    def _is_full_for(self, user: int, stranger: bool) -> str:
+        """Why one more program cannot be connected; empty if it can, where the one that is idle longest makes room."""
+        others, most = list(self._peers.values()), _MAX_PEERS
+        if stranger and len(others) < most:
+            others, most = [peer for peer in others if peer.user == user], _MAX_PEERS_OF_A_STRANGER
+        if len(others) < most:
+            return ""
+        idle = [peer for peer in others if not peer.open and now_ns() - peer.heard_ns >= _IDLE_NS]
+        if not idle:
+            return f"{most} programs are connected to it, and each has asked for something lately"
+        self._drop(min(idle, key=lambda peer: peer.heard_ns))
+        return ""
 
     def _hear(self, peer: _Peer, turn: _Turn) -> Request | None:
         try:
             packet = receive(peer.connection)
         except BlockingIOError:
             return None
+        peer.heard_ns = now_ns()
         turn.bytes_left -= len(packet)
         ask = decode(packet, Ask)
         if ask is None:

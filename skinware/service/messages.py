@@ -18,6 +18,8 @@ OPERATIONS = "operations"
 """Operation of every service: the operations that it declares, by name, with a description each."""
 CANCEL = "cancel"
 """Not an operation: takes the request of the same id back."""
+TO_ALL = 0
+"""Id of an answer to every request of a connection: the service takes none from it."""
 
 
 MessageT = TypeVar("MessageT", bound=msgspec.Struct)
@@ -74,12 +76,14 @@ def receive(connection: socket.socket) -> bytes:
     Raises:
         BlockingIOError: there is none yet.
     """
-    try:
-        return connection.recv(MAX_PACKET)
-    except BlockingIOError:
-        raise
-    except OSError:
-        return b""
+    for _ in range(2):  # after an error, what the other end sent before it hung up still waits
+        try:
+            return connection.recv(MAX_PACKET)
+        except BlockingIOError:
+            raise
+        except OSError:
+            pass
+    return b""
 
 
 def decode(packet: bytes, message: type[MessageT]) -> MessageT | None:

@@ -23,6 +23,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
+_MOST_FAILURES = 50
+"""Calls of ``recv`` in a row that may fail before the interface counts as failed."""
 _SWITCHED, _PASSIVE = 0x01, 0x02
 """Flags of a CAN FD frame: bit rate switched, sender error passive."""
 _CLOSE_S = 0.8
@@ -218,8 +220,24 @@ class _Messages:
         os.close(self.fd)
 
     def _take_all(self) -> None:
+        """Take messages; one that the library cannot take costs itself, unless all that follow are like it.
+
+        Raises:
+            Exception: whatever the library raises when its interface has failed.
+        """
+        failures = 0
         while not self._closing.is_set():
-            message = self._bus.recv(_POLL_S)
+            try:
+                message = self._bus.recv(_POLL_S)
+            except OSError:
+                raise
+            except Exception:
+                failures += 1
+                if failures >= _MOST_FAILURES:
+                    raise
+                self._counters.refused += 1
+                continue
+            failures = 0
             if message is not None:
                 self._take(message)
 

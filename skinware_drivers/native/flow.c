@@ -81,6 +81,8 @@ static int64_t find_ready(struct flow *flow, struct source **ready)
         return flow->n_sources;
     }
     int64_t n = epoll_wait((int)flow->epoll_fd, events, MOST_EVENTS, 0);
+    if (n < 0)
+        n = 0; /* interrupted: the next turn asks again */
     for (int64_t i = 0; i < n; i++) {
         ready[i] = source_of(flow, events[i].data.fd);
         if (!ready[i])

@@ -43,6 +43,16 @@ def test_fresh_takes_status_age_and_life_together() -> None:
     assert not is_fresh(status, time_ns, at_ns=900, max_age_ns=100, alive=False).any()
 
 
+def test_a_stamp_in_the_future_is_not_fresh() -> None:
+    status = np.zeros(3, np.uint8)
+    time_ns = np.array([900, 900 + 200 * MS, 901 + 200 * MS], np.int64)
+    assert is_fresh(status, time_ns, at_ns=900, max_age_ns=100).tolist() == [True, True, False]
+    with DriverWriter("a", fake_structure(1, 2), rate_hz=10) as writer, DriverReader("a") as reader:
+        publish(writer, age_ns=-3600 * NS_PER_S)
+        assert not reader.read().fresh("pressure").any()
+        assert not reader.read().fresh("pressure", max_age_s=10).any()
+
+
 def test_a_frame_judges_by_the_rate_of_its_driver_or_as_it_is_told() -> None:
     with DriverWriter("a", fake_structure(1, 2), rate_hz=10) as writer, DriverReader("a") as reader:
         publish(writer)

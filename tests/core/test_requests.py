@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
 import threading
 from typing import Any
 
@@ -201,6 +203,31 @@ def test_closed_and_gone(namespace: Namespace) -> None:
     reader.close()
     with pytest.raises(Closed):
         reader.request()
+
+
+def idle_programs(count: int) -> list[socket.socket]:
+    """Connections that ask for nothing."""
+    held = []
+    for _ in range(count):
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        held.append(connection)
+        connection.connect(str(Namespace().socket_path("x")))
+    return held
+
+
+def test_a_full_service_says_so_and_idle_programs_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    with on_request(), contextlib.ExitStack() as open_connections:
+        with ServiceReader[Frame]("x") as reader:
+            reader.request()
+            for connection in idle_programs(63):
+                open_connections.callback(connection.close)
+                reader.request()  # the service has seen it
+            with ServiceReader[Frame]("x") as late:
+                with pytest.raises(RequestRefused, match="64 programs are connected"):
+                    late.request()
+                monkeypatch.setattr("skinware.service._server._IDLE_NS", 0)
+                assert late.request().sequence
+            assert reader.request().sequence
 
 
 def test_the_longest_names_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,11 +97,14 @@ def test_c_judges_as_python_does(tmp_path: Path, tmp_path_factory: pytest.TempPa
     source = tmp_path / "fresh.c"
     source.write_text(PROGRAM)
     program = compiled(source, "sanitized", tmp_path_factory)
-    with DriverWriter("groups", grouped(), rate_hz=100) as writer:
-        write(writer, [60_000, 1500, 0, 0])
+    slow = grouped().replace(group_period_ns=[0, 100 * NS_PER_S, 0, 100 * NS_PER_S])  # a program takes time to start
+    with DriverWriter("groups", slow, rate_hz=0.1) as writer:
+        write(writer, [60_000, 150_000, 0, 0])
         assert said(program) == "00010"
-        write(writer, [-60_000, 60_000, 0, 0])
+        write(writer, [0, 400_000, 0, 0])
         assert said(program) == "11101"
+        write(writer, [-3_600_000, 0, 0, 0])
+        assert said(program) == "00010"
 
 
 def test_a_recording_keeps_them(tmp_path: Path) -> None:

@@ -65,6 +65,33 @@ def test_an_adapter_that_is_unplugged_after_its_last_messages_is_noticed(
     bus.close()
 
 
+class Stumbling:
+    """An adapter whose library cannot take every second message."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def recv(self, _timeout: float) -> can.Message:
+        self.calls += 1
+        if self.calls % 2:
+            raise ValueError("invalid data length code: 51")
+        return can.Message(arbitration_id=0x473, data=bytes(8), is_extended_id=False)
+
+    def shutdown(self) -> None:
+        """Nothing is left to shut down."""
+
+
+def test_a_message_that_the_library_cannot_take_costs_itself_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", lambda **_: Stumbling())
+    bus = PythonCanBus("slcan", "/dev/ttyACM0")
+    bus.open()
+    received = 0
+    while received < 200:
+        received += bus.receive(FrameBatch(64), 0)
+    assert bus.counters.refused >= received
+    bus.close()
+
+
 @contextmanager
 def adapter_on_a_pty() -> Iterator[tuple[int, str]]:
     """The device's end, and the path of a port."""

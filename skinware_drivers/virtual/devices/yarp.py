@@ -25,7 +25,9 @@ class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fie
     """What it sends."""
 
     length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
-    version: Annotated[Literal[3, 4], Meta(description="of YARP: it decides how a list of doubles is marked")] = 4
+    yarp: Annotated[
+        Literal[3, 4], Meta(description="major version of its YARP, which decides how a list of doubles is marked")
+    ] = 4
     envelope: Annotated[bool, Meta(description="tell number and time of each message")] = True
     period_ms: Annotated[float, Meta(ge=1, description="time between two messages, ms")] = 20
 
@@ -50,7 +52,7 @@ class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
         """One vector, as YARP sends it in its binary carriers."""
         text = f"D {device.cycle} {_BOOT_TIME_S + device.sampled_ns / 1e9:.6f}\0".encode()
         command = struct.pack("<i", len(text)) + b"~\0\0\1" + text if self.options.envelope else b"\0\0\0\0~D\0\1"
-        head = struct.pack("<ii", _TAGS[self.options.version], len(values))
+        head = struct.pack("<ii", _TAGS[self.options.yarp], len(values))
         numbers = struct.pack(f"<{len(values)}d", *values)
         index = struct.pack("<3ii", len(command), len(head), len(numbers), 0)
         return [b"YA\n\0\0\0RP\3\1" + 8 * b"\xff" + index + command + head + numbers]

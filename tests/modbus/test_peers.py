@@ -191,7 +191,7 @@ def test_a_server_that_answers_late_never_shifts_values(way: str) -> None:
 
     with tcp_server(palm(act)) as name, driven(f"{name}?timeout_ms={1e3 * timeout_s}") as (driving, reader):
         right = np.arange(1000, 1000 + N)
-        wait_until(lambda: counted(driving)["refused"] > 0)
+        wait_until(lambda: counted(driving)["polls_late"] > 0)
         for _ in range(50):
             frame = read_until(reader, lambda frame: True)
             fresh = (frame.status & Status.NEVER_SEEN) == 0

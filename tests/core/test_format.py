@@ -17,7 +17,7 @@ from skinware.geometry import Geometry
 from skinware.memory import file_layout
 from skinware.sensor_types import CATALOGUE
 from skinware.structure import _COLUMNS, VALUE_DTYPES
-from tests.core.c_programs import structure
+from tests.core.test_update_groups import grouped
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "reference" / "shared-memory.md").read_text()
 
@@ -86,7 +86,7 @@ def test_the_parts_of_a_file_and_the_limits_are_as_documented() -> None:
 
 def test_a_real_driver_has_the_documented_tables_and_columns() -> None:
     static, columns, *_ = tables("Drivers")
-    made = structure()
+    made = grouped()
     places = Geometry.unknown(["pressure"] * made.n_sensors, made.sensor_uid)
     with DriverWriter("x", made.placed(places), bus_counters=["lost"], patch_counters=["cycles", "late"]):
         with ServiceReader[Any]("x") as reader:

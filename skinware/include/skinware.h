@@ -1282,7 +1282,8 @@ size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame
         if (positions[i] >= status->count || positions[i] >= owners->count || group[positions[i]] >= times->count)
             return 0;
     for (i = 0; i < count; i++) {
-        const uint32_t own = group[positions[i]];
+        /* Loaded once and checked below: the file's owner may change the table after the loop above. */
+        const uint32_t own = skinware__load_32((const unsigned char *)(group + positions[i]));
         const int64_t own_ns = own_period_ns != NULL && own < periods->count ? own_period_ns[own] : 0;
         const int64_t limit_ns = max_age_ns != 0 ? max_age_ns : skinware__age_limit_ns(own_ns > 0 ? own_ns : period_ns);
         const int64_t acquired_ns = own < times->count ? time_ns[own] : 0;

@@ -28,6 +28,9 @@ _ROWS_OF_TRIANGLES = 3**0.5 / 2
 """From row to row, where each is shifted by half a sensor."""
 _BETWEEN_ISLANDS = 0.15
 """Of the width of what is beside each other; at least some pitches."""
+_NOMINAL = "_nominal"
+"""Ends the name of a coordinate frame that each driver has for itself, such as ``hand_nominal``."""
+_SAME_PLACE_M = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +55,11 @@ class Placed:
 class Scene:
     """Places of all taxels.
 
-    What has places in one coordinate frame stays together. Frames with a pose are where it says; the first other one is
-    where its numbers say, and the rest of the frames, then drivers without places, come beside it, so that nothing is
-    drawn over something else.
+    Taxels with places in one coordinate frame are one body, also those of several drivers. But a driver is a body of
+    its own in a nominal frame, and where its taxels would lie on those of another driver. The first body of a frame
+    with a pose is where the pose says; the first other body is where its numbers say; all further bodies, by the names
+    of their drivers, then taxels without places, come beside it. So nothing is drawn over something else, and the order
+    in which drivers were started changes nothing.
 
     Args:
         drivers: structure and quantities of each driver, by name.
@@ -68,7 +73,8 @@ class Scene:
         self._right = -np.inf  # how far what is placed so far reaches
         self._low, self._high = 0.0, 0.0  # its y
         self._placed: dict[tuple[str, str], Placed] = {}
-        self._arrange_frames([s.geometry for s, _ in drivers.values() if s.geometry is not None])
+        self._pose_of: dict[tuple[str, str], Pose] = {}  # by driver and frame
+        self._arrange_bodies(_bodies({name: s.geometry for name, (s, _) in drivers.items() if s.geometry is not None}))
         flat = {
             name: [laid_out(structure, quantity.index[~quantity.geometry.known]) for quantity in quantities]
             for name, (structure, quantities) in drivers.items()
@@ -81,27 +87,26 @@ class Scene:
         """Where the taxels of a driver's quantity are."""
         return self._placed[driver, quantity]
 
-    def pose(self, frame: str) -> Pose:
-        """(4, 4): where a coordinate frame is; where its numbers say, if nobody knows it."""
-        return self._poses.get(frame, np.eye(4))
+    def pose(self, driver: str, frame: str) -> Pose:
+        """(4, 4): where a driver's coordinate frame is; the identity for a frame in which it has no taxels."""
+        return self._pose_of.get((driver, frame), np.eye(4))
 
-    def _arrange_frames(self, geometries: Sequence[Geometry]) -> None:
-        """Give a pose to each frame that has none."""
-        boxes: dict[str, tuple[Pose, Pose]] = {}
-        for geometry in geometries:
-            for frame in _frames(geometry):
-                at = geometry.position_m[geometry.known & (geometry.frame == frame)]
-                low, high = boxes.get(frame, (at[0], at[0]))
-                boxes[frame] = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
-        for frame in sorted(boxes, key=lambda frame: (frame not in self._poses, frame)):
-            corners = np.array(np.meshgrid(*zip(*boxes[frame], strict=True))).reshape(3, -1)
-            if frame not in self._poses:
-                self._poses[frame] = np.eye(4)
-                self._poses[frame][0, 3] = self._way_right(corners[0].min(), np.ptp(corners[0]))
-            pose = self._poses[frame]
+    def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
+        """Give a pose to each body."""
+        for body in sorted(bodies, key=lambda body: (not self._is_placed(body), body.drivers[0], body.frame)):
+            pose = self._poses.get(body.frame, np.eye(4)).copy()
+            corners = np.array(np.meshgrid(*zip(body.at.min(axis=0), body.at.max(axis=0), strict=True))).reshape(3, -1)
             at = pose[:3, :3] @ corners + pose[:3, 3:]
+            if not self._is_placed(body):
+                away = self._way_right(at[0].min(), np.ptp(at[0]))
+                pose[0, 3] += away
+                at[0] += away
+            self._pose_of |= {(driver, body.frame): pose for driver in body.drivers}
             self._right = max(self._right, at[0].max())
             self._low, self._high = min(self._low, at[1].min()), max(self._high, at[1].max())
+
+    def _is_placed(self, body: _Body) -> bool:
+        return body.is_first and body.frame in self._poses
 
     def _way_right(self, left: float, width: float) -> float:
         """How far something has to go so that it is on the right of all that is placed."""
@@ -127,7 +132,7 @@ class Scene:
             geometry = quantity.geometry
             position, normal = geometry.position_m.copy(), geometry.normal.copy()
             for frame in _frames(geometry):
-                rows, pose = geometry.known & (geometry.frame == frame), self.pose(frame)
+                rows, pose = geometry.known & (geometry.frame == frame), self.pose(driver, frame)
                 position[rows] = position[rows] @ pose[:3, :3].T + pose[:3, 3]
                 normal[rows] = normal[rows] @ pose[:3, :3].T
             position[~geometry.known] = places + corner
@@ -139,6 +144,39 @@ class Scene:
                 bool(2 * geometry.known.sum() > len(quantity)),
                 FLAT_PITCH_M if np.isnan(quantity.pitch_m) else quantity.pitch_m,
             )
+
+
+@dataclass(eq=False)
+class _Body:
+    """The drivers whose taxels are together in a coordinate frame, and the (n, 3) places of these, m."""
+
+    frame: str
+    is_first: bool
+    drivers: list[str]
+    at: npt.NDArray[np.float64]
+
+
+def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
+    """All bodies; the drivers of each are in the order of their names."""
+    found: dict[str, list[_Body]] = {}
+    for driver, geometry in sorted(geometries.items()):
+        for frame in _frames(geometry):
+            bodies = found.setdefault(frame, [])
+            at = geometry.position_m[geometry.known & (geometry.frame == frame)]
+            shared = [] if frame.endswith(_NOMINAL) else [body for body in bodies if not _is_same(body.at, at)]
+            if shared:
+                shared[0].drivers.append(driver)
+                shared[0].at = np.concatenate([shared[0].at, at])
+            else:
+                bodies.append(_Body(frame, not bodies, [driver], at))
+    return [body for bodies in found.values() for body in bodies]
+
+
+def _is_same(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> bool:
+    """Whether more than half of the smaller set of (n, 3) places are also in the other."""
+    sets = [np.unique(np.round(at / _SAME_PLACE_M) + 0.0, axis=0) for at in (one, other)]
+    common = sum(map(len, sets)) - len(np.unique(np.concatenate(sets), axis=0))
+    return 2 * common > min(map(len, sets))
 
 
 def _frames(geometry: Geometry) -> list[str]:

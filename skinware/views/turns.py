@@ -161,7 +161,7 @@ class Viewer:
                 {
                     "frame": mesh.frame,
                     "mesh": f"mesh/{number}",
-                    "pose": (scene.pose(mesh.frame) @ mesh.pose).ravel().tolist(),
+                    "pose": (follower.robot.poses[mesh.frame] @ mesh.pose).ravel().tolist(),
                 }
                 for number, mesh in enumerate(follower.robot.meshes)
             ],
@@ -221,7 +221,7 @@ class Viewer:
         laid_out = self._follower.scene.of(driver.name, quantity.name).position
         told = []
         for contact, unit, sensor, _ in places_of(frame, driver.structure):
-            pose = self._follower.scene.pose(contact.frame)
+            pose = self._follower.scene.pose(driver.name, contact.frame)
             position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
             if not np.isfinite(position).all():  # without places: in the middle of where its taxels are laid out
                 position = laid_out[contact.taxels].mean(axis=0, dtype=np.float64)

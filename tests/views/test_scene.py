@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -13,6 +15,7 @@ from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
 from skinware.views.quantities import quantities_of
 from skinware.views.scene import ASPECT, FLAT_PITCH_M, Scene
+from skinware_drivers.hand import FINGERS, FRAME, Grid, Hand
 from tests.cli.fake_skin import fake_structure
 from tests.tactile.skins import triangles
 
@@ -122,8 +125,61 @@ def test_frames_lie_beside_each_other_or_where_they_are_said_to_be() -> None:
     scene = Scene({name: (s, quantities_of(s)) for name, s in structures.items()}, {"chest": turned})
     x, y, z = triangles(2, 10).T
     assert np.allclose(scene.of("chest", "pressure").position, np.array([1 - y, 2 + x, 3 + z]).T)
-    assert np.array_equal(scene.pose("chest"), turned)
-    assert np.array_equal(scene.pose("nowhere"), np.eye(4))
+    assert np.array_equal(scene.pose("chest", "chest"), turned)
+    assert np.array_equal(scene.pose("chest", "nowhere"), np.eye(4))
+
+
+def a_hand(
+    side: Literal["right", "left"] = "right",
+    frame: str = FRAME,
+    fingers: tuple[str, ...] = ("thumb", "middle"),
+    rows: int = 10,
+) -> Structure:
+    """Fingers of ``rows`` x 4 taxels with their places."""
+    structure = structure_of([(0, f"{rows}x4", 4 * rows)] * len(fingers))
+    grid, uids = Grid(rows, 4), structure.sensor_uid.reshape(len(fingers), -1).tolist()
+    centres = [Hand(side).down(finger, [grid])[0] for finger in fingers]
+    parts = [grid.at(centre, ["pressure"], uid, frame) for centre, uid in zip(centres, uids, strict=True)]
+    return structure.placed(Geometry.joined(parts))
+
+
+@pytest.mark.parametrize("frame", [FRAME, "palm"], ids=["nominal", "measured"])
+def test_two_hands_lie_beside_each_other_in_any_order_of_start(frame: str) -> None:
+    """In the nominal frame a right and a left one; in another frame two of one model, which have the same places."""
+    hands = {"right": a_hand("right", frame), "left": a_hand("left" if frame == FRAME else "right", frame)}
+    scene = scene_of(**hands)
+    left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
+    assert right[:, 0].min() - left[:, 0].max() > 0.1 * np.ptp(left[:, 0])
+    assert np.allclose(np.ptp(left, axis=0), np.ptp(right, axis=0))
+    other_way = scene_of(**dict(reversed(hands.items())))
+    for name in hands:
+        assert np.array_equal(other_way.of(name, "pressure").position, scene.of(name, "pressure").position)
+    geometry = hands["right"].geometry
+    assert geometry is not None
+    moved = geometry.position_m + scene.pose("right", frame)[:3, 3]  # as contacts are
+    assert np.allclose(right, moved)
+    assert np.array_equal(scene.pose("left", frame), np.eye(4))
+
+
+def test_hands_of_two_models_lie_beside_each_other() -> None:
+    scene = scene_of(a=a_hand(), b=a_hand(rows=7))
+    a, b = (scene.of(name, "pressure").position for name in "ab")
+    assert b[:, 0].min() > a[:, 0].max()
+
+
+def test_a_second_driver_of_a_frame_with_a_pose_is_turned_alike_and_beside() -> None:
+    pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], float)
+    hands = {name: (hand, quantities_of(hand)) for name in ("left", "right") for hand in [a_hand()]}
+    scene = Scene(hands, {FRAME: pose})
+    left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
+    assert np.array_equal(scene.pose("left", FRAME), pose)
+    assert right[:, 0].min() > left[:, 0].max()
+    assert np.allclose((right - left)[:, 1:], 0)
+
+
+def test_drivers_of_two_parts_of_a_body_stay_together() -> None:
+    scene = scene_of(**{finger: a_hand(frame="palm", fingers=(finger,)) for finger in FINGERS})
+    assert all(np.array_equal(scene.pose(name, "palm"), np.eye(4)) for name in FINGERS)
 
 
 def test_three_axes_are_one_picture() -> None:

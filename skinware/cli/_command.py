@@ -185,7 +185,7 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
         where = f"{error.filename}: " if error.filename else ""
         echo(f"{name}: {where}{error.strerror or error}", err=True)
         _discard_output()
-        return EXIT_USAGE if isinstance(error, FileNotFoundError) else EXIT_FAILED
+        return EXIT_USAGE if isinstance(error, FileNotFoundError | FileExistsError) else EXIT_FAILED
 
 
 def _show(error: click.ClickException) -> None:

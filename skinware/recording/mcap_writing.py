@@ -225,7 +225,7 @@ class McapFile:
             return
         info = os.fstat(self._fd)
         if not info.st_nlink:
-            raise OSError(errno.ENOENT, "deleted while it was recorded: what was in it is gone", str(self.path))
+            raise OSError(errno.ESTALE, "deleted while it was recorded: what was in it is gone", str(self.path))
         if info.st_size != self.size:
             self._is_ours = False  # a summary would not fit it
             what = f"changed by another program while it was recorded: {info.st_size} bytes instead of {self.size}"

@@ -12,7 +12,7 @@ from click.core import ParameterSource
 
 from skinware.cli._terminal import echo, print_json, style
 from skinware.errors import ConfigurationError
-from skinware_drivers.cli.hardware_options import value_of
+from skinware_drivers.cli.hardware_options import hardware_values, value_of
 
 if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
@@ -70,13 +70,16 @@ def _chosen(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter] |
         return None, {}
     name = value_of("--driver", list(arguments)) or driver_type_of(capture)
     context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
-    driver, given = load_driver(name), dict[str, str]()
-    for key, text in context.params.items():
-        if context.get_parameter_source(key) is not ParameterSource.COMMANDLINE or key == "driver_name":
-            continue
-        if key not in driver.Options.__struct_fields__:
-            raise click.UsageError(f"--captured: --{key.replace('_', '-')} is not about decoding")
-        given[key] = text
+    driver = load_driver(name)
+    chosen = {
+        key: text
+        for key, text in context.params.items()
+        if context.get_parameter_source(key) is ParameterSource.COMMANDLINE and key != "driver_name"
+    }
+    for option in driver_command.params:
+        if option.name in chosen:
+            raise click.UsageError(f"--captured: {option.opts[0]} is not about decoding")
+    given = hardware_values(chosen)
     options = options_from_strings(driver.Options, given) if given else None
     return driver, {key: getattr(options, key) for key in given}
 

@@ -49,7 +49,6 @@ class _Place:
         """The device did not answer."""
         self._missing += 1
         if self._missing >= _PATIENT_TIMES:
-            self.extra_s = 0.0
             self.silent_until_ns = now_ns() + round(self._pauses.next_s() * NS_PER_S)
 
 
@@ -62,8 +61,8 @@ class Poller:
 
     In lock step, a device that does not answer costs the others its timeout. After three times in a row it is asked
     more and more rarely, if there are others; once it has answered, as often as before. An answer that comes after the
-    timeout is an answer: it is counted in ``polls_late``, and from then on the device is given as much time as it
-    takes, up to a second more.
+    timeout is an answer: it is counted in ``polls_late``, and the device is then given as much time as it takes,
+    up to a second more, for as long as its answers come late.
 
     Args:
         link: the bus.
@@ -148,12 +147,13 @@ class Poller:
 
     async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
         """In lock step."""
+        extra_s, place.extra_s = place.extra_s, place.extra_s / 2  # one late answer must not hold up the others for long
         came = await self._link.ask(
             poll.identifier,
             poll.payload,
             answer,
             timeout_s=poll.patience_s,
-            extra_s=place.extra_s,
+            extra_s=extra_s,
             on_late=lambda late_s: self._count_late(poll, place, late_s),
         )
         if came:

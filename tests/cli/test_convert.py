@@ -57,11 +57,11 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["nothing.mcap", "--to", "npz"], 1, "nothing.mcap: No such file or directory"),
+        (["nothing.mcap", "--to", "npz"], 2, "nothing.mcap: No such file or directory"),
         (["walk.mcap", "--to", "xls"], 2, "'xls' is not one of"),
-        (["walk.mcap", "--to", "npz", "-o", "walk.mcap"], 1, "walk.mcap: exists already: give another name"),
-        (["walk.mcap", "--to", "npz", "-o", "nowhere/x.npz"], 1, "No such file or directory"),
-        (["walk.mcap", "--to", "npz", "-o", "/proc/x.npz"], 1, "No such file or directory"),
+        (["walk.mcap", "--to", "npz", "-o", "walk.mcap"], 2, "walk.mcap: exists already: give another name"),
+        (["walk.mcap", "--to", "npz", "-o", "nowhere/x.npz"], 2, "No such file or directory"),
+        (["walk.mcap", "--to", "npz", "-o", "/proc/x.npz"], 2, "No such file or directory"),
         (["walk.mcap", "--to", "npz", "--start", "2", "--end", "1"], 2, "--end 1 is not after --start 2"),
         (["walk.mcap", "leg", "--to", "npz"], 2, "no service 'leg'; there are: torso"),
         (["walk.mcap", "--to", "npz", "--region", "palm"], 2, "regions.toml"),
@@ -73,11 +73,11 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of frames, nor all"),
         (["walk.mcap", "--to", "lerobot", "--episode", "2..1"], 2, "is not START..END in seconds"),
         (["walk.mcap", "--to", "lerobot", "--episode", "7..8"], 2, "no time in the episode 7..8 has everything"),
-        (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 1, "no.csv: No such file or directory"),
-        (["walk.mcap", "--to", "lerobot", "--join", "action=no.csv"], 1, "no.csv: No such file or directory"),
-        (["walk.mcap", "--to", "lerobot", "--also", "no.mcap"], 1, "no.mcap: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 2, "no.csv: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--join", "action=no.csv"], 2, "no.csv: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--also", "no.mcap"], 2, "no.mcap: No such file or directory"),
         (["walk.mcap", "--to", "lerobot", "--start", "9"], 2, "no frames of a driver are in it"),
-        (["walk.mcap", "--to", "lerobot", "-o", "walk.mcap"], 1, "walk.mcap: exists already: give another name"),
+        (["walk.mcap", "--to", "lerobot", "-o", "walk.mcap"], 2, "walk.mcap: exists already: give another name"),
     ],
 )
 def test_mistakes_are_one_line(

@@ -141,7 +141,7 @@ def test_frames_of_drivers_are_dumped_as_before(capsys: pytest.CaptureFixture[st
     ("arguments", "status", "words"),
     [
         (["--raw", "virtual", "-T", "0.05"], 1, "virtual: no frame for 0.05 s"),
-        (["--raw", "no-such-can0"], 3, "CAN"),
+        (["--raw", "no-such-can0"], 1, "CAN"),
         (["--raw", "/dev/ttyUSB0"], 2, "a serial line has one owner"),
         (["--raw", "serial:/dev/ttyUSB0"], 2, "a serial line has one owner"),
         (["--raw", "virtual", "--type", "pressure"], 2, "--type is about the frames of a driver"),

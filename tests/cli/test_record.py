@@ -177,9 +177,9 @@ def test_no_permission_is_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["-o", "there.mcap"], 1, "there.mcap: exists already: give another name, or remove it"),
-        (["-o", "nowhere/x.mcap"], 1, "nowhere/x.mcap: No such file or directory"),
-        (["-o", "/proc/x.mcap"], 1, "/proc/x.mcap: No such file or directory"),
+        (["-o", "there.mcap"], 2, "there.mcap: exists already: give another name, or remove it"),
+        (["-o", "nowhere/x.mcap"], 2, "nowhere/x.mcap: No such file or directory"),
+        (["-o", "/proc/x.mcap"], 2, "/proc/x.mcap: No such file or directory"),
         (["-o", "x.mcap", "to rso"], 2, "service name 'to rso'"),
         (["-o", "x.mcap", "--split", "much"], 2, "'much' is not a size"),
         (["-o", "x.mcap", "--last", "0"], 2, "'0' is not a time"),
@@ -220,7 +220,7 @@ def test_what_cannot_be_recovered_is_one_line(
     if contents is not None:
         file.write_bytes(contents)
     before = list(tmp_path.iterdir())
-    assert exit_status(recover, [str(file)]) == 1
+    assert exit_status(recover, [str(file)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert list(tmp_path.iterdir()) == before

@@ -150,7 +150,7 @@ def test_the_command_tells_the_first_difference_and_keeps_what_is_right(capture:
 
 def test_what_cannot_be_compared(capture: Path, tmp_path: Path, mistaken: Path) -> None:
     nothing = refused("skin-prove", "--captured", str(tmp_path / "nothing.mcap"))
-    assert (nothing.returncode, "No such file" in nothing.stderr) == (3, True)
+    assert (nothing.returncode, "No such file" in nothing.stderr) == (2, True)
     unnamed = refused("skin-prove", "--captured", str(capture))  # a program has run this driver, of no name
     assert (unnamed.returncode, "tip" in unnamed.stderr) == (2, True)
     for more, words in (

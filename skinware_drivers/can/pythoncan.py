@@ -24,7 +24,8 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 _QUEUE_FRAMES = 1 << 16
 _POLL_S = 0.2
 _MOST_FAILURES = 50
-"""Calls of ``recv`` in a row that may fail before the interface counts as failed."""
+"""Calls of ``recv`` that may fail with no message between them; then the interface counts as failed, and is opened
+again: python-can's slcan, for example, keeps bytes that it cannot decode, and fails with every frame after them."""
 _SWITCHED, _PASSIVE = 0x01, 0x02
 """Flags of a CAN FD frame: bit rate switched, sender error passive."""
 _CLOSE_S = 0.8
@@ -237,8 +238,8 @@ class _Messages:
                     raise
                 self._counters.refused += 1
                 continue
-            failures = 0
             if message is not None:
+                failures = 0
                 self._take(message)
 
     def _take(self, message: can.Message) -> None:

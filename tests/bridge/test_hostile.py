@@ -117,7 +117,7 @@ LIES = {
     ),
     "frames beyond counting before": Lie(lambda: Lies(generation=lambda: generation(head(before=LAST))), "service"),
     "a negative period": Lie(lambda: Lies(generation=lambda: generation(head(period_ns=-(2**63)))), "service"),
-    "a tiny period": Lie(lambda: Lies(generation=lambda: generation(head(period_ns=1))), "", comes=True),
+    "a tiny period": Lie(lambda: Lies(generation=lambda: generation(head(period_ns=1))), "service"),
     "a ring beyond all": Lie(lambda: Lies(generation=lambda: generation(head(60 << 20, 64))), "service"),
     "odd tokens": Lie(
         lambda: Lies(

@@ -76,11 +76,16 @@ def test_another_structure_and_no_regions_in_it(into: Namespace, caplog: pytest.
 def test_a_name_that_another_program_has(into: Namespace, caplog: pytest.LogCaptureFixture) -> None:
     skin = FakeSkin("fake", placed_structure())
     press(skin)
-    with MotionWriter(skin.structure, "pressure", REGIONS, (), namespace=into), publishing(skin):
+    with publishing(skin), MotionWriter(skin.structure, "pressure", REGIONS, (), namespace=into):
         with calming(into, watched=WatchedRegions(REGIONS)):
-            assert "no motion of 'fake': " in caplog.text
+            assert "fake-motion" in into.services()
         with calming(into, watched=WatchedRegions(REGIONS, "mine")):
             assert "mine" in into.services()
+        with (
+            MotionWriter(skin.structure, "pressure", REGIONS, (), name="fake-motion", namespace=into),
+            calming(into, watched=WatchedRegions(REGIONS)),
+        ):
+            assert "no motion of 'fake': " in caplog.text
 
 
 def test_the_command_takes_files_of_regions(into: Namespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

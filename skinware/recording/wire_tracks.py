@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from skinware.limits import LIMITS
 from skinware.memory.ring import Frame
 from skinware.realtime import NS_PER_S
 from skinware.recording.tracks import ChunkSource
@@ -200,6 +201,9 @@ class WireTrack:
                     self._recording.note(f"wire of {self.bus}: a message is shorter than its header")
                     continue
                 generation, _, published_ns, lost = _HEADER.unpack_from(message.data)
+                if not (LIMITS.is_time(message.time_ns) and LIMITS.is_time(published_ns)):
+                    self._recording.note(f"wire of {self.bus}: a message has a time that no clock has")
+                    continue
                 yield generation, lost, message.time_ns - published_ns, message.data[_HEADER.size :]
 
     def __repr__(self) -> str:

@@ -124,6 +124,18 @@ def test_times_beyond_what_clocks_have_are_left_out_and_said(path: Path, time_ns
         assert opened.problems == ["big: a frame has a time that no clock has"]
 
 
+@pytest.mark.parametrize("time_ns", [-(1 << 63), (1 << 63) - 1])
+def test_a_wire_of_a_time_beyond_what_clocks_have(path: Path, time_ns: int) -> None:
+    file, chunk = McapFile(path), OpenChunk()
+    chunk.add(*Channels().of_wire("tip", "can0"), 1, START_NS, struct.pack("<QQqQ", 1, 1, time_ns, 0))
+    file.add(chunk.close())
+    file.finish()
+    with skinware.recording.open(path) as opened:
+        (wire,) = opened.wires
+        assert len(wire.frames()) == 0
+        assert opened.problems == ["wire of can0: a message has a time that no clock has"]
+
+
 def test_a_message_of_a_time_beyond_63_bits_costs_its_chunk(path: Path) -> None:
     file, channels = McapFile(path), Channels()
     for time_ns in (START_NS, (1 << 64) - 1):

@@ -255,7 +255,7 @@ class Exchanged(EmulatedPaxini):
 
 def test_another_sensor_in_the_place_of_one_that_fell_silent_is_noticed() -> None:
     Exchanged.now = False
-    with emulated_skin(PaxiniDriver, Exchanged, driver_options={"sensors": (3,)}, boot_s=0.6, points=31) as skin:
+    with emulated_skin(PaxiniDriver, Exchanged, driver_options={"sensors": (3,)}, boot_s=2.0, points=31) as skin:
         assert read_until(skin.reader, is_live).structure.module_kind.tolist() == [b"S1813-Elite"]
         Exchanged.now = True
         frame = following(skin.reader, lambda f: f.structure.module_kind.tolist() == [b"S1610"] and is_live(f))

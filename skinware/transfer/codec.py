@@ -189,7 +189,7 @@ class Run:
         starts = np.frombuffer(b"".join([message[: fixed.itemsize] for message in messages]), fixed)
         self.headers: npt.NDArray[np.void] = starts["header"].copy()
         for name in ("acquired_ns", "published_ns"):
-            if (self.headers[name] > LIMITS.time_ns).any() or (self.headers[name] < -LIMITS.time_ns).any():
+            if (self.headers[name] > LIMITS.time_ns).any() or (self.headers[name] < 0).any():
                 raise BadRecording("a frame has a time that no clock has")
         self._codes = starts["codes"]
         self._sizes = starts["sizes"].astype(np.int64)

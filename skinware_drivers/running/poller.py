@@ -147,7 +147,10 @@ class Poller:
 
     async def _ask(self, poll: Poll, answer: Match, place: _Place) -> None:
         """In lock step."""
-        extra_s, place.extra_s = place.extra_s, place.extra_s / 2  # one late answer must not hold up the others for long
+        extra_s, place.extra_s = (
+            place.extra_s,
+            place.extra_s / 2,
+        )  # one late answer must not hold up the others for long
         came = await self._link.ask(
             poll.identifier,
             poll.payload,

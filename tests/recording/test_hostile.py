@@ -116,7 +116,7 @@ def test_frames_of_a_chunk_that_become_too_much_are_left_out_and_said(path: Path
         assert "become more than" in opened.problems[0]
 
 
-@pytest.mark.parametrize("time_ns", [-(1 << 63), 1 << 62, (1 << 63) - 1])
+@pytest.mark.parametrize("time_ns", [-(1 << 63), -1, 1 << 62, (1 << 63) - 1])
 def test_times_beyond_what_clocks_have_are_left_out_and_said(path: Path, time_ns: int) -> None:
     of_frames(path, head(64), time_ns=time_ns)
     with skinware.recording.open(path) as opened:
@@ -126,8 +126,9 @@ def test_times_beyond_what_clocks_have_are_left_out_and_said(path: Path, time_ns
 
 @pytest.mark.parametrize("time_ns", [-(1 << 63), (1 << 63) - 1])
 def test_a_wire_of_a_time_beyond_what_clocks_have(path: Path, time_ns: int) -> None:
-    file, chunk = McapFile(path), OpenChunk()
-    chunk.add(*Channels().of_wire("tip", "can0"), 1, START_NS, struct.pack("<QQqQ", 1, 1, time_ns, 0))
+    file, channels, chunk = McapFile(path), Channels(), OpenChunk()
+    chunk.add(*channels.of_service("big", GENERATION), 1, START_NS, head(64))
+    chunk.add(*channels.of_wire("tip", "can0"), 1, START_NS, struct.pack("<QQqQ", 1, 1, time_ns, 0))
     file.add(chunk.close())
     file.finish()
     with skinware.recording.open(path) as opened:

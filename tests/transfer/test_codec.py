@@ -38,7 +38,7 @@ class Source:
         """One with these bytes in its columns."""
         slot = bytearray(self.layout.slot_stride)
         head = np.frombuffer(slot, file_layout.SLOT, 1)
-        head["sequence"], head["acquired_ns"], head["published_ns"], head["flags"] = sequence, -5, 1 << 61, 1 << 63
+        head["sequence"], head["acquired_ns"], head["published_ns"], head["flags"] = sequence, 5, 1 << 61, 1 << 63
         for column, data in zip(self.layout.slot, contents, strict=True):
             slot[column.offset : column.offset + len(data)] = data
         return Frame(self, slot)

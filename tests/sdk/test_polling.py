@@ -501,6 +501,27 @@ def test_late_answers_are_answers_and_devices_are_followed_at_their_pace(caplog:
     assert len(lines) == len(polls)
 
 
+def test_one_late_answer_does_not_hold_up_the_others_for_long() -> None:
+    """A device that was late gets more time with the next question, and half of that with each one after."""
+    polls = [Poll(16 * n, bytes([n]), 0.2, answer=Match(16 * n + 1), timeout_s=0.01) for n in (1, 2)]
+
+    async def answering(polling: Polling) -> None:
+        for number in itertools.count():
+            while len(polling.line.sent) <= number:
+                await asyncio.sleep(0.0005)
+            if number == 0:
+                await asyncio.sleep(0.09)  # both answers are late
+            elif number == 20:
+                continue  # lost
+            _, identifier, payload = polling.line.sent[number]
+            polling.hear(identifier + 1, payload)
+
+    polling = poll_for(2.35, lambda: polls, answering)
+    assert (polling.counters.polls_late, polling.counters.polls_unanswered) == (2, 3)
+    times_s = polling.line.times_s
+    assert times_s[21] - times_s[20] == pytest.approx(0.01, abs=0.001)
+
+
 def test_a_late_answer_that_comes_after_the_next_question_is_of_its_own_device() -> None:
     polls = [Poll(16 * n, bytes([n]), 0.1, answer=Match(16 * n + 1), timeout_s=0.01) for n in (1, 2)]
 

@@ -22,7 +22,7 @@ from skinware.views.scene import Scene
 from skinware.views.state import problem_of_all, problems_of, state_of, worst_first
 from skinware.views.touches import places_of
 
-PROTOCOL = "skinware.view.1"
+PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
 _STATE_EVERY_NS = NS_PER_S // 2
 _MOST_QUESTIONS = 64
@@ -178,8 +178,7 @@ class Viewer:
         if not pictures:
             return
         header["pictures"] = pictures
-        low, high = pictures[0]["scale"]
-        header["scale"] = {"low": low, "high": high, "unit": pictures[0]["unit"], "mode": self.look.mode}
+        header["mode"] = self.look.mode
         header["contacts"] = [told for driver in self._follower.drivers for told in self._contacts(driver)]
         header["regions"] = [told for driver in self._follower.drivers for told in _regions(driver)]
         wiped = self.look.wiped(self._follower.drivers)

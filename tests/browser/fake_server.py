@@ -54,6 +54,8 @@ class FakeDriver:
     """A driver with ``boards`` patches of ``triangles`` triangles of ten taxels, rolled to a forearm or flat.
 
     Attributes:
+        type: name of the sensor type.
+        unit, scale: of the values.
         levels: (n,) uint8, what is felt; tests write into it.
         status: (n,) uint8; tests write into it.
         state: of the driver in the tree.
@@ -67,6 +69,7 @@ class FakeDriver:
         self.levels = np.zeros(self.n, np.uint8)
         self.status = np.zeros(self.n, np.uint8)
         self.shear = np.zeros((self.n, 2), np.int8) if shear else None
+        self.type, self.unit, self.scale = "pressure", "counts", (0, 250)
         self.state = "live"
         self.generation = "1"
         self.sequence = 0
@@ -99,8 +102,8 @@ class FakeDriver:
     def told(self) -> Header:
         modules = self.boards * self.triangles
         kind: Header = {
-            "name": "pressure",
-            "unit": "counts",
+            "name": self.type,
+            "unit": self.unit,
             "scale": 1.0,
             "offset": 0.0,
             "minimum": 0,
@@ -139,12 +142,12 @@ class FakeDriver:
         self.sequence += 1
         picture: Header = {
             "driver": self.number,
-            "type": "pressure",
+            "type": self.type,
             "generation": self.generation,
             "sequence": str(self.sequence),
             "acquired_ns": str(MONOTONIC_NS + time.monotonic_ns()),
-            "scale": [0, 250],
-            "unit": "counts",
+            "scale": list(self.scale),
+            "unit": self.unit,
             "levels": self.levels,
             "status": self.status,
         }
@@ -262,7 +265,7 @@ class FakeServer:
                     told = self.version
                     drivers = [d.told() for d in self.drivers]
                     header["skin"] = {"namespaces": ["default"], "drivers": drivers, "links": self.links}
-                header["scale"] = {"low": 0, "high": 250, "unit": "counts", "mode": self.look["mode"]}
+                header["mode"] = self.look["mode"]
                 header["pictures"] = [d.picture() for d in self.drivers if d.state == "live"]
                 if last - state_at > 0.5:
                     state_at = last

@@ -14,6 +14,7 @@ from tests.browser.browsing import PHONE, Troubles, look, tell, until
 from tests.browser.fake_server import FakeDriver, FakeServer
 
 OpenPage = Callable[..., Page]
+LEGEND = "document.querySelector('#scaling').innerText"
 READY = "skin.connected && skin.drawn > 2 && skin.drivers.length"
 
 
@@ -270,6 +271,60 @@ def test_a_fixed_scale_is_asked_for_and_forgotten(page: Page, server: FakeServer
     page.keyboard.press("Tab")
     page.locator("#auto").click()
     wait_until(lambda: server.look["scale"] is None)
+
+
+@pytest.fixture
+def in_newtons(server: FakeServer, driver: FakeDriver) -> FakeDriver:
+    """A second driver, of another type and unit."""
+    second = FakeDriver(1, "finger", boards=1, triangles=4, placed=False)
+    second.position += driver.position.max(axis=0)
+    second.type, second.unit, second.scale = "force_z", "N", (0, 1.5)
+    server.drivers.append(second)
+    return second
+
+
+def test_the_legend_is_of_what_is_shown(page: Page, server: FakeServer, in_newtons: FakeDriver) -> None:
+    """Each scale has its own unit; of a selected driver, only its own; of one type, only that of the type."""
+    assert page.locator("#scale").is_visible()
+    server.restructure()
+    until(page, f"{LEGEND}.includes('finger force_z')")
+    rows = page.locator("#scales > .scale")
+    assert [row.split() for row in rows.all_inner_texts()] == [
+        ["0", "250", "counts", "sheet", "pressure"],
+        ["0", "1.5", "N", "finger", "force_z"],
+    ]
+    assert not page.locator("#scale").is_visible()  # no numbers hold for both units
+    page.get_by_text("finger", exact=True).first.click()
+    until(page, f"!{LEGEND}.includes('sheet')")
+    assert rows.all_inner_texts()[0].split() == ["0", "1.5", "N", "finger", "force_z"]
+    page.locator("#types select").select_option("force_z")
+    page.locator("#scale").wait_for(state="visible")
+    assert page.locator("#unit").inner_text() == "N"
+    assert page.locator("#high").input_value() == "1.5"
+
+
+def test_a_scale_that_was_chosen_does_not_outlive_its_unit(
+    page: Page, server: FakeServer, in_newtons: FakeDriver
+) -> None:
+    page.locator("#low").fill("10")
+    page.locator("#high").fill("90")
+    page.keyboard.press("Enter")
+    wait_until(lambda: server.look.get("scale") == [10, 90])
+    server.restructure()
+    wait_until(lambda: server.look["scale"] is None)
+
+
+def test_drivers_of_one_unit_and_different_ends(page: Page, server: FakeServer, driver: FakeDriver) -> None:
+    """Both scales are shown, and one for both can be chosen."""
+    second = FakeDriver(1, "other", boards=1, triangles=4, placed=False)
+    second.scale = (0, 4095)
+    server.drivers.append(second)
+    server.restructure()
+    until(page, f"{LEGEND}.includes('4095 counts')")
+    assert page.locator("#low").input_value() == page.locator("#high").input_value() == ""
+    driver.scale = second.scale
+    until(page, f"!{LEGEND}.includes('other')")
+    assert page.locator("#high").input_value() == "4095"
 
 
 def test_an_address_of_another_skin_shows_this_one(server: FakeServer, open_page: OpenPage) -> None:

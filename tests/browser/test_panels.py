@@ -124,14 +124,14 @@ def test_peaks_stay_and_zero_is_what_is_felt_now(sleeve: Sleeve, address: str, o
     until(page, READY)
     one, other = (int(taxel) for taxel in sleeve.taxels[[200, 400]])
     page.locator(role("mode", "[data-mode=peak]")).click()
-    until(page, "skin.scale.mode === 'peak'")
+    until(page, "skin.drawnMode === 'peak'")
     let_settle(page, sleeve)
     for taxel in (one, other):
         sleeve.press(taxel)
         until(page, f"{level(taxel)} > 150")
     assert tell(page, level(one)) > 150
     page.locator(role("mode", "[data-mode=change]")).click()
-    until(page, f"skin.scale.mode === 'change' && {level(other)} > 150 && {level(one)} < 50")
+    until(page, f"skin.drawnMode === 'change' && {level(other)} > 150 && {level(one)} < 50")
     page.keyboard.press("b")
     until(page, f"{level(other)} < 50")
     let_settle(page, sleeve)

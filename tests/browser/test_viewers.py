@@ -107,8 +107,8 @@ def test_a_slow_page_delays_nobody(large: None, address: str, open_page: OpenPag
 
 def test_two_people_look_at_different_things(large: None, address: str, open_page: OpenPage) -> None:
     one, other = open_page(f"{address}#type=pressure&mode=raw"), open_page(f"{address}#type=temperature&mode=peak")
-    until(one, "skin.connected && skin.type === 'pressure' && skin.scale.mode === 'raw'")
-    until(other, "skin.connected && skin.type === 'temperature' && skin.scale.mode === 'peak'")
+    until(one, "skin.connected && skin.type === 'pressure' && skin.drawnMode === 'raw'")
+    until(other, "skin.connected && skin.type === 'temperature' && skin.drawnMode === 'peak'")
     assert tell(one, "[skin.type, skin.mode]") == ["pressure", "raw"]
     tell(one, "document.activeElement.blur()")
     one.keyboard.press("Space")

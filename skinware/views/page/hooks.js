@@ -19,7 +19,7 @@ export function hooks({ skin, stage, tree, probes, rewind, past, view, now }) {
     get recording() { return now.recording; },
     get mode() { return view.mode; },
     get type() { return view.type ?? stage.sheets[0]?.type ?? null; },
-    get scale() { return skin.scale; },
+    get drawnMode() { return skin.mode; },
     get theme() { return view.theme; },
     get selected() { return tree.selected; },
     get hovered() { return probes.hovered && pairOf(probes.hovered); },

@@ -1,7 +1,7 @@
-// What colours and marks mean: the scale with its ends, and the marks that are in view with how many there are.
+// What colours and marks mean: each scale in use with its ends, unit and drivers, and the marks in view with their counts.
 
-import { byId, h, setChildren, setPressed, setText } from "./dom.js";
-import { count, figure } from "./format.js";
+import { byId, h, setChildren, setHidden, setPressed, setText } from "./dom.js";
+import { count, figure, measure } from "./format.js";
 import { DIMMED, FRESH, MARKS } from "./marks.js";
 import { gradient } from "./palette.js";
 import { CLEAR, inksOf, signOf } from "./signs.js";
@@ -18,6 +18,7 @@ export class Legend {
     this.low = byId("low");
     this.high = byId("high");
     this.marks = byId("marks");
+    this.scales = byId("scales");
     const both = () => {
       const scale = [this.low.valueAsNumber, this.high.valueAsNumber];
       if (scale.every(Number.isFinite) && scale[0] < scale[1]) choose(scale);
@@ -32,18 +33,23 @@ export class Legend {
     byId("gradient").style.background = gradient(theme);
     this.#items.clear();
     this.#versions = "";
+    this.scales.replaceChildren();
   }
 
-  /** @param {object} scale `low`, `high`, `unit` of what is shown; @param {?number[]} fixed what a person chose. */
-  update(scale, fixed, sheets) {
-    const ends = fixed ?? [scale.low, scale.high];
-    for (const [input, end] of [[this.low, ends[0]], [this.high, ends[1]]]) {
-      if (document.activeElement !== input) input.value = figure(end);
+  /**
+   * @param {Sheet[]} sheets what is drawn; @param {Sheet[]} chosen of these, those that are selected, or all.
+   * @param {?number[]} fixed ends that a person chose; they hold for all sheets.
+   */
+  update(sheets, chosen, fixed) {
+    const scales = scalesOf(chosen);
+    const isCommon = unitsOf(sheets).size < 2;
+    setHidden(byId("scale"), !isCommon);
+    if (isCommon && scales.length) this.#setCommon(scales, fixed);
+    setHidden(this.scales, isCommon && scales.length < 2);
+    const rows = isCommon && scales.length < 2 ? [] : scales.map((scale) => this.#row(scale));
+    if (rows.map(({ title }) => title).join() !== [...this.scales.children].map(({ title }) => title).join()) {
+      this.scales.replaceChildren(...rows);
     }
-    const [low, high] = ends.map(figure);
-    byId("gradient").setAttribute("aria-label", `colours from ${low} to ${high} ${scale.unit}`);
-    setText(byId("unit"), scale.unit || "");
-    setPressed(byId("auto"), fixed === null);
     const versions = sheets.map(({ driver, marksVersion }) => `${driver.key}:${marksVersion}`).join();
     if (versions === this.#versions) return;
     this.#versions = versions;
@@ -53,12 +59,50 @@ export class Legend {
     setChildren(this.marks, present.map((mark) => this.#item(mark, counts[mark])));
   }
 
+  /** The ends that can be changed, of sheets of one unit; empty where the sheets have different ends. */
+  #setCommon(scales, fixed) {
+    const [{ low, high, unit }] = scales;
+    const ends = fixed ?? (scales.length < 2 ? [low, high] : null);
+    for (const [input, end] of [[this.low, ends?.[0]], [this.high, ends?.[1]]]) {
+      if (document.activeElement !== input) input.value = ends ? figure(end) : "";
+    }
+    const words = ends ? `colours from ${ends.map(figure).join(" to ")} ${unit}` : "colours, see the scales of the drivers";
+    byId("gradient").setAttribute("aria-label", words);
+    setText(byId("unit"), unit);
+    setPressed(byId("auto"), fixed === null);
+  }
+
+  #row({ low, high, unit, names }) {
+    const bar = h("div", { class: "gradient", "aria-hidden": "true" });
+    bar.style.background = gradient(this.theme);
+    const [from, to] = [figure(low), measure(high, unit)];
+    const who = names.join(", ");
+    return h("div", { class: "scale", title: `${from} to ${to}: ${who}` }, h("span", {}, from), bar, h("span", {}, to), h("span", {}, who));
+  }
+
   #item(mark, n) {
     const item = this.#items.get(mark) ?? h("span", { class: "mark" }, picture(mark, this.theme), h("span"));
     this.#items.set(mark, item);
     setText(item.lastChild, `${MARKS[mark].name} ${count(n)}`);
     return item;
   }
+}
+
+/** The different scales of sheets: `low`, `high`, `unit`, and `names` of what has it. */
+function scalesOf(sheets) {
+  const scales = new Map();
+  for (const { shown, unit, driver, type } of sheets) {
+    const [low, high] = shown.scale;
+    const key = `${low} ${high} ${unit}`;
+    if (!scales.has(key)) scales.set(key, { low, high, unit, names: [] });
+    scales.get(key).names.push(`${driver.name} ${type}`);
+  }
+  return [...scales.values()];
+}
+
+/** The units of sheets; one scale that a person chooses can hold for one unit only. */
+export function unitsOf(sheets) {
+  return new Set(sheets.map(({ unit }) => unit));
 }
 
 /** A mark as it looks in the skin. */

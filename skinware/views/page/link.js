@@ -1,6 +1,6 @@
 // The connection: asks for one turn at a time, and connects again by itself.
 
-export const PROTOCOL = "skinware.view.1";
+export const PROTOCOL = "skinware.view.2";
 const FIRST_WAIT_MS = 300;
 const LONGEST_WAIT_MS = 4000;
 const SILENCE_MS = 3000; // the server answers within 0.5 s, however little there is to tell

@@ -10,7 +10,7 @@ import { Past } from "./history.js";
 import { directionOf } from "./framing.js";
 import { hooks } from "./hooks.js";
 import { fillHelp, onKeys } from "./keys.js";
-import { Legend } from "./legend.js";
+import { Legend, unitsOf } from "./legend.js";
 import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
 import { Overlay } from "./overlay.js";
@@ -212,15 +212,18 @@ function tell() {
   const isPast = rewind.isPaused;
   cards.update(probes, isPast ? ({ sheet, i }) => ({ value: sheet.valueOf(i), status: sheet.shown.status[i] }) : null);
   bar.update(skin, states, stage, now.recording);
-  const first = stage.sheets[0];
-  const scale = first ? { low: first.shown.scale[0], high: first.shown.scale[1], unit: first.unit } : skin.scale;
-  legend.update(scale, view.scale, stage.sheets);
+  const row = tree.selected && tree.find(tree.selected);
+  legend.update(stage.sheets, row ? stage.sheets.filter(({ driver }) => driver === row.driver) : stage.sheets, view.scale);
   setHidden(byId("legend"), !stage.sheets.length);
   setHidden(byId("empty"), stage.sheets.length > 0 || !now.isAlive);
 }
 
 function sheetsChanged() {
   stage.setSheets(skin.shown(view.type));
+  if (view.scale && unitsOf(stage.sheets).size > 1) {
+    view.scale = null; // it was of another unit
+    sendLook();
+  }
   if (stage.isTurned || !stage.sheets.length) return;
   if (wanted.camera) {
     stage.look(...[wanted.camera.position, wanted.camera.target].map(([x, y, z]) => ({ x, y, z })));
@@ -274,7 +277,7 @@ function look() {
   wipe.show(view.mode === "wipe");
   if (view.mode !== "wipe") now.wipe = null;
   setHidden(byId("tare"), view.mode === "raw" || view.mode === "wipe");
-  setHidden(byId("scale"), view.mode === "wipe");
+  setHidden(byId("scaling"), view.mode === "wipe");
   keep();
 }
 

@@ -101,7 +101,7 @@ export class Skin {
   drivers = new Map(); // by id
   links = [];
   namespaces = [];
-  scale = { low: 0, high: 1, unit: "", mode: "raw" };
+  mode = "raw"; // of the newest pictures
 
   /**
    * Take what a turn tells of the skin itself, of names and of values.
@@ -113,14 +113,14 @@ export class Skin {
       this.links = header.skin.links ?? [];
       this.drivers = new Map(header.skin.drivers.map((told) => [told.id, this.#driver(told, blob)]));
     }
-    if (header.scale) this.scale = header.scale;
+    this.mode = header.mode ?? this.mode;
     for (const told of header.state?.drivers ?? []) {
       const driver = this.drivers.get(told.id);
       if (driver) driver.state = told.state;
     }
     for (const picture of header.pictures ?? []) {
       const sheet = this.sheet(picture.driver, picture.type);
-      if (sheet && sheet.driver.generation === picture.generation) sheet.take(picture, this.scale.mode, blob);
+      if (sheet && sheet.driver.generation === picture.generation) sheet.take(picture, this.mode, blob);
     }
     const named = header.names && this.sheet(header.names.driver, header.names.type);
     if (named) named.names = header.names.of;

@@ -27,6 +27,7 @@ from skinware.views.health import (
     patch_state_name,
     rate_now_hz,
     status_now,
+    untouched,
 )
 
 FrameT = TypeVar("FrameT", bound=Frame)
@@ -222,15 +223,16 @@ def _patches(driver: DriverReader, frame: DriverFrame | None, life: str) -> list
         for name, bus in zip(structure.patch_name.tolist(), structure.patch_bus.tolist(), strict=True)
     ]
     for patch, entry in enumerate(entries):
-        entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0}
+        entry |= {"modules": modules[patch], "sensors": patch_sensors[patch], "fresh": 0, "untouched": 0}
     if frame is None:
         return entries
     is_fresh = status_now(life, frame) == 0
     fresh = np.bincount(structure.sensor_patch[is_fresh], minlength=structure.n_patches).tolist()
+    dark = np.bincount(structure.sensor_patch[untouched(frame)], minlength=structure.n_patches).tolist()
     for patch, (entry, age_ns) in enumerate(zip(entries, patch_ages_ns(frame), strict=True)):
         entry["state"] = patch_state_name(int(frame.patch_state[patch]))
         entry["age_ms"] = None if age_ns is None else round(age_ns / 1e6, 3)
-        entry["fresh"] = fresh[patch]
+        entry["fresh"], entry["untouched"] = fresh[patch], dark[patch]
         entry["interval"] = _histogram(Histogram(frame.patch_interval_counts[patch].tolist()))
         entry["age"] = _histogram(Histogram(frame.patch_age_counts[patch].tolist()))
     return [

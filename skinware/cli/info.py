@@ -142,12 +142,13 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
     counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
+    untouched = sum(patch["untouched"] for patch in driver["patch_list"])
     told = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
     timed = _OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
     timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
     lines = [
         f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
-        f"sensors: {', '.join(units)}",
+        f"sensors: {', '.join(units)}{f'; {count_text(untouched)} untouched so far (only 0)' if untouched else ''}",
         "",
         *_counter_table(
             driver["buses"],

@@ -69,7 +69,8 @@ class FakeDriver:
         self.levels = np.zeros(self.n, np.uint8)
         self.status = np.zeros(self.n, np.uint8)
         self.shear = np.zeros((self.n, 2), np.int8) if shear else None
-        self.type, self.unit, self.scale = "pressure", "counts", (0, 250)
+        self.type, self.unit = "pressure", "counts"
+        self.scale: tuple[float, float] = (0, 250)
         self.state = "live"
         self.generation = "1"
         self.sequence = 0

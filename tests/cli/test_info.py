@@ -88,6 +88,7 @@ def test_json_contract(namespace: Namespace, capsys: pytest.CaptureFixture[str])
         "modules": 4,
         "sensors": 48,
         "fresh": 41,
+        "untouched": 0,
         "orphans": 3,
         "updates": 640,
     }

@@ -66,6 +66,17 @@ def test_a_patch_that_is_alone_in_order_keeps_its_name() -> None:
     assert re.search(r"board 8 +can1 +live", text)
 
 
+def test_modules_that_have_sent_nothing_but_0_are_fresh_and_said(capsys: pytest.CaptureFixture[str]) -> None:
+    with FakeSkin("a", fake_structure(2, 1)) as skin:
+        skin.publish()
+        assert "untouched" not in shown(capsys)
+        skin.untouched[1] = 1
+        skin.publish()
+        lines = shown(capsys)
+    assert re.search(r"sensors: .*; 12 untouched so far \(only 0\)\n", lines)
+    assert re.search(r"board 8 +can0 +live +12 of 12", lines)
+
+
 def test_who_has_no_fresh_sensor_is_not_called_live(capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a", fake_structure(2, 1)) as skin:
         skin.status[:] = Status.NOT_CONNECTED

@@ -16,7 +16,7 @@ from tests.modbus.hands import Array, EmulatedArray
 
 
 class InTwoBlocks(Array):
-    registers = (
+    registers = (  # type: ignore[assignment]
         Registers(7, 18, function=4),
         Registers(300, 18, function=4, to=range(18, 36)),
     )

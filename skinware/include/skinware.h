@@ -949,7 +949,7 @@ static int skinware__watch(const skinware__header *header) {
     if (fd < 0)
         return errno == ESRCH ? SKINWARE__ENDED : SKINWARE__UNKNOWN;
     ticks = skinware__start_ticks(header->writer_pid);
-    if (ticks == 0 || ticks == header->writer_start_ticks)
+    if (ticks == 0 || header->writer_start_ticks == 0 || ticks == header->writer_start_ticks)
         return fd;
     close(fd); /* its number is another's now */
     return SKINWARE__ENDED;
@@ -1133,6 +1133,11 @@ static void skinware__fill(const skinware_reader *reader, skinware_frame *frame,
     frame->size = (size_t)reader->header.slot_stride;
 }
 
+static skinware_result skinware__overrun(int alive) {
+    return skinware__fail(SKINWARE_OVERRUN, alive ? "give the service more slots, or publish less often"
+                                                  : "its writer is dead, and its newest frame is not whole; start it again");
+}
+
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
     const size_t size = (size_t)reader->header.slot_stride;
     const int alive = skinware_is_alive(reader);
@@ -1156,7 +1161,7 @@ skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
     }
     frame->bytes = NULL; /* half of one frame, half of another */
     frame->generation = frame->sequence = 0;
-    return skinware__fail(SKINWARE_OVERRUN, "give the service more slots, or publish less often");
+    return skinware__overrun(alive);
 }
 
 skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame) {
@@ -1176,7 +1181,7 @@ skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame) {
             return SKINWARE_OK;
         }
     }
-    return skinware__fail(SKINWARE_OVERRUN, "give the service more slots, or publish less often");
+    return skinware__overrun(alive);
 }
 
 int skinware_valid(const skinware_frame *frame) {

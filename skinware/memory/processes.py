@@ -21,7 +21,7 @@ class Process(NamedTuple):
 
     Attributes:
         pid: its number in its own pid namespace.
-        start_ticks: when it started, clock ticks since boot: field 22 of ``/proc/PID/stat``.
+        start_ticks: when it started, clock ticks since boot: field 22 of ``/proc/PID/stat``; 0: unknown.
         pid_namespace: inode of its ``/proc/self/ns/pid``.
     """
 
@@ -32,7 +32,7 @@ class Process(NamedTuple):
 
 def this_process() -> Process:
     """Return the process that asks."""
-    return Process(os.getpid(), _start_ticks("self") or 0, _pid_namespace())
+    return Process(os.getpid(), _start_ticks("self"), _pid_namespace())
 
 
 class ProcessWatch(Descriptor):
@@ -60,7 +60,7 @@ class ProcessWatch(Descriptor):
             self._poll = select.poll()
             self._poll.register(self._fd, select.POLLIN)
             start_ticks = _start_ticks(process.pid)
-            if start_ticks is not None and start_ticks != process.start_ticks:  # its number is another's now
+            if start_ticks and process.start_ticks and start_ticks != process.start_ticks:  # another has its number now
                 self.close()
                 self._has_ended = True
 
@@ -100,8 +100,8 @@ def _proc_is_ours() -> bool:
         return False
 
 
-def _start_ticks(process: int | str) -> int | None:
-    """Return when a process started, in clock ticks since boot; None: that cannot be read (hidepid, or it is gone)."""
+def _start_ticks(process: int | str) -> int:
+    """Return when a process started, in clock ticks since boot; 0: that cannot be read (hidepid, no descriptor)."""
     with contextlib.suppress(OSError), open(f"/proc/{process}/stat", encoding="ascii", errors="replace") as file:
         return int(file.read().rpartition(")")[2].split()[19])
-    return None
+    return 0

@@ -270,6 +270,10 @@ class RingReader(Generic[FrameT]):
         raise self._overrun()
 
     def _overrun(self) -> Overrun:
+        if not self.segment.writer_lives():
+            return Overrun(
+                f"{self.segment.path}: its writer is dead, and its newest frame is not whole; start it again"
+            )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
             f"give the service more slots (it has {self._count}) or publish less often"
@@ -357,7 +361,7 @@ class RingReader(Generic[FrameT]):
             frame = self._frame_class(self, self._slots[slot], self._slot_words[slot])
             if frame.sequence == wanted and frame.valid:
                 return frame
-        raise Overrun(f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row")
+        raise self._overrun()
 
 
 def slots_of(segment: Segment) -> list[memoryview]:

@@ -12,6 +12,7 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from errno import EMFILE, ENFILE, ENOMEM
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from skinware.memory.schema import STATIC_NAME, Schema, from_file
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_LEAST = file_layout.COLUMN_OFFSET
 _COUNT = struct.Struct("<Q")
+_MOST_FRAMES = 1 << 62
+"""A greater count is of a forged or damaged file: 146,000 years at 1 MHz."""
 _HOLDER = struct.Struct("<QQQ")
 """In the file of a name's lock, behind the count: the :class:`Process` that took it last."""
 _ORPHAN_S = 2.0
@@ -208,11 +211,12 @@ def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:
     """Frames that were published under a name before.
 
     A writer that is closed leaves the count in the file of the lock (:func:`note_published`), one that is killed in its
-    ring.
+    ring. Absurd counts are not believed.
     """
-    told = os.pread(name_lock.fd, _COUNT.size, 0)
-    count: int = _COUNT.unpack(told)[0] if len(told) == _COUNT.size else 0
-    return max(count, last.published if last is not None else 0)
+    noted = os.pread(name_lock.fd, _COUNT.size, 0)
+    count: int = _COUNT.unpack(noted)[0] if len(noted) == _COUNT.size else 0
+    counts = (count, last.published if last is not None else 0)
+    return max((count for count in counts if count <= _MOST_FRAMES), default=0)
 
 
 def note_published(name_lock: Descriptor, count: int) -> None:
@@ -332,7 +336,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     Raises:
         ServiceNotFound: there is none.
         BadServiceFile: the file is not one that can be read safely.
-        NamespaceError: the namespace cannot be trusted or read.
+        NamespaceError: the namespace cannot be trusted or read, or this program has no descriptors or memory left.
     """
     if not namespace.exists():
         raise ServiceNotFound(_not_found(namespace, name))
@@ -343,7 +347,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     except FileNotFoundError:
         raise ServiceNotFound(_not_found(namespace, name)) from None
     except OSError as error:
-        raise BadServiceFile(f"{path}: cannot be opened ({error.strerror}); not attached") from None
+        raise _cannot(path, "opened", error) from None
     descriptor = Descriptor(fd)
     try:
         info = os.fstat(fd)
@@ -356,7 +360,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
         try:
             data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
         except OSError as error:
-            raise BadServiceFile(f"{path}: cannot be mapped ({error.strerror}); not attached") from None
+            raise _cannot(path, "mapped", error) from None
         segment = Segment(
             str(path), header, layout, data, descriptor, _inode(fd), Schema(), ProcessWatch(_maker(header))
         )
@@ -365,6 +369,15 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
         descriptor.close()
         raise
     return segment
+
+
+def _cannot(path: Path, what: str, error: OSError) -> BadServiceFile | NamespaceError:
+    """The error for a file that the system does not open or map: the file's fault, or a limit of this program."""
+    if error.errno in (EMFILE, ENFILE):
+        return NamespaceError(f"{path} cannot be {what}: no more file descriptors (raise the limit, ulimit -n)")
+    if error.errno == ENOMEM:
+        return NamespaceError(f"{path} cannot be {what}: no memory or address space left (ulimit -v)")
+    return BadServiceFile(f"{path}: cannot be {what} ({error.strerror}); not attached")
 
 
 def recorded(head: bytes, name: str) -> Segment:

@@ -56,7 +56,8 @@ def test_of_other_pid_namespaces_and_without_rights_nothing_is_known(monkeypatch
     ended = this_process()._replace(start_ticks=1)
     assert has_ended(ended)
     assert not has_ended(ended._replace(pid_namespace=ended.pid_namespace + 1))
-    monkeypatch.setattr(processes, "_start_ticks", lambda _: None)  # hidepid
+    assert not has_ended(ended._replace(start_ticks=0))
+    monkeypatch.setattr(processes, "_start_ticks", lambda _: 0)  # hidepid
     assert not has_ended(ended)
 
 

@@ -22,7 +22,7 @@ class Patches:
         for _ in range(10 * seconds):
             self.time_ns += NS_PER_S // 10
             self.updates += np.round(3 * np.array(ratios)).astype(np.int64)
-            reported += self.doubles.look(self.updates)
+            reported += [(patch, round(ratio, 3)) for patch, ratio in self.doubles.look(self.updates)]
         return reported
 
 

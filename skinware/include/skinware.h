@@ -397,6 +397,8 @@ typedef struct skinware__slot {
 
 typedef char skinware__slot_has_64_bytes[sizeof(skinware__slot) == 64 ? 1 : -1];
 
+#define SKINWARE__AHEAD_NS 200000000 /* how far ahead of the clock a stamp may be: clocks of two machines differ a little */
+
 enum { SKINWARE__LATEST_OFFSET = 512, SKINWARE__WAKE_WORD_OFFSET = 520, SKINWARE__STATE_OFFSET = 524 };
 
 /* A mapped file, and where its slots are. */
@@ -1320,8 +1322,6 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
     }
     return count;
 }
-
-#define SKINWARE__AHEAD_NS 200000000 /* how far ahead of the clock a stamp may be: clocks of two machines differ a little */
 
 static int64_t skinware__age_limit_ns(int64_t period_ns) {
     const int64_t most_ns = (int64_t)86400 * 1000000000; /* of a forged file */

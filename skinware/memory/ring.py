@@ -22,6 +22,7 @@ COPY_ATTEMPTS = 64
 """How often a reader tries again while the writer overwrites what it copies."""
 LATEST = file_layout.LATEST_OFFSET // 8
 MISSED_PERIODS = file_layout.MISSED_PERIODS_OFFSET // 8
+AHEAD = file_layout.AHEAD_OFFSET // 8
 WAKE_WORD = file_layout.WAKE_WORD_OFFSET // 4
 STATE = file_layout.STATE_OFFSET // 4
 SEQUENCE, ACQUIRED, PUBLISHED, FLAGS = range(4)  # 8-byte words of a slot's header

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import random
 import struct
 import subprocess
 import sys
@@ -18,7 +20,14 @@ from hypothesis import strategies as st
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.driver_service import DriverReader, DriverWriter
-from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.errors import (
+    BadServiceFile,
+    NamespaceError,
+    Overrun,
+    ServiceNotFound,
+    ServiceTimeout,
+    SkinwareError,
+)
 from skinware.memory import file_layout
 from skinware.memory.schema import STATIC_NAME, from_file
 from skinware.service import Column
@@ -343,3 +352,28 @@ def test_no_schema_does_harm(text: bytes) -> None:
         return
     values = schema.columns["values"]
     assert values.dtype.itemsize * np.prod(values.shape) == 20
+
+
+@pytest.mark.usefixtures("data_path")
+def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(namespace: Namespace) -> None:
+    """Only the size of the file stays: all else changes between the looks of a reader that has attached."""
+    generator = random.Random(7)
+    with ServiceWriter("x", {"values": ("<u8", 512)}, {"table": np.arange(5, dtype="<u4")}) as writer:
+        writer.begin()
+        writer.commit(1)
+        with ServiceReader[Frame]("x") as reader, open(namespace.ring_path("x"), "r+b", buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+            for _ in range(300):
+                offset = generator.choice([0, 512, 1152, generator.randrange(size)])
+                os.pwrite(file.fileno(), generator.randbytes(min(640, size - offset)), offset)
+                for take in (
+                    partial(reader.read, timeout_s=0),
+                    partial(reader.read, newer_than=(0, 0), timeout_s=0.001),
+                    partial(next, reader.in_order(timeout_s=0)),
+                    partial(next, reader.frames(timeout_s=0)),
+                    reader.refresh,
+                ):
+                    with contextlib.suppress(SkinwareError):
+                        take()
+                assert reader.statistics.lost >= 0
+                assert reader.rate_hz() is None or reader.writer_statistics.published >= 0

@@ -122,7 +122,7 @@ def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
 
 def is_wished(namespace: Namespace, what: str) -> bool:
     """Whether somebody who lives announces ``what`` in the place of a service's name: a wish to those who publish."""
-    for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
+    for path in namespace.reader_files(_MOST_FILES):
         if path.name.startswith(f"{what}."):
             with contextlib.suppress(OSError):
                 fd = _open(path)

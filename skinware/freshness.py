@@ -11,7 +11,7 @@ import numpy.typing as npt
 _PERIODS = 3
 _LEAST_NS = 200_000_000
 _WITHOUT_PERIOD_NS = 1_000_000_000
-_AHEAD_NS = 200_000_000
+AHEAD_NS = 200_000_000
 """How far ahead of the clock a stamp may be: clocks of two machines differ a little. Beyond it, no age is known."""
 LONGEST_PERIOD_S = 86_400.0
 """That anything may have: a day."""
@@ -52,6 +52,6 @@ def is_fresh(
     """
     if not alive:
         return np.zeros(status.shape, bool)
-    is_recent = (time_ns >= at_ns - max_age_ns) & (time_ns <= at_ns + _AHEAD_NS)
+    is_recent = (time_ns >= at_ns - max_age_ns) & (time_ns <= at_ns + AHEAD_NS)
     fresh: npt.NDArray[np.bool_] = (status == 0) & (time_ns > 0) & is_recent
     return fresh

@@ -9,7 +9,15 @@ from typing import Any, Self
 from skinware._renamed import renamed
 from skinware.driver_frame import DriverFrame
 from skinware.driver_service import DriverReader
-from skinware.errors import BadServiceFile, Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.errors import (
+    BadServiceFile,
+    Closed,
+    ConfigurationError,
+    NamespaceError,
+    Overrun,
+    ServiceNotFound,
+    ServiceTimeout,
+)
 from skinware.freshness import age_limit_ns
 from skinware.geometry import Geometry
 from skinware.memory import futex, segments
@@ -70,6 +78,7 @@ class Skin:
         self._on_attach, self._on_detach, self._on_structure = on_attach, on_detach, on_structure
         self._drivers, self._types = _names(drivers), _names(types)
         self._readers: dict[str, _Reader] = {}
+        self._trouble = ""  # why a driver could not be read by this program
         self._refused: dict[str, tuple[tuple[int, int], int]] = {}  # which file, and when to look at it again
         self._layout = SkinLayout((), ())
         self._in_c: Look[DriverFrame] | None = None
@@ -287,11 +296,13 @@ class Skin:
             return None
         try:
             reader = _Reader(name, namespace=self.namespace)
-        except BadServiceFile:  # not a driver; or memory was short, so that another look is worth it
+        except (BadServiceFile, NamespaceError) as error:  # not a driver; or memory was short: another look is worth it
             self._refused[name] = inode, now_ns() + _REFUSED_FOR_NS
+            self._trouble = str(error) if isinstance(error, NamespaceError) else ""
             return None
         except ServiceNotFound:
             return None  # just gone
+        self._trouble = ""
         if self._has_wanted(reader) and reader.alive and reader.latest is not None:
             return reader
         reader.close()  # another generation came in between
@@ -311,7 +322,7 @@ class Skin:
                 reader.reattach()
             except ServiceNotFound:
                 return False
-            except BadServiceFile as error:
+            except (BadServiceFile, NamespaceError) as error:
                 log.warning("driver %r left the skin: %s", reader.name, str(error))
                 return False
             if not self._has_wanted(reader):
@@ -341,6 +352,8 @@ class Skin:
         chosen = [*sorted(self._drivers or ()), *(f"with {name} sensors" for name in sorted(self._types or ()))]
         if not self._readers:
             wanted = f" ({', '.join(chosen)})" if chosen else ""
+            if self._trouble:
+                return f"no driver{wanted} can be read: {self._trouble}"
             return f"no driver{wanted} runs in namespace {self.namespace.name!r}; start one (skin-driver --bus ...)"
         return f"no driver of namespace {self.namespace.name!r} published anything newer: {', '.join(self._readers)}"
 

@@ -139,6 +139,7 @@ def _common(service: ServiceReader[Any], frame: Frame | None) -> dict[str, Any]:
         "age_ms": round(frame.age_ns / 1e6, 3) if frame else None,
         "missed_periods": statistics.missed_periods,
         "before_boot": statistics.before_boot,
+        "ahead": statistics.ahead,
         "generation": service.generation,
         "statistics": _times(statistics),
     }

@@ -305,6 +305,8 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
         parts.append(f"{plural(entry['missed_periods'], 'period')} missed")
     if entry["before_boot"]:
         parts.append(f"{plural(entry['before_boot'], 'frame')} stamped before this machine booted")
+    if entry["ahead"]:
+        parts.append(f"{plural(entry['ahead'], 'frame')} stamped in the future, with nothing fresh")
     parts.append(f"pid {entry['pid']}")
     return f"{what} {style(entry['name'], bold=True)}: {', '.join(parts)}"
 

@@ -373,6 +373,7 @@ const char *skinware_reason(void);
 
 #include <errno.h>
 #include <fcntl.h>
+#include <poll.h>
 #include <string.h>
 #include <sys/syscall.h>
 #include <time.h>
@@ -395,6 +396,8 @@ typedef struct skinware__slot {
 } skinware__slot;
 
 typedef char skinware__slot_has_64_bytes[sizeof(skinware__slot) == 64 ? 1 : -1];
+
+#define SKINWARE__AHEAD_NS 200000000 /* how far ahead of the clock a stamp may be: clocks of two machines differ a little */
 
 enum { SKINWARE__LATEST_OFFSET = 512, SKINWARE__WAKE_WORD_OFFSET = 520, SKINWARE__STATE_OFFSET = 524 };
 
@@ -475,6 +478,21 @@ static inline int skinware__is_locked(int fd) {
     return fcntl(fd, F_OFD_GETLK, &lock) == 0 && lock.l_type == F_WRLCK;
 }
 
+/* In the place of a pidfd: nothing can be known of the process, or it has ended. */
+enum { SKINWARE__UNKNOWN = -1, SKINWARE__ENDED = -2 };
+
+/*
+ * Whether the writer of a file lives: its lock is held, and the process that made the file has not ended. A child that C
+ * code forked keeps the lock of a dead parent.
+ */
+static inline int skinware__lives(int fd, int process) {
+    struct pollfd ended;
+    ended.fd = process; /* poll passes over what is below 0 */
+    ended.events = POLLIN;
+    ended.revents = 0;
+    return process != SKINWARE__ENDED && skinware__is_locked(fd) && poll(&ended, 1, 0) <= 0;
+}
+
 /* Sleep until the word is woken or differs from expected, or the time is up. 0, or the number of an error. */
 static inline int skinware__sleep(const unsigned char *word, uint32_t expected, int64_t timeout_ns) {
 #ifdef SYS_futex
@@ -502,6 +520,7 @@ static inline int skinware__sleep(const unsigned char *word, uint32_t expected, 
 #define SKINWARE_IMPLEMENTED
 
 #include <pwd.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
@@ -565,7 +584,8 @@ typedef char skinware__files_have_64_bit_offsets[sizeof(off_t) == 8 ? 1 : -1]; /
 struct skinware_reader {
     char name_space[48];
     char service[48];
-    int fd; /* asks whether the writer's lock is held; takes none */
+    int fd;      /* asks whether the writer's lock is held; takes none */
+    int process; /* pidfd of the writer, SKINWARE__UNKNOWN or SKINWARE__ENDED */
     dev_t device;
     ino_t inode;
     skinware__ring ring;
@@ -895,6 +915,48 @@ static skinware_result skinware__open_folder(const char *name_space, int *folder
     return result;
 }
 
+/* When a process started, in clock ticks since boot: field 22 of its stat in /proc; 0 if that cannot be read. */
+static uint64_t skinware__start_ticks(uint64_t pid) {
+    char path[48], text[1024];
+    const char *at;
+    int fd, field;
+    ssize_t size;
+    snprintf(path, sizeof path, "/proc/%llu/stat", (unsigned long long)pid);
+    fd = open(path, O_RDONLY | O_CLOEXEC);
+    if (fd < 0)
+        return 0;
+    size = read(fd, text, sizeof text - 1);
+    close(fd);
+    text[size > 0 ? size : 0] = '\0';
+    at = strrchr(text, ')'); /* the name before it may contain anything */
+    for (field = 2; at != NULL && field < 22; field++)
+        at = strchr(at + 1, ' ');
+    return at != NULL ? strtoull(at, NULL, 10) : 0;
+}
+
+/*
+ * A pidfd of the process that made the file; SKINWARE__ENDED if it is gone; SKINWARE__UNKNOWN in another pid namespace,
+ * with a /proc of another one, or before Linux 5.3: the lock alone decides then.
+ */
+static int skinware__watch(const skinware__header *header) {
+    struct stat here;
+    char self[24] = "";
+    uint64_t ticks;
+    int fd;
+    if (stat("/proc/self/ns/pid", &here) != 0 || (uint64_t)here.st_ino != header->pid_namespace ||
+        readlink("/proc/self", self, sizeof self - 1) <= 0 || strtoull(self, NULL, 10) != (uint64_t)getpid() ||
+        header->writer_pid > INT32_MAX)
+        return SKINWARE__UNKNOWN;
+    fd = (int)syscall(434 /* SYS_pidfd_open */, (pid_t)header->writer_pid, 0);
+    if (fd < 0)
+        return errno == ESRCH ? SKINWARE__ENDED : SKINWARE__UNKNOWN;
+    ticks = skinware__start_ticks(header->writer_pid);
+    if (ticks == 0 || header->writer_start_ticks == 0 || ticks == header->writer_start_ticks)
+        return fd;
+    close(fd); /* its number is another's now */
+    return SKINWARE__ENDED;
+}
+
 /* Opens and checks the present file of the service. Whatever is open or mapped afterwards, skinware__release ends. */
 static skinware_result skinware__open(skinware_reader *reader) {
     char file_name[56] = "";
@@ -936,6 +998,7 @@ static skinware_result skinware__open(skinware_reader *reader) {
     reader->map_size = (size_t)reader->header.file_size;
     reader->device = info.st_dev;
     reader->inode = info.st_ino;
+    reader->process = skinware__watch(&reader->header);
     return skinware_is_driver(reader) ? skinware__read_driver(reader) : SKINWARE_OK;
 }
 
@@ -944,6 +1007,8 @@ static void skinware__release(skinware_reader *reader) {
         munmap((void *)(uintptr_t)reader->ring.map, reader->map_size);
     if (reader->fd >= 0)
         close(reader->fd);
+    if (reader->process >= 0)
+        close(reader->process);
     free(reader->types);
     free(reader);
 }
@@ -961,6 +1026,7 @@ skinware_result skinware_attach(skinware_reader **reader, const char *name_space
     if (made == NULL)
         return skinware__fail(SKINWARE_NO_MEMORY, "no memory for a reader");
     made->fd = -1;
+    made->process = SKINWARE__UNKNOWN;
     strcat(made->name_space, name_space);
     strcat(made->service, service);
     result = skinware__open(made);
@@ -1031,7 +1097,7 @@ skinware_result skinware_wait(skinware_reader *reader, const skinware_frame *new
         if (latest != 0 && (newer_than == NULL || newer_than->generation != reader->header.generation ||
                             newer_than->sequence != latest))
             return SKINWARE_OK;
-        gone = (state & SKINWARE_STATE_CLOSED) || (look_around && !skinware__is_locked(reader->fd));
+        gone = (state & SKINWARE_STATE_CLOSED) || (look_around && !skinware__lives(reader->fd, reader->process));
         if (gone && !reader->told_gone) {
             reader->told_gone = 1;
             return SKINWARE_GONE;
@@ -1069,6 +1135,11 @@ static void skinware__fill(const skinware_reader *reader, skinware_frame *frame,
     frame->size = (size_t)reader->header.slot_stride;
 }
 
+static skinware_result skinware__overrun(int alive) {
+    return skinware__fail(SKINWARE_OVERRUN, alive ? "give the service more slots, or publish less often"
+                                                  : "its writer is dead, and its newest frame is not whole; start it again");
+}
+
 skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
     const size_t size = (size_t)reader->header.slot_stride;
     const int alive = skinware_is_alive(reader);
@@ -1092,7 +1163,7 @@ skinware_result skinware_read(skinware_reader *reader, skinware_frame *frame) {
     }
     frame->bytes = NULL; /* half of one frame, half of another */
     frame->generation = frame->sequence = 0;
-    return skinware__fail(SKINWARE_OVERRUN, "give the service more slots, or publish less often");
+    return skinware__overrun(alive);
 }
 
 skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame) {
@@ -1112,7 +1183,7 @@ skinware_result skinware_view(skinware_reader *reader, skinware_frame *frame) {
             return SKINWARE_OK;
         }
     }
-    return skinware__fail(SKINWARE_OVERRUN, "give the service more slots, or publish less often");
+    return skinware__overrun(alive);
 }
 
 int skinware_valid(const skinware_frame *frame) {
@@ -1252,8 +1323,6 @@ size_t skinware_physical(const skinware_frame *frame, const skinware_column *val
     return count;
 }
 
-#define SKINWARE__AHEAD_NS 200000000 /* how far ahead of the clock a stamp may be: clocks of two machines differ a little */
-
 static int64_t skinware__age_limit_ns(int64_t period_ns) {
     const int64_t most_ns = (int64_t)86400 * 1000000000; /* of a forged file */
     if (period_ns <= 0)
@@ -1297,7 +1366,7 @@ size_t skinware_fresh(const skinware_reader *reader, const skinware_frame *frame
 /* -- the state of things ------------------------------------------------------------------------------------------ */
 
 int skinware_is_alive(const skinware_reader *reader) {
-    return !(skinware_state(reader) & SKINWARE_STATE_CLOSED) && skinware__is_locked(reader->fd);
+    return !(skinware_state(reader) & SKINWARE_STATE_CLOSED) && skinware__lives(reader->fd, reader->process);
 }
 
 uint32_t skinware_state(const skinware_reader *reader) {

@@ -20,7 +20,9 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram, Spread
 
 MOST_ANNOUNCEMENTS = 1000
-"""Nobody looks at more of them at once."""
+"""A look ends after so many that it cannot remove: those of living readers, and junk of others."""
+_MOST_FILES = 10_000
+"""A look removes fewer than these of dead readers."""
 _SIZE = 2048
 _READ_ATTEMPTS = 5
 
@@ -95,6 +97,9 @@ class Announcement:
             self._path.unlink()
         self._descriptor.close()
 
+    def __del__(self) -> None:
+        self.close()  # a reader that is dropped leaves nothing
+
     def _make(self) -> None:
         with contextlib.suppress(OSError):
             descriptor = Descriptor(os.open(self._folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o640))
@@ -117,7 +122,7 @@ def living_readers(namespace: Namespace) -> Iterator[ReaderRecord]:
 
 def is_wished(namespace: Namespace, what: str) -> bool:
     """Whether somebody who lives announces ``what`` in the place of a service's name: a wish to those who publish."""
-    for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
+    for path in namespace.reader_files(_MOST_FILES):
         if path.name.startswith(f"{what}."):
             with contextlib.suppress(OSError):
                 fd = _open(path)
@@ -132,8 +137,7 @@ def is_wished(namespace: Namespace, what: str) -> bool:
 def sweep(namespace: Namespace) -> None:
     """Remove what dead readers left behind, as far as this user may.
 
-    It looks at ``MOST_ANNOUNCEMENTS`` files at most: however many somebody puts there, they delay nobody. The next
-    look goes on.
+    It is bounded, however many files somebody puts there. The next look goes on.
     """
     for _ in _living(namespace):
         pass
@@ -141,7 +145,11 @@ def sweep(namespace: Namespace) -> None:
 
 def _living(namespace: Namespace) -> Iterator[int]:
     """Open announcements of readers that are alive; those of dead ones are removed."""
-    for path in namespace.reader_files(MOST_ANNOUNCEMENTS):
+    left = MOST_ANNOUNCEMENTS
+    for path in namespace.reader_files(_MOST_FILES):
+        if not left:
+            break
+        left -= 1
         with contextlib.suppress(OSError):
             fd = _open(path)
             try:
@@ -149,6 +157,7 @@ def _living(namespace: Namespace) -> Iterator[int]:
                     yield fd
                 else:
                     path.unlink()
+                    left += 1
             finally:
                 os.close(fd)
 

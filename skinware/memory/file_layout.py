@@ -76,14 +76,17 @@ LATEST_OFFSET = CONTROL_OFFSET
 WAKE_WORD_OFFSET = CONTROL_OFFSET + 8
 STATE_OFFSET = CONTROL_OFFSET + 12
 MISSED_PERIODS_OFFSET = CONTROL_OFFSET + 16
+AHEAD_OFFSET = CONTROL_OFFSET + 24
 CONTROL = _packed(
     64,
     ("latest", "<u8", 0),
     ("wake_word", "<u4", 8),
     ("state", "<u4", 12),
     ("missed_periods", "<u8", 16),
+    ("ahead", "<u8", 24),
 )
-"""``latest``: newest sequence, 0 before the first. ``wake_word``: the futex. ``state``: see the constants."""
+"""``latest``: newest sequence, 0 before the first. ``wake_word``: the futex. ``state``: see the constants. ``ahead``:
+stamps that lay more than 0.2 s in the future."""
 
 STATE_PAUSED = 1
 """The writer publishes nothing until it resumes."""

@@ -142,6 +142,8 @@ class Namespace:
                 f"{self.path} may not be read by {_user_name(os.geteuid())}; ask its owner"
                 f" {_user_name(self.path.stat().st_uid)} to add you to its group"
             ) from None
+        except OSError as error:  # no descriptors left
+            raise NamespaceError(f"{self.path} cannot be read: {error.strerror}") from None
 
     @property
     def calm_name(self) -> str:
@@ -169,7 +171,7 @@ class Namespace:
         try:
             with os.scandir(self.readers_path) as entries:
                 names = sorted(entry.name for entry in itertools.islice(entries, most))
-        except (FileNotFoundError, PermissionError):
+        except OSError:  # not there, not ours to read, or no descriptors left
             return
         for name in names:
             yield self.readers_path / name

@@ -68,6 +68,7 @@ class _TurnsState(_Ring):
         ("timeout_ns", ctypes.c_int64),
         ("begun_ns", ctypes.c_int64),
         ("descriptor", ctypes.c_int64),
+        ("writer", ctypes.c_int64),
         ("process", ctypes.c_int64),
         ("frames", ctypes.c_uint64),
         ("lost", ctypes.c_uint64),
@@ -92,7 +93,8 @@ class NativeRingReader(RingReader[FrameT]):
         self._request_at = ctypes.byref(self._request)
         self._turns = _TurnsState(*_ring_words(segment))
         self._turns_at = ctypes.byref(self._turns)
-        self._turns.descriptor, self._turns.process = segment.descriptor.fd, os.getpid()
+        self._turns.descriptor, self._turns.writer = segment.descriptor.fd, segment.maker.fd_for_c
+        self._turns.process = os.getpid()
         self._turns.timeout_ns = _NEVER_NS
         self._timeout_ns: int | None = None
         self._in_order = False

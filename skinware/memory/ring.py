@@ -22,6 +22,7 @@ COPY_ATTEMPTS = 64
 """How often a reader tries again while the writer overwrites what it copies."""
 LATEST = file_layout.LATEST_OFFSET // 8
 MISSED_PERIODS = file_layout.MISSED_PERIODS_OFFSET // 8
+AHEAD = file_layout.AHEAD_OFFSET // 8
 WAKE_WORD = file_layout.WAKE_WORD_OFFSET // 4
 STATE = file_layout.STATE_OFFSET // 4
 SEQUENCE, ACQUIRED, PUBLISHED, FLAGS = range(4)  # 8-byte words of a slot's header
@@ -270,6 +271,10 @@ class RingReader(Generic[FrameT]):
         raise self._overrun()
 
     def _overrun(self) -> Overrun:
+        if not self.segment.writer_lives():
+            return Overrun(
+                f"{self.segment.path}: its writer is dead, and its newest frame is not whole; start it again"
+            )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
             f"give the service more slots (it has {self._count}) or publish less often"
@@ -357,7 +362,7 @@ class RingReader(Generic[FrameT]):
             frame = self._frame_class(self, self._slots[slot], self._slot_words[slot])
             if frame.sequence == wanted and frame.valid:
                 return frame
-        raise Overrun(f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row")
+        raise self._overrun()
 
 
 def slots_of(segment: Segment) -> list[memoryview]:

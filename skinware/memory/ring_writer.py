@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import Closed, ServiceError
+from skinware.freshness import AHEAD_NS
 from skinware.memory import file_layout, futex
 from skinware.memory._fences import fence
 from skinware.memory.ring import (
     ACQUIRED,
+    AHEAD,
     FLAGS,
     LATEST,
     MISSED_PERIODS,
@@ -113,7 +115,8 @@ class RingWriter:
 
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
-                machine booted) it counts as 0, and in ``WriterStatistics.before_boot``.
+                machine booted) it counts as 0, and in ``WriterStatistics.before_boot``. More than 0.2 s in the future
+                it stays as it is, is fresh for nobody, and counts in ``WriterStatistics.ahead``.
             flags: bits for the service's own use.
 
         Returns:
@@ -172,6 +175,8 @@ class RingWriter:
     def _note(self, begun_ns: int, published_ns: int, acquired_ns: int) -> None:
         """Statistics of one publication, after the readers have been woken."""
         words = self._statistics
+        if acquired_ns - published_ns > AHEAD_NS:
+            self._words[AHEAD] += 1
         words[_AGE + bucket_of(published_ns - acquired_ns)] += 1
         words[_TIMED] = timed = words[_TIMED] + 1
         cpu_ns = time.thread_time_ns()

@@ -12,6 +12,7 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from errno import EMFILE, ENFILE, ENOMEM
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,16 @@ from skinware.memory._fences import fence
 from skinware.memory.file_layout import Layout
 from skinware.memory.locks import Descriptor, is_locked, try_lock
 from skinware.memory.namespace import Namespace
+from skinware.memory.processes import Process, ProcessWatch, has_ended, this_process
 from skinware.memory.schema import STATIC_NAME, Schema, from_file
 
 _OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO in our place must not block us
 _HEAD_LEAST = file_layout.COLUMN_OFFSET
 _COUNT = struct.Struct("<Q")
+_MOST_FRAMES = 1 << 62
+"""A greater count is of a forged or damaged file: 146,000 years at 1 MHz."""
+_HOLDER = struct.Struct("<QQQ")
+"""In the file of a name's lock, behind the count: the :class:`Process` that took it last."""
 _ORPHAN_S = 2.0
 """How long a child that was forked just before its parent was killed may take to close the lock that it inherited."""
 _HEAD_BYTES = file_layout.COLUMN_OFFSET + file_layout.COLUMN.itemsize * file_layout.MAX_COLUMNS
@@ -44,6 +50,7 @@ class Segment:
         layout: where the columns are.
         data: (file_size,) uint8, the whole map; read-only for readers.
         descriptor: the open file: the writer's holds the lock, the reader's queries it.
+        maker: answers a reader whether the process that made it has ended.
         inode: (device, inode), which tells generations of one name apart.
         schema: what the columns of the slots look like to users.
     """
@@ -55,6 +62,7 @@ class Segment:
     descriptor: Descriptor
     inode: tuple[int, int]
     schema: Schema
+    maker: ProcessWatch
 
     @property
     def generation(self) -> int:
@@ -91,9 +99,18 @@ class Segment:
         return self.data[offset : offset + dtype.itemsize * count].view(dtype)
 
     def writer_lives(self) -> bool:
-        """Whether the process that created this generation still holds its lock."""
+        """Whether the lock of this generation is held, and the process that made it has not ended.
+
+        Both are needed: a child that C forked keeps the lock of a dead parent, and a pid says nothing in another pid
+        namespace.
+        """
         fd = self.descriptor.fd
-        return fd >= 0 and is_locked(fd)
+        return fd >= 0 and is_locked(fd) and not self.maker.has_ended()
+
+    def close(self) -> None:
+        """Close its descriptors, and let go of its lock; the map stays as long as its arrays. Idempotent."""
+        self.descriptor.close()
+        self.maker.close()
 
     def mark(self, state: int) -> None:
         """Set bits of the state word and wake everybody who waits (needs a writable map)."""
@@ -107,29 +124,33 @@ class Segment:
 def take_name(namespace: Namespace, name: str) -> Descriptor:
     """Become the owner of a service's name, for as long as the returned descriptor is open.
 
-    What the owner before left half made or cannot take back (it was killed) is removed. Of one that was killed while it
-    forked, the child may still have the lock: that moment is waited for.
+    What the owner before left half made or cannot take back (it was killed) is removed. A child of a killed owner may
+    still have the lock: for a moment where Python forked it, which is waited for, and as long as it lives where C did;
+    its lock's file is then replaced.
 
     Raises:
         NameInUse: a living process owns it.
         NamespaceError: the lock file cannot be used.
     """
     path = namespace.lock_path(name)
-    try:
-        fd = os.open(path, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600)
-    except OSError as error:
-        raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
-    descriptor = Descriptor(fd)
     deadline = time.monotonic() + _ORPHAN_S
-    while not try_lock(fd):
-        if time.monotonic() < deadline and _maker_is_dead(namespace, name):
+    while True:
+        descriptor = _opened_lock(path)
+        if try_lock(descriptor.fd):
+            _note_holder(descriptor.fd, path)
+            if current_inode(path) == _inode(descriptor.fd):
+                break  # otherwise it was removed or replaced meanwhile
+        elif not _holder_has_ended(descriptor.fd):
+            descriptor.close()
+            raise NameInUse(
+                f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
+                " stop it (skin-info shows its pid), or choose another name or namespace (SKINWARE_NAMESPACE)"
+            )
+        elif time.monotonic() > deadline:
+            _replace_lock(namespace, name, descriptor)
+        else:
             time.sleep(0.005)
-            continue
         descriptor.close()
-        raise NameInUse(
-            f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
-            " stop it (skin-info shows its pid), or choose another name or namespace (SKINWARE_NAMESPACE)"
-        )
     try:
         _remove_leftovers(namespace, name)
     except OSError as error:
@@ -138,14 +159,44 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
     return descriptor
 
 
-def _maker_is_dead(namespace: Namespace, name: str) -> bool:
-    """Whether the process that made the newest generation has ended, as far as that can be known here."""
+def _opened_lock(path: Path) -> Descriptor:
     try:
-        header = attach(namespace, name).header
-    except (ServiceNotFound, BadServiceFile):
-        return False
-    is_here = header["pid_namespace"] == os.stat("/proc/self/ns/pid").st_ino
-    return bool(is_here and _start_ticks(int(header["writer_pid"])) != header["writer_start_ticks"])
+        return Descriptor(os.open(path, _OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600))
+    except OSError as error:
+        raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
+
+
+def _note_holder(fd: int, path: Path) -> None:
+    try:
+        os.pwrite(fd, _HOLDER.pack(*this_process()), _COUNT.size)
+    except OSError as error:
+        raise NamespaceError(f"cannot write the lock {path}: {error.strerror}") from None
+
+
+def _holder_has_ended(fd: int) -> bool:
+    """Whether the process that took a lock has ended, so that a child of it holds the lock."""
+    noted = os.pread(fd, _HOLDER.size, _COUNT.size)
+    return len(noted) == _HOLDER.size and has_ended(Process(*_HOLDER.unpack(noted)))
+
+
+def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
+    """Put a free lock in the place of one that a child of a dead owner holds; the count in it is kept.
+
+    Two that do so at once are told apart as after any removal of the file: the owner notices within a second that its
+    lock is gone (``Ownership.keep_files``).
+    """
+    path = namespace.lock_path(name)
+    if current_inode(path) != _inode(held.fd):
+        return
+    temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
+    try:
+        with open(os.open(temporary, _OPEN_FLAGS | os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(os.pread(held.fd, _COUNT.size, 0))
+        os.rename(temporary, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise NamespaceError(f"cannot replace the lock {path}: {error.strerror}") from None
 
 
 def previous(namespace: Namespace, name: str) -> Segment | None:
@@ -160,11 +211,12 @@ def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:
     """Frames that were published under a name before.
 
     A writer that is closed leaves the count in the file of the lock (:func:`note_published`), one that is killed in its
-    ring.
+    ring. Absurd counts are not believed.
     """
-    told = os.pread(name_lock.fd, _COUNT.size, 0)
-    count: int = _COUNT.unpack(told)[0] if len(told) == _COUNT.size else 0
-    return max(count, last.published if last is not None else 0)
+    noted = os.pread(name_lock.fd, _COUNT.size, 0)
+    count: int = _COUNT.unpack(noted)[0] if len(noted) == _COUNT.size else 0
+    counts = (count, last.published if last is not None else 0)
+    return max((count for count in counts if count <= _MOST_FRAMES), default=0)
 
 
 def note_published(name_lock: Descriptor, count: int) -> None:
@@ -215,8 +267,7 @@ def create(
     except OSError as error:
         where = namespace.ring_path(name)
         raise NamespaceError(f"cannot make {where} ({layout.file_size} bytes): {error.strerror}") from None
-    info = os.fstat(fd)
-    return Segment(str(temporary), header[0], layout, data, descriptor, (info.st_dev, info.st_ino), schema)
+    return Segment(str(temporary), header[0], layout, data, descriptor, _inode(fd), schema, ProcessWatch(None))
 
 
 def _write_head(
@@ -252,7 +303,7 @@ def discard(segment: Segment) -> None:
     """Remove a generation that was created and not published."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(segment.path)
-    segment.descriptor.close()
+    segment.close()
 
 
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
@@ -285,7 +336,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     Raises:
         ServiceNotFound: there is none.
         BadServiceFile: the file is not one that can be read safely.
-        NamespaceError: the namespace cannot be trusted or read.
+        NamespaceError: the namespace cannot be trusted or read, or this program has no descriptors or memory left.
     """
     if not namespace.exists():
         raise ServiceNotFound(_not_found(namespace, name))
@@ -296,7 +347,7 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
     except FileNotFoundError:
         raise ServiceNotFound(_not_found(namespace, name)) from None
     except OSError as error:
-        raise BadServiceFile(f"{path}: cannot be opened ({error.strerror}); not attached") from None
+        raise _cannot(path, "opened", error) from None
     descriptor = Descriptor(fd)
     try:
         info = os.fstat(fd)
@@ -309,14 +360,24 @@ def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segmen
         try:
             data = np.frombuffer(mmap.mmap(fd, info.st_size, prot=protection), np.uint8)
         except OSError as error:
-            raise BadServiceFile(f"{path}: cannot be mapped ({error.strerror}); not attached") from None
-        inode = info.st_dev, info.st_ino
-        segment = Segment(str(path), header, layout, data, descriptor, inode, Schema())
+            raise _cannot(path, "mapped", error) from None
+        segment = Segment(
+            str(path), header, layout, data, descriptor, _inode(fd), Schema(), ProcessWatch(_maker(header))
+        )
         segment.schema = from_file(layout, segment.static_columns(), str(path))
     except BaseException:
         descriptor.close()
         raise
     return segment
+
+
+def _cannot(path: Path, what: str, error: OSError) -> BadServiceFile | NamespaceError:
+    """The error for a file that the system does not open or map: the file's fault, or a limit of this program."""
+    if error.errno in (EMFILE, ENFILE):
+        return NamespaceError(f"{path} cannot be {what}: no more file descriptors (raise the limit, ulimit -n)")
+    if error.errno == ENOMEM:
+        return NamespaceError(f"{path} cannot be {what}: no memory or address space left (ulimit -v)")
+    return BadServiceFile(f"{path}: cannot be {what} ({error.strerror}); not attached")
 
 
 def recorded(head: bytes, name: str) -> Segment:
@@ -334,7 +395,7 @@ def recorded(head: bytes, name: str) -> Segment:
     if layout.slot_offset != len(head):
         raise BadServiceFile(f"{name}: a head of {len(head)} bytes, not of {layout.slot_offset}")
     data = np.frombuffer(head, np.uint8)
-    segment = Segment(name, header, layout, data, Descriptor(-1), (0, 0), Schema())
+    segment = Segment(name, header, layout, data, Descriptor(-1), (0, 0), Schema(), ProcessWatch(None))
     segment.schema = from_file(layout, segment.static_columns(), name)
     return segment
 
@@ -372,6 +433,15 @@ def current_inode(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     return info.st_dev, info.st_ino
 
 
+def _inode(fd: int) -> tuple[int, int]:
+    info = os.fstat(fd)
+    return info.st_dev, info.st_ino
+
+
+def _maker(header: np.void) -> Process:
+    return Process(int(header["writer_pid"]), int(header["writer_start_ticks"]), int(header["pid_namespace"]))
+
+
 def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
     """(device, inode) of a service's present file if its writer lives and has published; maps and checks nothing."""
     try:
@@ -379,9 +449,10 @@ def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
     except OSError:
         return None
     try:
-        info = os.fstat(fd)
-        has_published = any(os.pread(fd, 8, file_layout.LATEST_OFFSET))
-        return (info.st_dev, info.st_ino) if has_published and is_locked(fd) else None
+        head = os.pread(fd, file_layout.LATEST_OFFSET + 8, 0)
+        if not any(head[file_layout.LATEST_OFFSET :]) or not is_locked(fd):
+            return None
+        return None if has_ended(_maker(np.frombuffer(head, file_layout.HEADER, 1)[0])) else _inode(fd)
     except OSError:
         return None
     finally:
@@ -405,20 +476,9 @@ def _header(
     header["column_count"] = len(layout.static) + len(layout.slot)
     header["slot_count"], header["slot_offset"] = layout.slot_count, layout.slot_offset
     header["slot_stride"] = layout.slot_stride
-    header["writer_pid"], header["writer_start_ticks"] = os.getpid(), _start_ticks()
-    header["pid_namespace"] = os.stat("/proc/self/ns/pid").st_ino
+    header["writer_pid"], header["writer_start_ticks"], header["pid_namespace"] = this_process()
     header["period_ns"] = period_ns
     header["kind"], header["name"] = kind.encode(), name.encode()
     header["digest"] = np.frombuffer(digest, "V32")
     header["published_before"] = published_before
     return header
-
-
-def _start_ticks(process: int | str = "self") -> int:
-    """When a process began, in clock ticks since boot; 0: it has ended. Fields 22 and 3 of proc(5) stat."""
-    try:
-        with open(f"/proc/{process}/stat", encoding="ascii", errors="replace") as file:
-            fields = file.read().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return int(fields[19]) if fields[0] not in "ZX" else 0

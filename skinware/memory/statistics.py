@@ -80,6 +80,7 @@ class WriterStatistics(msgspec.Struct):
         published: frames.
         missed_periods: periods in which it published nothing because it was late.
         before_boot: frames whose ``acquired_ns`` lay before this machine booted, and counts as 0.
+        ahead: frames whose ``acquired_ns`` lay more than 0.2 s in the future, so that nothing in them is fresh.
         wall: from ``begin`` to ``commit``.
         cpu: from one publication to the next, on a processor.
         age: how old the newest data of a frame was when it was published.
@@ -89,6 +90,7 @@ class WriterStatistics(msgspec.Struct):
     published: int
     missed_periods: int
     before_boot: int
+    ahead: int
     wall: Spread
     cpu: Spread
     age: Histogram
@@ -110,6 +112,7 @@ def read_statistics(data: npt.NDArray[np.uint8]) -> WriterStatistics:
         int(control["latest"]),
         int(control["missed_periods"]),
         int(words["before_boot"]),
+        int(control["ahead"]),
         spread("wall"),
         spread("cpu"),
         Histogram(words["age"].tolist()),

@@ -14,7 +14,7 @@ from pathlib import Path
 
 __all__ = ["ABI", "Library", "Loaded", "core", "load", "path", "why_python"]
 
-ABI = 4
+ABI = 6
 """Of the core's own library, ``library.c``: both change together."""
 
 _CORE = Path(__file__).with_name("libskinware.so")

@@ -6,7 +6,7 @@
 #include "ring.h"
 
 /* Changes whenever a function or structure here does; skinware/native/__init__.py has the same number. */
-#define ABI 4
+#define ABI 6
 
 /* What a reader asks for. The map outlives it. */
 typedef struct skinware_native_request {

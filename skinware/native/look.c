@@ -55,7 +55,7 @@ static int writers_live(skinware_native_look *look, int64_t now_ns) {
     if (now_ns - look->asked_ns < SLICE_NS)
         return 1;
     for (i = 0; i < look->count; i++)
-        if (!skinware__is_locked((int)look->rings[i].turns->descriptor))
+        if (!skinware__writer_lives(look->rings[i].turns))
             return 0;
     look->asked_ns = now_ns;
     return 1;

@@ -25,6 +25,7 @@ enum { SKINWARE__COPY_ATTEMPTS = 64 };
 
 /* Words of 8 bytes from the beginning of the file. */
 enum {
+    SKINWARE__WORD_AHEAD = 536 / 8,
     SKINWARE__WORD_TIMED = 576 / 8,
     SKINWARE__WORD_WALL = 584 / 8, /* best, worst, total; so for the next */
     SKINWARE__WORD_CPU = 608 / 8,
@@ -94,6 +95,8 @@ static inline void skinware__note(skinware_ring_writer *writer, int64_t begun_ns
     const int64_t passed_ns = cpu_ns > writer->cpu_ns ? cpu_ns - writer->cpu_ns : 0; /* below 0: of another thread */
     const uint64_t timed = skinware__statistic(writer, SKINWARE__WORD_TIMED) + 1;
     writer->cpu_ns = cpu_ns;
+    if (acquired_ns - published_ns > SKINWARE__AHEAD_NS)
+        skinware__add_statistic(writer, SKINWARE__WORD_AHEAD, 1);
     skinware__add_statistic(writer, SKINWARE__WORD_AGE + skinware__bucket(published_ns - acquired_ns), 1);
     skinware__set_statistic(writer, SKINWARE__WORD_TIMED, timed);
     skinware__note_spread(writer, SKINWARE__WORD_WALL, published_ns - begun_ns, timed == 1);
@@ -136,7 +139,8 @@ static inline void skinware_ring_wake(const skinware_ring_writer *writer) {
 /*
  * Publish what was filled in since the begin, and wake all readers.
  *
- * acquired_ns: newest time stamp of the data; one from before this machine booted (below 0) counts as 0, and is counted.
+ * acquired_ns: newest time stamp of the data; one from before this machine booted (below 0) counts as 0, and is counted;
+ * one of more than 0.2 s in the future is counted.
  * Returns the frame's sequence; 0 if there was no begin: nothing has changed then.
  */
 static inline uint64_t skinware_ring_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags) {

@@ -39,7 +39,7 @@ int skinware_native_turn(skinware_native_turns *turns, unsigned char *to) {
     if (turns->last == 0 || turns->noted == TURNS || skinware__has_ended(&turns->ring) || turns->process != getpid())
         return 0;
     if (latest != turns->last) /* there without a sleep: its writer may be dead */
-        return skinware__is_locked((int)turns->descriptor) ? take(turns, latest, to) : 0;
+        return skinware__writer_lives(turns) ? take(turns, latest, to) : 0;
     until_ns = least(now_ns + least(SLICE_NS, turns->timeout_ns), turns->until_ns);
     if (until_ns <= now_ns)
         return 0;

@@ -26,6 +26,7 @@ typedef struct skinware_native_turns {
     int64_t timeout_ns;  /* of each wait */
     int64_t begun_ns;    /* when the wait for the next frame began */
     int64_t descriptor;  /* of the file: asks whether the writer lives */
+    int64_t writer;      /* pidfd of the writer, SKINWARE__UNKNOWN or SKINWARE__ENDED */
     int64_t process;     /* whose reader this is: the child of a fork has none */
     uint64_t frames;     /* handed out */
     uint64_t lost;       /* not handed out */
@@ -42,6 +43,10 @@ static inline int64_t least(int64_t a, int64_t b) {
 /* Whether the writer went over to another generation, or closed this one. */
 static inline int skinware__has_ended(const skinware__ring *ring) {
     return (skinware__load_32(ring->map + SKINWARE__STATE_OFFSET) & 6u) != 0;
+}
+
+static inline int skinware__writer_lives(const skinware_native_turns *turns) {
+    return skinware__lives((int)turns->descriptor, (int)turns->writer);
 }
 
 /* The frame of this sequence is handed out. */

@@ -179,7 +179,7 @@ class Attachment(Generic[FrameT]):
             timer.wait()
 
     def _adopt(self, ring: RingReader[FrameT]) -> None:
-        self._ring.segment.descriptor.close()
+        self._ring.segment.close()
         self._ring = ring
         self._moved = False
 
@@ -216,7 +216,7 @@ class Attachment(Generic[FrameT]):
         if _digest(ring.segment) == _digest(self._ring.segment):
             self._adopt(ring)
         else:
-            ring.segment.descriptor.close()
+            ring.segment.close()
             self._moved = True
 
     def _successor_lives(self) -> bool:
@@ -230,7 +230,7 @@ class Attachment(Generic[FrameT]):
         try:
             return segment.writer_lives()
         finally:
-            segment.descriptor.close()
+            segment.close()
 
 
 def _digest(segment: segments.Segment) -> bytes:

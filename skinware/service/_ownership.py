@@ -211,7 +211,7 @@ class Ownership:
             if segments.current_inode(path) == segment.inode:
                 path.unlink()
             self._ring.set_state(file_layout.STATE_CLOSED)
-            segment.descriptor.close()
+            segment.close()
             if self._server is not None:
                 self._server.close()  # now: who finds no socket finds no living writer either
             self._name_lock.close()
@@ -221,7 +221,7 @@ class Ownership:
         if self.closed:
             return
         with self._changing:
-            self._ring.segment.descriptor.close()
+            self._ring.segment.close()
             if self._server is not None:
                 self._server.abandon()
             self._name_lock.close()
@@ -257,7 +257,7 @@ class Ownership:
             self._next_file_check_ns = now_ns() + _FILE_CHECK_NS
             if previous is not None:
                 previous.mark(file_layout.STATE_SUPERSEDED)  # its readers wake up and find the new file
-                previous.descriptor.close()
+                previous.close()
 
     def _succeed(self, schema: Schema, static: Mapping[str, npt.NDArray[Any]], period_ns: int, skip: int = 0) -> None:
         """A new generation in the place of our own."""

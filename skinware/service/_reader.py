@@ -232,7 +232,7 @@ class ServiceReader(Taking[FrameT]):
         self._closed = True
         self._accounts.close()
         self._client.close()
-        self._ring.segment.descriptor.close()
+        self._ring.segment.close()
 
     # -- names of version 0.1.0 -------------------------------------------------------------------------------------
 

@@ -105,7 +105,8 @@ class ServiceWriter(Ownership):
 
         Args:
             acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
-                machine booted) it counts as 0, and is counted in the statistics (``before_boot``).
+                machine booted) it counts as 0, and is counted in the statistics (``before_boot``). More than 0.2 s in
+                the future it stays as it is, and is counted there (``ahead``): nothing in such a frame is fresh.
             flags: bits for the service's own use.
 
         Returns:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import can
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware.wire import IS_FD
@@ -42,6 +42,10 @@ _LISTENING: dict[str, dict[str, Any]] = {
 }
 """What makes an interface's controller only listen: it does not even acknowledge frames. By python-can's sources."""
 _WITHOUT_CONTROLLER = ("udp_multicast", "virtual")
+_ECHOING = ("udp_multicast",)
+"""Interfaces that hear what they send themselves, which cannot be switched off."""
+_ECHO_NS = NS_PER_S
+"""An echo that has not come by then was lost."""
 
 
 class PythonCanBus(Bus):
@@ -75,6 +79,7 @@ class PythonCanBus(Bus):
         self._bus: can.BusABC | None = None
         self._messages: _Messages | None = None
         self._was_open = False
+        self._echoes: deque[tuple[int, int, bytes]] = deque()  # of what was sent: when, identifier, payload
 
     def open(self) -> None:
         """Open the interface and start taking its messages.
@@ -130,6 +135,8 @@ class PythonCanBus(Bus):
         count = 0
         while messages.queue and batch.free:
             time_ns, identifier, payload, flags = messages.queue.popleft()
+            if self._echoes and self._is_echo(time_ns, identifier, payload):
+                continue
             if self.tap.is_open:
                 self.tap.keep_frame(time_ns, identifier, payload, flags=flags)
             if identifier & ERROR_FLAG:
@@ -164,8 +171,20 @@ class PythonCanBus(Bus):
             self.counters.send_failures += 1
             raise BusSendError(f"bus {self.channel}: frame {identifier_text(identifier)} not sent ({error})") from None
         self.counters.sent += 1
+        if self.interface in _ECHOING:
+            self._echoes.append((sent_ns, identifier, payload))
         if self.tap.is_open:
             self.tap.keep_frame(sent_ns, identifier, payload, is_sent=True)
+
+    def _is_echo(self, time_ns: int, identifier: int, payload: bytes) -> bool:
+        """Whether a message is one of our own, each of which comes back once."""
+        while self._echoes and time_ns - self._echoes[0][0] > _ECHO_NS:
+            self._echoes.popleft()
+        for index, echo in enumerate(self._echoes):
+            if echo[1:] == (identifier, payload):
+                del self._echoes[index]
+                return True
+        return False
 
     def close(self) -> None:
         """Stop taking messages and shut the interface down. Idempotent.
@@ -173,6 +192,7 @@ class PythonCanBus(Bus):
         An interface that hangs in it is left to itself after 0.8 s, which is logged.
         """
         messages, self._bus, self._messages = self._messages, None, None
+        self._echoes.clear()
         if messages is not None:
             messages.close()
 

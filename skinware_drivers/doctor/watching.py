@@ -159,7 +159,7 @@ class _DriverWatch:
 
 def _nothing() -> WriterStatistics:
     """What a writer tells that has just begun."""
-    return WriterStatistics(0, 0, 0, Spread(), Spread(), Histogram(), Histogram())
+    return WriterStatistics(0, 0, 0, 0, Spread(), Spread(), Histogram(), Histogram())
 
 
 def _grown(before: Histogram, now: Histogram) -> Histogram:

@@ -6,6 +6,8 @@ V1.1b3, MODBUS over Serial Line V1.02, MODBUS Messaging on TCP/IP V1.0b.
 
 from __future__ import annotations
 
+import functools
+import re
 import struct
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -24,6 +26,8 @@ _ECHOING = {_WRITE_BIT: 5, WRITE_ONE: 5, _WRITE_BITS: 5, WRITE_MANY: 5, _MASK: 7
 """Functions whose reply repeats the beginning of the question, and how much of it."""
 _COUNTING = (*_READ_BITS, *READS, _EXCHANGE)
 """Functions whose reply tells how many bytes follow."""
+_LENGTH_AT = {_WRITE_BITS: 6, WRITE_MANY: 6, _EXCHANGE: 10}
+"""Where the question of a function says how many bytes follow."""
 LONGEST_MESSAGE = 253
 FAILED = 0x80
 """Bit of the function in a reply that is an exception."""
@@ -196,11 +200,11 @@ class RtuMessages:
 
     def reply_to(self, unit: int, question: bytes) -> Message | None:
         """The reply to a question, if it has arrived; what comes before it is skipped."""
-        return self._first([(unit, question)], also_questions=False)
+        return self._first((unit, question), also_questions=False)
 
     def next_of(self, asked: Message | None) -> Message | None:
         """The next message on a line on which others speak: the reply to what was asked before, or a question."""
-        return self._first([] if asked is None else [(asked.unit, asked.data)], also_questions=True)
+        return self._first(None if asked is None else (asked.unit, asked.data), also_questions=True)
 
     @property
     def pending(self) -> int:
@@ -211,11 +215,17 @@ class RtuMessages:
         """Forget what was left over."""
         self._skip(len(self._rest))
 
-    def _first(self, asked: list[tuple[int, bytes]], *, also_questions: bool) -> Message | None:
+    def _first(self, asked: tuple[int, bytes] | None, *, also_questions: bool) -> Message | None:
         place, rest, was_damaged = 0, self._rest, False
+        beginning = _beginning_of(None if asked is None else (asked[0], asked[1][0]), also_questions)
         while place < len(rest):
+            found = beginning.search(rest, place)  # on a line that babbles hardly a byte begins anything
+            if found is None:
+                place = len(rest)
+                break
+            place = found.start()
             here = rest[place:]
-            sizes = [size for unit, question in asked for size in _sizes_of_reply(here, unit, question)]
+            sizes = [] if asked is None else _sizes_of_reply(here, *asked)
             if also_questions:
                 sizes.append(_size_of_question(here))
             whole = [size for size in sizes if 0 < size <= len(here)]
@@ -242,6 +252,20 @@ class RtuMessages:
         self._rest = self._rest[count:]
 
 
+@functools.lru_cache(256)
+def _beginning_of(asked: tuple[int, int] | None, also_questions: bool) -> re.Pattern[bytes]:
+    """Where a reply to what was asked (unit, function) or a question may begin, by its first two bytes."""
+    beginnings = []
+    if asked is not None:
+        unit, function = (re.escape(bytes([number])) for number in asked)
+        failed = re.escape(bytes([asked[1] | FAILED]))
+        beginnings.append(unit + b"(?:" + function + b"|" + failed + b"|\\Z)")
+    if also_questions:
+        known = b"".join(re.escape(bytes([number])) for number in (*range(1, WRITE_ONE + 1), *_LENGTH_AT, _MASK))
+        beginnings.append(b".(?:[" + known + b"]|\\Z)")
+    return re.compile(b"|".join(beginnings), re.DOTALL)
+
+
 def _sizes_of_reply(here: bytes, unit: int, question: bytes) -> list[int]:
     """Bytes of the frames that may begin here and answer a question."""
     size = reply_size(question)
@@ -263,7 +287,7 @@ def _size_of_question(here: bytes) -> int:
         return 8
     if here[1] == _MASK:
         return 10
-    length_at = {_WRITE_BITS: 6, WRITE_MANY: 6, _EXCHANGE: 10}.get(here[1])
+    length_at = _LENGTH_AT.get(here[1])
     if length_at is None:
         return 0
     return length_at + 3 + (here[length_at] if len(here) > length_at else 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -12,15 +13,20 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import DataPath, PatchState
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.skin_state import PATCH_COUNTERS
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.native.kernel_bus import is_read_natively
 from skinware_drivers.running.bus_line import BusLine
+from skinware_drivers.running.doubles import Doubles
 from skinware_drivers.running.guard import failure
 from skinware_drivers.running.native_path import NativePath, path_for
 from skinware_drivers.running.patch_news import PatchChange
 from skinware_drivers.running.publisher import Publisher
 from skinware_drivers.watch import Watch
 
+log: logging.Logger = logging.getLogger("skinware.driver")
+
+_UPDATES = PATCH_COUNTERS.index("updates")
 _LOOK_PAUSE_NS = NS_PER_S // 20
 
 Rows = npt.NDArray[np.int64]
@@ -89,11 +95,13 @@ class Generation:
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
+    _doubles: Doubles = field(init=False)
 
     def __post_init__(self) -> None:
         self.batch = make_batch(self.lines, self.decoder.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patch_state.copy()
+        self._doubles = Doubles(self.tables.structure, self.publisher.period_ns)
         self.publisher.bus_counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
         self.native, self.why_python = path_for(self.decoder, self.publisher, self.batch)
@@ -224,7 +232,18 @@ class Generation:
             before[patch] = now[patch]
         for bus in set(self.tables.structure.patch_bus[now != PatchState.LIVE].tolist()):
             self.lines[bus].needs_care.set()
+        self._report_doubles()
         for line in self.lines:
             change = line.patch_news.catch_up()
             if change is not None:
                 yield change
+
+    def _report_doubles(self) -> None:
+        for patch, ratio in self._doubles.look(self.decoder.state.patch_counters[:, _UPDATES]):
+            log.warning(
+                "%s has sent %.1f times as much as its period allows for a while: do two devices send with one"
+                " identifier? Their values would mix. Unplug one and look, or give the driver the right period; logged"
+                " once",
+                self.name_of(patch),
+                ratio,
+            )

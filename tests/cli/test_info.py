@@ -312,10 +312,14 @@ def test_announcements_that_are_too_many_are_told(namespace: Namespace, capsys: 
     with FakeSkin("a"):
         for number in range(2 * MOST_ANNOUNCEMENTS + 1):
             (namespace.readers_path / f"x.{number}.fake").touch()
+        assert told(capsys)["problems"] == []  # those of the dead are removed
+        junk = [namespace.readers_path / f"x.{number}.folder" for number in range(MOST_ANNOUNCEMENTS + 1)]
+        for folder in junk:
+            folder.mkdir()
         (problem,) = told(capsys)["problems"]
         assert problem.startswith(f"{namespace.readers_path}: more than 1000 files; ")
-        for _ in range(2):  # those of the dead are removed
-            assert told(capsys)["problems"] == []
+        for folder in junk:
+            folder.rmdir()
 
 
 @pytest.mark.parametrize(

@@ -87,6 +87,7 @@ static void *look_at_frames(void *argument) {
             abort();
         look->rings[i].turns->ring = ring_of();
         look->rings[i].turns->descriptor = descriptor;
+        look->rings[i].turns->writer = SKINWARE__UNKNOWN;
         look->rings[i].turns->process = getpid();
     }
     while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {
@@ -122,6 +123,7 @@ static void *read_frames(void *argument) {
     turns->in_order = mine->way == 1;
     turns->until_ns = turns->timeout_ns = INT64_MAX;
     turns->descriptor = descriptor;
+    turns->writer = SKINWARE__UNKNOWN;
     turns->process = getpid();
     while (!__atomic_load_n(&over, __ATOMIC_ACQUIRE)) {
         if (mine->way < 2) {

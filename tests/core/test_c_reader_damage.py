@@ -14,12 +14,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skinware import DriverReader, Namespace
+from skinware import DriverReader, DriverWriter, Namespace
 from skinware.errors import BadServiceFile
 from skinware.memory import file_layout
 from skinware.memory.namespace import ROOT
 from tests.compiling import compiled
-from tests.core.c_programs import SOURCE, STRAIN, ring_file, run, talking
+from tests.core.c_programs import SOURCE, STRAIN, fill, ring_file, run, structure, talking
 
 
 @pytest.mark.parametrize(
@@ -185,3 +185,15 @@ def test_damage_while_a_file_is_read_does_no_harm(
         os.close(fd)
     assert path.stat().st_size == size
     path.unlink()
+
+
+@pytest.mark.parametrize("language", ["c11", "c11 sanitized"])
+def test_an_owner_that_changes_a_table_during_a_call_does_no_harm(
+    language: str, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    program = compiled(SOURCE.with_name("fresh_race.c"), language, tmp_path_factory)
+    with DriverWriter("x", structure()) as writer:
+        fill(writer, 1)
+        result = subprocess.run([program, namespace.name, "x"], capture_output=True, text=True, timeout=110)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) > 0

@@ -8,6 +8,7 @@ import random
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -39,7 +40,15 @@ pytestmark = pytest.mark.usefixtures("process_server", "data_path")
 # -- those who are killed ----------------------------------------------------------------------------------------
 
 
-def victim_driver(name: str, board: Path, row: int, state: str, lines: int, fork_until: Path | None = None) -> None:
+def victim_driver(
+    name: str,
+    board: Path,
+    row: int,
+    state: str,
+    lines: int,
+    fork_until: Path | None = None,
+    fork: Callable[[], int] = os.fork,
+) -> None:
     """Everything that a driver does, until it is killed in the given state."""
     mine = Board(board).rows[row]
     bomb = Bomb(state, lines)
@@ -47,7 +56,7 @@ def victim_driver(name: str, board: Path, row: int, state: str, lines: int, fork
         writer = ServiceWriter(name, COLUMNS, slots=3)
         writer.request_server()
     mine[GENERATION] = writer.generation
-    if fork_until is not None and os.fork() == 0:
+    if fork_until is not None and fork() == 0:
         outlive_the_parent(fork_until)
     for turn in range(1_000_000):
         with bomb.armed("filling", last_chance=turn > 20):

@@ -10,7 +10,7 @@ import pytest
 
 from skinware import Frame, ServiceReader, ServiceWriter
 from skinware.errors import ServiceError
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 
 pytestmark = pytest.mark.usefixtures("data_path")
 
@@ -70,6 +70,16 @@ def test_a_stamp_before_boot_counts_as_boot_and_is_counted() -> None:
             writer.commit(acquired_ns)
             assert reader.read(timeout_s=0).acquired_ns == 0
         assert reader.writer_statistics.before_boot == 2
+
+
+def test_a_stamp_in_the_future_is_kept_and_counted() -> None:
+    with service() as (writer, reader):
+        for ahead_s in (3600, 0.1, -1):
+            writer.begin()
+            stamp_ns = now_ns() + round(ahead_s * NS_PER_S)
+            writer.commit(stamp_ns)
+            assert reader.read(timeout_s=0).acquired_ns == stamp_ns
+        assert reader.writer_statistics.ahead == 1
 
 
 def test_frames_that_are_left_out_are_lost_to_readers_and_the_newest_is_always_there() -> None:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import random
+import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -14,7 +20,14 @@ from hypothesis import strategies as st
 
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.driver_service import DriverReader, DriverWriter
-from skinware.errors import BadServiceFile, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.errors import (
+    BadServiceFile,
+    NamespaceError,
+    Overrun,
+    ServiceNotFound,
+    ServiceTimeout,
+    SkinwareError,
+)
 from skinware.memory import file_layout
 from skinware.memory.schema import STATIC_NAME, from_file
 from skinware.service import Column
@@ -53,6 +66,92 @@ def test_damaged_files_are_refused(namespace: Namespace, damage: Callable[[bytes
     with pytest.raises(BadServiceFile, match=words):
         ServiceReader[Frame]("x")
     namespace.ring_path("x").unlink()
+
+
+def forged(namespace: Namespace, offset: int, form: str, value: int) -> None:
+    """The file of a dead writer that published once, with one number changed."""
+    namespace.create()
+    with ServiceWriter("x", {"values": ("<u8", 512)}) as writer:
+        writer.begin()["values"][:] = 7
+        writer.commit(1)
+        data = bytearray(namespace.ring_path("x").read_bytes())
+    struct.pack_into(form, data, offset, value)
+    namespace.ring_path("x").write_bytes(data)
+
+
+ABSURD = {
+    "latest": (512, "<Q", 2**64 - 1),
+    "published_before": (192, "<Q", 2**64 - 1),
+    "generation": (24, "<Q", 2**64 - 1),
+    "period": (88, "<q", -(2**63)),
+    "pid": (64, "<Q", 2**64 - 1),
+}
+
+
+@pytest.mark.parametrize("field", ABSURD)
+def test_a_forged_predecessor_stops_no_writer(namespace: Namespace, field: str) -> None:
+    forged(namespace, *ABSURD[field])
+    with ServiceWriter("x", {"values": ("<u8", 512)}) as writer, ServiceReader[Frame]("x") as reader:
+        writer.begin()["values"][:] = 8
+        writer.commit(2)
+        frame = reader.read()
+        assert (frame.column("values")[0], frame.stale) == (8, False)
+        assert reader._ring.segment.published_before < 2
+
+
+def test_a_forged_count_beside_the_lock_is_not_believed(namespace: Namespace) -> None:
+    with ServiceWriter("x", {"values": ("<u8", 512)}):
+        pass
+    namespace.lock_path("x").write_bytes(b"\xff" * 8)
+    with ServiceWriter("x", {"values": ("<u8", 512)}), ServiceReader[Frame]("x") as reader:
+        assert reader._ring.segment.published_before == 0
+
+
+@pytest.mark.usefixtures("data_path")
+def test_a_dead_writer_was_not_too_fast(namespace: Namespace, program: Path) -> None:
+    forged(namespace, *ABSURD["latest"])
+    with ServiceReader[Frame]("x") as reader:
+        with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"):
+            reader.read()
+        with pytest.raises(Overrun, match="its writer is dead, and its newest frame is not whole"), reader.view():
+            pass
+    result = subprocess.run([program, "describe", "x"], capture_output=True, text=True, timeout=60)
+    assert "its writer is dead" in result.stdout + result.stderr
+    namespace.ring_path("x").unlink()
+
+
+WITHOUT_DESCRIPTORS = """
+import os, resource
+from skinware import ServiceReader, Skin
+resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+held = []
+while True:
+    try:
+        held.append(os.open("/dev/null", os.O_RDONLY))
+    except OSError:
+        break
+for free in range(8):
+    for kind in (lambda: ServiceReader("x"), Skin):
+        try:
+            with kind() as reader:
+                reader.read(timeout_s=0)
+                print("read")
+        except Exception as error:
+            print(type(error).__name__, error)
+    os.close(held.pop())
+"""
+
+
+def test_a_program_without_descriptors_is_not_given_the_file_to_blame() -> None:
+    with DriverWriter("x", Structure(**tables()), driver_type="test", bus_counters=["n"]) as writer:
+        writer.begin()
+        writer.commit(1)
+        result = subprocess.run([sys.executable, "-c", WITHOUT_DESCRIPTORS], capture_output=True, text=True, timeout=60)
+    lines = result.stdout.splitlines()
+    assert lines[-2:] == ["read", "read"], result.stderr
+    assert "no more file descriptors" in lines[0]
+    for line in lines:
+        assert line == "read" or line.startswith(("NamespaceError", "ServiceTimeout no driver can be read")), line
 
 
 def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> None:
@@ -253,3 +352,28 @@ def test_no_schema_does_harm(text: bytes) -> None:
         return
     values = schema.columns["values"]
     assert values.dtype.itemsize * np.prod(values.shape) == 20
+
+
+@pytest.mark.usefixtures("data_path")
+def test_an_owner_that_scribbles_over_its_file_gives_readers_errors_of_ours(namespace: Namespace) -> None:
+    """Only the size of the file stays: all else changes between the looks of a reader that has attached."""
+    generator = random.Random(7)
+    with ServiceWriter("x", {"values": ("<u8", 512)}, {"table": np.arange(5, dtype="<u4")}) as writer:
+        writer.begin()
+        writer.commit(1)
+        with ServiceReader[Frame]("x") as reader, open(namespace.ring_path("x"), "r+b", buffering=0) as file:
+            size = os.fstat(file.fileno()).st_size
+            for _ in range(300):
+                offset = generator.choice([0, 512, 1152, generator.randrange(size)])
+                os.pwrite(file.fileno(), generator.randbytes(min(640, size - offset)), offset)
+                for take in (
+                    partial(reader.read, timeout_s=0),
+                    partial(reader.read, newer_than=(0, 0), timeout_s=0.001),
+                    partial(next, reader.in_order(timeout_s=0)),
+                    partial(next, reader.frames(timeout_s=0)),
+                    reader.refresh,
+                ):
+                    with contextlib.suppress(SkinwareError):
+                        take()
+                assert reader.statistics.lost >= 0
+                assert reader.rate_hz() is None or reader.writer_statistics.published >= 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import grp
 import os
 import shutil
@@ -14,9 +16,11 @@ import pytest
 from skinware import Frame, Namespace, ServiceReader, ServiceWriter
 from skinware.errors import Closed, ConfigurationError, NameInUse, NamespaceError, PeerGone, ServiceTimeout
 from skinware.memory.announcement import living_readers
-from skinware.memory.locks import Descriptor, ForkGuard
+from skinware.memory.locks import Descriptor, ForkGuard, is_locked
+from skinware.memory.segments import living_inode
 from skinware.service import RequestServer
 from skinware_drivers.testing.waiting import wait_until
+from tests.core.c_programs import run
 from tests.core.test_chaos import BEGUN, COLUMNS, MISSED, PID, ROUTINE, TORN, WON, victim_driver
 from tests.core.workers import PATIENCE_S, Board, Bomb, Crew
 
@@ -74,6 +78,46 @@ def test_a_forked_child_does_not_make_a_dead_driver_look_alive(tmp_path: Path, n
                 again.commit(1)
                 assert not reader.read(newer_than=frame).stale
         until.touch()
+
+
+def fork_in_c() -> int:
+    """No hook of Python's runs: the child keeps the locks and the connections for as long as it lives."""
+    return int(ctypes.CDLL(None).fork())
+
+
+@pytest.mark.usefixtures("data_path")
+def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
+    tmp_path: Path, namespace: Namespace, program: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    board, until = Board(tmp_path / "board", 1), tmp_path / "stop"
+    with Crew() as crew, contextlib.ExitStack() as at_end:
+        at_end.callback(until.touch)
+        process = crew.start(victim_driver, "x", board.path, 0, ROUTINE, 0, until, fork_in_c)
+        with ServiceReader[Frame]("x", timeout_s=PATIENCE_S) as reader:
+            wait_until(lambda: board.rows[0, BEGUN] > 2, PATIENCE_S)
+            frames = reader.frames(timeout_s=PATIENCE_S)
+            assert not any(next(frames).stale for _ in range(5))
+            assert reader.alive
+            assert living_inode(namespace, "x") is not None
+            assert run(program, "describe", "x")["stale"] == 0
+            crew.kill(process)
+            with open(namespace.ring_path("x"), "rb") as ring, open(namespace.lock_path("x"), "rb") as lock:
+                assert is_locked(ring.fileno())
+                assert is_locked(lock.fileno())
+            assert not reader.alive
+            assert reader.read().stale
+            assert living_inode(namespace, "x") is None
+            assert run(program, "describe", "x")["stale"] == 1
+            with pytest.raises(PeerGone):
+                reader.request()
+            last = reader.latest
+            monkeypatch.setattr("skinware.memory.segments._ORPHAN_S", 0.0)
+            with ServiceWriter("x", COLUMNS) as again:
+                again.begin()["values"][:] = 1
+                again.commit(1)
+                assert not reader.read(newer_than=last, timeout_s=PATIENCE_S).stale
+                with pytest.raises(NameInUse):
+                    ServiceWriter("x", COLUMNS)
 
 
 def fork_and_die() -> None:

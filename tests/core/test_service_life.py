@@ -222,9 +222,10 @@ def test_a_dead_readers_announcement_is_removed_by_whoever_looks(
     "look", [lambda _: ServiceWriter("x", SMALL).close(), lambda place: list(living_readers(place))]
 )
 def test_however_many_dead_announcements_delay_nobody(
-    namespace: Namespace, look: Callable[[Namespace], object]
+    namespace: Namespace, look: Callable[[Namespace], object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So many are looked at each time: whoever may announce may put any number there."""
+    """A look ends after so many: a program that may announce a reader may put any number there."""
+    monkeypatch.setattr("skinware.memory.announcement._MOST_FILES", 1000)
     namespace.create()
     for number in range(2500):
         (namespace.readers_path / f"x.{number}.fake").touch()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from functools import partial
@@ -14,6 +15,7 @@ from skinware.memory.announcement import living_readers
 from skinware.memory.statistics import BUCKETS, Histogram, Spread, bucket_of
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
+from tests.core.services import publish
 from tests.core.workers import kill, running
 
 pytestmark = pytest.mark.usefixtures("data_path")
@@ -71,6 +73,25 @@ def test_a_periodic_writer_tells_how_late_its_periods_begin() -> None:
         told = reader.writer_statistics
         assert told.lateness.total == 7
         assert told.missed_periods == writer.missed_periods >= 5
+
+
+def test_thousands_of_dead_readers_hide_no_living_one(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Frame]("x") as reader:
+        publish(writer, 1)
+        reader.read()
+        for number in range(3000):
+            (namespace.readers_path / f"a.1.{number:08x}").touch()
+        assert [seen.service for seen in living_readers(namespace)] == ["x"]
+        assert len(list(namespace.reader_files())) == 1
+
+
+def test_readers_that_are_dropped_leave_nothing(namespace: Namespace) -> None:
+    with ServiceWriter("x", SMALL) as writer:
+        publish(writer, 1)
+        for _ in range(20):
+            ServiceReader[Frame]("x").read()
+        gc.collect()
+        assert list(namespace.reader_files()) == []
 
 
 def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from unittest import mock
 
 import pytest
 
@@ -131,3 +132,19 @@ def test_noise_is_counted_and_never_raises_on_a_line() -> None:
         pending = len(found._rest)
         assert pending < 300
     assert counters.bytes_in == counters.frame_bytes + counters.skipped_bytes + pending
+
+
+@pytest.mark.parametrize(("listens", "most"), [(False, 0.02), (True, 0.1)])
+def test_a_line_that_babbles_is_hardly_looked_at(listens: bool, most: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work is counted, not timed: a byte at which nothing can begin costs none of ours."""
+    noise = random.Random(1).randbytes(20_000)
+    looks = mock.Mock(side_effect=wire._sizes_of_reply)
+    monkeypatch.setattr(wire, "_sizes_of_reply", looks)
+    counters = FramerCounters()
+    line = RtuMessages(counters)
+    for start in range(0, len(noise), 64):
+        line.feed(noise[start : start + 64])
+        while (line.next_of(Message(1, READ_9)) if listens else line.reply_to(1, READ_9)) is not None:
+            pass
+    assert counters.skipped_bytes + counters.frame_bytes + line.pending == len(noise)
+    assert looks.call_count < most * len(noise)

@@ -6,6 +6,7 @@ import os
 import pty
 import select
 import signal
+import socket
 import threading
 import tty
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can.pythoncan import PythonCanBus
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import running
+from tests.streams.peers import free_port
 
 
 class Unplugged:
@@ -90,6 +92,34 @@ def test_a_message_that_the_library_cannot_take_costs_itself_alone(monkeypatch: 
         received += bus.receive(FrameBatch(64), 0)
     assert bus.counters.refused >= received
     bus.close()
+
+
+def heard_by(bus: PythonCanBus, count: int) -> list[int]:
+    """Identifiers of the next frames, of at least so many."""
+    batch = FrameBatch(64)
+
+    def take() -> bool:
+        bus.receive(batch, 0)
+        return len(batch) >= count
+
+    wait_until(take)
+    identifiers: list[int] = batch.wire["identifier"][batch.start : batch.stop].tolist()
+    return identifiers
+
+
+def test_a_bus_that_hears_itself_shows_only_what_others_send() -> None:
+    options = {"port": str(free_port(socket.SOCK_DGRAM)), "hop_limit": "0"}
+    driver, device = (PythonCanBus("udp_multicast", "239.74.163.2", dict(options)) for _ in range(2))
+    driver.open()
+    device.open()
+    for _ in range(3):
+        driver.send(0x210, b"start")
+    assert heard_by(device, 3) == [0x210] * 3
+    device.send(0x210, b"start")  # the same once more, from another
+    device.send(0x310, b"data")
+    assert heard_by(driver, 2) == [0x210, 0x310]
+    driver.close()
+    device.close()
 
 
 @contextmanager

@@ -45,6 +45,7 @@ def test_two_robots_of_one_name_are_told_and_never_mixed(namespace: Namespace, m
         with ExitStack() as one:
             one.enter_context(serving(net, namespace))
             wait_until(lambda: sees(1))
+            served = next(event for event in ends.events if event["event"] == "connected")
             stack.enter_context(serving(net, other))
             wait_until(lambda: any("served by two bridges" in event.get("why", "") for event in ends.events))
             for _ in range(50):
@@ -53,6 +54,10 @@ def test_two_robots_of_one_name_are_told_and_never_mixed(namespace: Namespace, m
         wait_until(lambda: sees(2))
         values = [value for value in seen if value]
         assert values == sorted(values), "the first came back after the other"
+        (switched,) = (event for event in ends.events if event["event"] == "switched")
+        assert switched["robot"] == served["robot"]
+        assert switched["instance"] != served["instance"]
+        assert served["instance"][:8] in switched["why"], "the bridge that was followed before is not named"
 
 
 @contextmanager

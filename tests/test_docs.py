@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
 import re
 import runpy
 import shlex
@@ -27,13 +25,12 @@ from skinware.tactile.testing import read_stage
 from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
-from tests.commands import PATIENCE_S, running
+from tests.commands import COMMANDS, PATIENCE_S, parse, running
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 ELSEWHERE = ("asyncio", "c-and-cpp", "icub")
 """Pages whose snippets other tests run."""
-COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
 _BLOCK = re.compile(r"^(?:```python|<!-- python)\n(.*?)^(?:```|-->)$", re.MULTILINE | re.DOTALL)
 
 
@@ -178,11 +175,8 @@ def test_commands_have_the_options_that_a_page_gives_them(page: Path, tmp_path: 
     file.touch()
     for name, *words in commands_of(page):
         arguments = [str(file) if word.endswith(".toml") else word for word in words]
-        module = importlib.import_module(COMMANDS[name].module)
-        command: click.Command = vars(module).get("command") or module.emulate
         try:
-            with contextlib.suppress(click.exceptions.Exit):  # --help and the like
-                command.make_context(name, arguments).close()
+            parse(name, *arguments)
         except click.UsageError as error:
             pytest.fail(f"{name} {shlex.join(arguments)}: {error.format_message()}")
 

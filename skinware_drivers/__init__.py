@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skinware_drivers.bus import EXTENDED_FLAG
+    from skinware_drivers.decoding.skin_state import Updates
     from skinware_drivers.description import Module, Patch, Sensor, taxels
     from skinware_drivers.layout import (
         Above,
@@ -57,6 +58,7 @@ __all__ = [
     "Sentinel",
     "SequenceNumber",
     "StatusBytes",
+    "Updates",
     "Values",
     "Watch",
     "check_options",

@@ -67,10 +67,10 @@ def check_identifier(identifier: int) -> None:
     largest = IDENTIFIER_MASK if identifier & EXTENDED_FLAG else LARGEST_STANDARD
     if not 0 <= identifier & ~EXTENDED_FLAG <= largest:
         raise ConfigurationError(
-            f"identifier {identifier:X} has more than 11 bits; one of 29 bits is written EXTENDED_FLAG |"
+            f"identifier 0x{identifier:X} has more than 11 bits; one of 29 bits is written EXTENDED_FLAG |"
             f" 0x{identifier:X}"
             if 0 <= identifier <= IDENTIFIER_MASK
-            else f"identifier {identifier:X} cannot be: it has 11 bits, or 29 and EXTENDED_FLAG"
+            else f"identifier 0x{identifier:X} cannot be: it has 11 bits, or 29 and EXTENDED_FLAG"
         )
 
 

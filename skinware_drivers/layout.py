@@ -350,7 +350,9 @@ def _check_frame(frame: Frame) -> None:
             except ConfigurationError as error:
                 raise refuse(str(error)) from None
         if isinstance(condition, Identifier) and condition.value & ~condition.mask:
-            raise refuse(f"identifier {condition.value:X} has bits outside its mask {condition.mask:X}: none matches")
+            raise refuse(
+                f"identifier 0x{condition.value:X} has bits outside its mask 0x{condition.mask:X}: none matches"
+            )
         if isinstance(condition, Byte) and condition.offset >= min(frame.length):
             raise refuse(f"byte {condition.offset} is not in every right payload")
     if frame.sequence is not None and frame.sequence.wrong(min(frame.length)):

@@ -12,14 +12,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import IO, Any
 
+import click
+
 from skinware.cli._command import exit_status
 
+COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
 BIN = Path(sys.executable).parent
 PATIENCE_S = 120.0
 """How long a command may take for its next line: the CAN lab's processor is emulated."""
@@ -30,6 +33,25 @@ def run(command: str, *arguments: str, timeout_s: float = PATIENCE_S) -> subproc
     return subprocess.run(
         [BIN / command, *arguments], capture_output=True, text=True, timeout=timeout_s, stdin=subprocess.DEVNULL
     )
+
+
+def parse(command: str, *arguments: str) -> None:
+    """Have a command take its arguments, also those of its subcommands, and do nothing with them.
+
+    Raises:
+        click.UsageError: it does not take them.
+    """
+    module = import_module(COMMANDS[command].module)
+    with suppress(click.exceptions.Exit):  # --help and the like
+        _parse(vars(module).get("command") or module.emulate, command, list(arguments), None)
+
+
+def _parse(command: click.Command, name: str | None, arguments: list[str], parent: click.Context | None) -> None:
+    with command.make_context(name, arguments, parent=parent) as context:
+        if isinstance(command, click.Group):
+            name, subcommand, rest = command.resolve_command(context, [*context._protected_args, *context.args])
+            if subcommand is not None:
+                _parse(subcommand, name, rest, context)
 
 
 def refused(command: str, *arguments: str) -> subprocess.CompletedProcess[str]:

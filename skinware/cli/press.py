@@ -61,8 +61,9 @@ def command(
 ) -> None:
     """Press an emulated skin at a place: X, Y and Z in metres, in the frame of its geometry.
 
-    The skin is one of "skin-driver --bus virtual", or of "skin-emulate --name NAME". Emulated ROBOSKIN boards cover a
-    forearm along x, from 0 to 0.14, and a hand from there to 0.23.
+    The skin is one of "skin-driver --bus virtual", or of "skin-emulate --name NAME": emulated ROBOSKIN boards, which
+    cover a forearm along x, from 0 to 0.14, and a hand from there to 0.23. Other emulated devices and hands cannot be
+    pressed at a place; they are touched by themselves, six times in half a minute.
 
     Exit status: 0 pressed, 1 nothing would feel it or no such skin runs, 2 wrong usage.
     """
@@ -92,8 +93,9 @@ def _the_only_one(namespace: Namespace) -> str:
     able = [name for name in namespace.services() if _can_be_pressed(namespace, name)]
     if not able:
         raise ServiceNotFound(
-            f"nothing in the namespace {namespace.name!r} can be pressed; start skin-driver --bus virtual,"
-            " or skin-emulate with --name"
+            f"nothing in the namespace {namespace.name!r} can be pressed: only emulated ROBOSKIN boards can, of"
+            " skin-driver --bus virtual, or of skin-emulate with --name. Other emulated devices and hands are touched"
+            " by themselves"
         )
     if len(able) > 1:
         raise ConfigurationError(f"several can be pressed; give --name: {', '.join(able)}")

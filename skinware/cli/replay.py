@@ -103,8 +103,7 @@ def command(
     from skinware.recording.replaying import Replayer
 
     place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or _NAMESPACE)
-    if not namespace:
-        _refuse_beside_others(place)
+    _heed_others(place, is_chosen=bool(namespace))
     with skinware.recording.open(file) as recording:
         replayer = Replayer(
             recording,
@@ -134,8 +133,8 @@ def command(
     _tell("stopped", replayer, as_json)
 
 
-def _refuse_beside_others(place: Namespace) -> None:
-    """Keep recorded frames away from living ones, unless the namespace was given on purpose.
+def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
+    """Keep recorded frames away from living ones; where the namespace was given on purpose, only warn of them.
 
     Raises:
         ConfigurationError: services run in the namespace that is the default.
@@ -147,9 +146,12 @@ def _refuse_beside_others(place: Namespace) -> None:
         with contextlib.suppress(BadServiceFile, ServiceNotFound):
             with ServiceReader[Any](name, namespace=place, announce=False) as reader:
                 living += [name] if reader.alive else []
-    if living:
+    run = f"{', '.join(living)} {'runs' if len(living) == 1 else 'run'}"
+    if living and is_chosen:
+        warn(f"{run} in namespace {place.name!r} too: readers have living and recorded frames side by side")
+    elif living:
         raise ConfigurationError(
-            f"{', '.join(living)} run in namespace {place.name!r}: give another one with --namespace, or"
+            f"{run} in namespace {place.name!r}: give another one with --namespace, or"
             f" --namespace {place.name} to publish beside them"
         )
 

@@ -122,7 +122,8 @@ class Namespace:
         if info.st_uid not in accepted:
             raise NamespaceError(
                 f"namespace {self.name!r} ({self.path}) belongs to {_user_name(info.st_uid)}, who is neither you nor"
-                " root; if that is right, set SKINWARE_OWNER to that user"
+                " root; if that is right, set SKINWARE_OWNER to that user, else use another namespace (--namespace,"
+                " SKINWARE_NAMESPACE)"
             )
         return info.st_uid
 
@@ -140,7 +141,8 @@ class Namespace:
         except PermissionError:
             raise NamespaceError(
                 f"{self.path} may not be read by {_user_name(os.geteuid())}; ask its owner"
-                f" {_user_name(self.path.stat().st_uid)} to add you to its group"
+                f" {_user_name(self.path.stat().st_uid)} to add you to its group, or use another namespace"
+                " (--namespace, SKINWARE_NAMESPACE)"
             ) from None
         except OSError as error:  # no descriptors left
             raise NamespaceError(f"{self.path} cannot be read: {error.strerror}") from None

@@ -29,7 +29,7 @@ class SdoAborted(BusError):
     """
 
     def __init__(self, what: str, code: int) -> None:
-        super().__init__(f"{what}: {SdoAbortedError.CODES.get(code, 'refused')} (abort code {code:08X})")
+        super().__init__(f"{what}: {SdoAbortedError.CODES.get(code, 'refused')} (abort code 0x{code:08X})")
         self.code = code
 
 

@@ -108,8 +108,8 @@ _LOSSES = {
     "lost": _Loss(
         Severity.ERROR,
         "frames were dropped before the driver took them",
-        "give the driver more processor time and a larger receive buffer",
-        ("sudo sysctl net.core.rmem_max=8388608", "skin-driver ... --realtime fifo:50"),
+        "enlarge the receive buffer, and start the driver with more processor time: --realtime fifo:50",
+        ("sudo sysctl net.core.rmem_max=8388608",),
     ),
     "overflows": _Loss(
         Severity.ERROR,
@@ -173,8 +173,7 @@ _LOSSES = {
     "updates_skipped": _Loss(
         Severity.WARNING,
         "more updates came at once than the ring has slots",
-        "give the driver more slots and more processor time",
-        ("skin-driver ... --slots 64",),
+        "start the driver with more slots (--slots 64) and more processor time (--realtime fifo:50)",
         unit="update",
     ),
     "before_boot": _Loss(
@@ -278,8 +277,8 @@ def _load(bus: BusSeen, driver: DriverSeen) -> Iterator[Finding]:
         "the wire is nearly full",
         f"driver {driver.name}, bus {brief(bus.name)}",
         f"load {100 * bus.load:.0f} %: frames with high identifiers wait, or never come",
-        "fewer boards on it, a longer period, and see what else sends",
-        typed(("skin-find {name}", "skin-driver ... --period-ms 100"), bus.name),
+        "connect fewer boards to it, start the driver with a longer period, and see what else sends",
+        typed(("skin-find {name}",), bus.name),
         _MISSING,
     )
 

@@ -62,7 +62,7 @@ def _left(evidence: Evidence) -> Iterator[Finding]:
                 f"{plural(len(dead), 'file')} of killed programs {'are' if len(dead) > 1 else 'is'} left",
                 f"namespace {namespace.name}",
                 f"{', '.join(dead)}: {namespace.bytes_of_dead / _MIB:.1f} MiB of shared memory",
-                "start them again, or remove what nobody needs any more",
+                "start them again, or remove those that are not needed any more",
                 tuple(f"rm {namespace.path}/{name}.ring" for name in dead[:_MOST_COMMANDS]),
                 _PROGRAMS,
             )
@@ -84,8 +84,8 @@ def _forgotten(evidence: Evidence) -> Iterator[Finding]:
             f"{plural(len(found), 'namespace')} of killed programs {'are' if len(found) > 1 else 'is'} left",
             ", ".join(told) + (" ..." if len(found) > len(told) else ""),
             f"{sum(len(one.dead) for one in found)} services, none alive: {size:.1f} MiB of shared memory",
-            "remove what nobody needs any more",
-            tuple(f"rm -r {one.path}" for one in found[:_MOST_COMMANDS]),
+            "they harm nothing while shared memory is left; if one is yours, see what it holds before you remove it",
+            tuple(f"skin-info --namespace {one.name}" for one in found[:_MOST_COMMANDS]),
             _PROGRAMS,
         )
 
@@ -124,9 +124,8 @@ def _recording(recording: RecordingSeen) -> Iterator[Note]:
             "the recorder lost frames",
             recording.name,
             f"{plural(recording.lost, 'frame')} published meanwhile are not in it",
-            "record on a machine that is less busy, or give the driver more slots",
-            ("skin-driver ... --slots 64",),
-            "how-to/record.md",
+            "record on a machine that is less busy, or start the driver with more slots: --slots 64",
+            see="how-to/record.md",
         )
     for jump in recording.clock_sets:
         yield Finding(

@@ -11,7 +11,7 @@ from skinware.cli._format import age_text, count_text, plural
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
 from skinware_drivers.doctor.losses import lost_text
-from skinware_drivers.doctor.naming import brief, typed
+from skinware_drivers.doctor.naming import brief, has_operation, typed
 
 AREA = "patches"
 _FAULTS, _MISSING = "reference/faults.md#patches", "troubleshooting.md#data-is-missing"
@@ -118,7 +118,7 @@ def _states(driver: DriverSeen) -> Iterator[Finding]:
 
 def _asking(driver: DriverSeen, patch: PatchSeen) -> tuple[str, ...]:
     """How to see whether it answers."""
-    if driver.driver_type == "roboskin":
+    if has_operation(driver.driver_type, "versions"):
         return (f"skin-config {driver.name} versions",)
     return typed(("skin-info {driver}", "skin-find {name}"), patch.bus, driver.name)
 
@@ -201,6 +201,8 @@ def _twice(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
         usual = max(of_period or 0.0, min(enough.values()) if len(enough) > 1 else 0.0)
     for patch in driver.patches:
         count, only = enough.get(patch.name, 0.0), shlex.quote(f"patch={patch.name}")
+        can_set = has_operation(driver.driver_type, "set_address")
+        set_address = (f"skin-config {{name}} set_address address=9 {only}",) if can_set else ()
         if usual and count > _TWICE * usual and _collides(patch):
             yield Finding(
                 Severity.ERROR,
@@ -208,8 +210,9 @@ def _twice(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
                 f"{patch.name} sends {count / usual:.1f} times as much as it should: two boards with one address?",
                 f"driver {driver.name}, bus {brief(patch.bus)}, {patch.name}",
                 f"data of {count:.0f} updates of a module in {age_text(evidence.seconds * 1e9)}, {usual:.0f} are due",
-                "unplug the board and see whether the address still sends; then give one of the two another address",
-                typed(("skin-find {name}", f"skin-config {{name}} set_address address=9 {only}"), patch.bus),
+                "unplug one board and see whether the address still sends; then end the driver, and give that board"
+                " another address",
+                typed(("skin-find {name}", *set_address), patch.bus),
                 "how-to/find-and-set-up.md#configure-boards",
             )
 

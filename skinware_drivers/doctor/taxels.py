@@ -12,6 +12,7 @@ from skinware.cli._format import count_text, plural
 from skinware.tactile.calibration.checking import SHARED, UNKNOWN, check_file
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence
 from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
+from skinware_drivers.doctor.naming import has_operation
 
 AREA = "taxels"
 _STATUS, _HEALTH, _CALIBRATION = "explanation/status.md", "tactile/health.md", "tactile/calibration.md"
@@ -72,10 +73,11 @@ def _statuses(driver: DriverSeen) -> Iterator[Finding]:
             continue
         named = driver.affected.get(name, ())
         more = " ..." if count > len(named) else ""
+        can_rebaseline = has_operation(driver.driver_type, "rebaseline")
         command = {
-            "suspect": f"skin-config {driver.name} rebaseline",
+            "suspect": f"skin-config {driver.name} rebaseline" if can_rebaseline else f"skin-info {driver.name}",
             "unhealthy": f"skin-info {driver.name} --health",
-        }.get(name, f"skin-top {driver.name}")
+        }.get(name, "skin-top")
         yield Finding(
             meaning.severity,
             AREA,
@@ -97,7 +99,7 @@ def _dark(driver: DriverSeen) -> Iterator[Finding]:
             f"driver {driver.name}",
             _dark_names(driver),
             "touch each once: those that go on with 0 are dead or switched off; look at their cables and plugs",
-            (f"skin-top {driver.name}",),
+            ("skin-top",),
             _STATUS,
         )
 
@@ -124,7 +126,7 @@ def _lines(driver: DriverSeen) -> Iterator[Finding]:
             f"driver {driver.name}",
             f"{'; '.join(driver.lines[:_MOST_LINES])}{' ...' if len(driver.lines) > _MOST_LINES else ''}",
             "a broken wire or a loose plug rather than so many broken taxels: look at the cables of these lines",
-            (f"skin-top {driver.name}",),
+            ("skin-top",),
             _STATUS,
         )
 
@@ -154,20 +156,21 @@ def _health(driver: DriverSeen) -> Iterator[Note]:
             f"driver {driver.name}",
             f"{told}{' ...' if count > len(some) else ''} (judged by {seen.source})",
             "touch them and see what they show; heed them no more if they are broken",
-            ("skin-wipe", f"skin-info {driver.name} --health"),
+            (f"skin-wipe {driver.name}", f"skin-info {driver.name} --health"),
             _HEALTH,
         )
     for what, why in seen.missing.items():
         is_last = what == list(seen.missing)[-1]
-        yield NotLooked(
-            AREA, f"{what} of {driver.name}", why, (f"skin-calm {driver.name}", "skin-wipe") if is_last else ()
-        )
+        commands = (f"skin-calm {driver.name}", f"skin-wipe {driver.name}") if is_last else ()
+        yield NotLooked(AREA, f"{what} of {driver.name}", why, commands)
 
 
 def _places(driver: DriverSeen) -> Iterator[Note]:
     structure = driver.structure
     swapped = f"exchanged or mirrored modules of {driver.name}"
-    by_strokes = ("skin-calibrate topology -o skin.toml", "skin-calibrate check skin.toml")
+    by_strokes = tuple(
+        f"skin-calibrate {command} --driver {driver.name}" for command in ("topology -o skin.toml", "check skin.toml")
+    )
     if structure.geometry is None:
         yield NotLooked(AREA, swapped, "the driver publishes no places of its sensors", by_strokes)
         return

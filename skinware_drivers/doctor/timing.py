@@ -85,8 +85,8 @@ def _readers(evidence: Evidence) -> Iterator[Note]:
                 "a program does not keep up with a driver whose frames it wants all",
                 f"{one.program}, pid {one.pid}, reads {one.driver}",
                 f"{plural(one.lost, 'frame')} missed and {one.frames} taken in {evidence.seconds:.1f} s",
-                "give that program more processor time, or the driver more slots, in which frames wait",
-                ("skin-driver ... --slots 64", "skin-info"),
+                "give that program more processor time, or start the driver with more slots for frames: --slots 64",
+                ("skin-info",),
                 "reference/faults.md#programs",
             )
 
@@ -103,7 +103,7 @@ def _life(driver: DriverSeen) -> Iterator[Finding]:
             where,
             f"pid {driver.pid} is gone; {age}",
             "start it again; its readers go on by themselves",
-            ("journalctl -b -g skin-driver", "skin-driver ..."),
+            ("journalctl -b -g skin-driver",),
             "reference/faults.md#programs",
         )
     elif driver.life == "silent":
@@ -134,7 +134,7 @@ def _life(driver: DriverSeen) -> Iterator[Finding]:
             "the driver is paused",
             where,
             f"pid {driver.pid}; {age}",
-            "have who paused it resume it",
+            "resume it from the program that paused it",
             (f"skin-info {driver.name}",),
         )
     if driver.restarts:
@@ -160,9 +160,8 @@ def _late(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             "the driver misses periods",
             where,
             f"{times.missed} of {periods:.0f} in {evidence.seconds:.1f} s; {circumstances(evidence, driver)}",
-            "give it more processor time",
-            ("skin-driver ... --realtime fifo:50",),
-            _REALTIME,
+            "start it with more processor time: --realtime fifo:50",
+            see=_REALTIME,
         )
     bound = times.age.quantile_ns(0.99)
     limit = max(2 * times.period_ns, _LATE_NS)
@@ -175,9 +174,9 @@ def _late(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             "data is old when it is published",
             where,
             f"99 % at most {age_text(bound)}, {period}{told}; {circumstances(evidence, driver)}",
-            "give it more processor time; if it waits for one patch of its cycle: --publish rate",
-            ("skin-driver ... --realtime fifo:50", "skin-driver ... --publish rate"),
-            "troubleshooting.md#data-is-missing",
+            "start it with more processor time (--realtime fifo:50); if it waits for one patch of its cycle, with"
+            " --publish rate",
+            see="troubleshooting.md#data-is-missing",
         )
     if times.longest_gap_s > max(_LONG_GAP_S, 5e-9 * times.period_ns) and driver.life != "paused":
         yield Finding(
@@ -187,7 +186,7 @@ def _late(driver: DriverSeen, evidence: Evidence) -> Iterator[Finding]:
             where,
             f"{age_text(times.longest_gap_s * 1e9)}, {period}; {circumstances(evidence, driver)}",
             "see what held the driver up: its log, and the load of the machine",
-            ("skin-driver ... --realtime fifo:50",),
+            ("journalctl -b -g skin-driver",),
             _REALTIME,
         )
 
@@ -201,9 +200,9 @@ def _clock(driver: DriverSeen) -> Iterator[Finding]:
             "data is stamped later than it was published",
             where,
             f"by up to {age_text(times.future_ns)}",
-            "the clock of a device or controller runs ahead; without its stamps: timestamps=kernel",
-            ("skin-driver --bus 'can0?timestamps=kernel'",),
-            _TIME,
+            "the clock of a device or controller runs ahead; start the driver without its stamps:"
+            " --bus 'can0?timestamps=kernel'",
+            see=_TIME,
         )
     if times.backwards:
         yield Finding(
@@ -212,9 +211,9 @@ def _clock(driver: DriverSeen) -> Iterator[Finding]:
             "times of data went backwards",
             where,
             plural(times.backwards, "time"),
-            "the clock of a device or controller was reset; if it goes on: timestamps=kernel",
-            ("skin-driver --bus 'can0?timestamps=kernel'",),
-            _TIME,
+            "the clock of a device or controller was reset; if it goes on, start the driver without its stamps:"
+            " --bus 'can0?timestamps=kernel'",
+            see=_TIME,
         )
     if times.before_boot:
         yield Finding(

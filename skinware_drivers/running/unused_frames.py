@@ -68,13 +68,13 @@ def _kinds_of_identifier(layout: Layout, samples: Sequence[Sample]) -> Iterator[
         identifier = identifier_text(_identifier(sample))
         if sample["extended"]:
             yield (
-                f"heard {identifier} (29 bits) where the layout has only identifiers of 11 bits: write"
+                f"heard 0x{identifier} (29 bits) where the layout has only identifiers of 11 bits: write"
                 f" EXTENDED_FLAG | 0x{identifier}"
             )
         else:
             yield (
-                f"heard {identifier} (11 bits) where the layout has only identifiers of 29 bits: write 0x{identifier},"
-                " without EXTENDED_FLAG"
+                f"heard 0x{identifier} (11 bits) where the layout has only identifiers of 29 bits: write"
+                f" 0x{identifier}, without EXTENDED_FLAG"
             )
 
 

@@ -8,6 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 _PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
+_PRESSES, _REST_S = 6, 6.0
+"""After so many presses and pauses nothing touches it for so long, as a hand rests between two grasps: a baseline can
+begin."""
 _RADIUS = 0.22
 """Of the pressed spot; the device is 1 wide."""
 
@@ -30,8 +33,10 @@ class Press:
     def strength(self, time_s: float) -> npt.NDArray[np.float64]:
         """(n,) 0 to 1, at a time since the device began to send."""
         since_s = time_s - self._first_s
-        moment_s = since_s % (_PRESS_S + _PAUSE_S)
-        ramp = min(max(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0.0), 1.0) if since_s > 0 else 0.0
+        in_round_s = since_s % (_PRESSES * (_PRESS_S + _PAUSE_S) + _REST_S)
+        is_pressing = since_s > 0 and in_round_s < _PRESSES * (_PRESS_S + _PAUSE_S)
+        moment_s = in_round_s % (_PRESS_S + _PAUSE_S)
+        ramp = min(max(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0.0), 1.0) if is_pressing else 0.0
         at = time_s + self._phase
         centre = 0.5 + 0.4 * np.array([math.sin(0.71 * at), math.sin(0.53 * at + 1)])
         distance2 = ((self._places - centre) ** 2).sum(axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from skinware.cli._command import exit_status
 from skinware.cli.replay import command as replay
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin
-from tests.commands import run, running
+from tests.commands import refused, run, running
 from tests.recording.rig import has, recording
 
 
@@ -49,7 +50,7 @@ def test_others_see_what_was_recorded(file: Path, namespace: Namespace) -> None:
 def test_a_name_in_use_is_one_line(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("torso"):
         assert exit_status(replay, [str(file), "--namespace", Namespace().name]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
+    *_, line = capsys.readouterr().err.splitlines()
     assert line.startswith("skin-replay: a running driver or service is called 'torso'")
 
 
@@ -59,8 +60,25 @@ def test_it_does_not_publish_beside_living_drivers_unless_it_is_asked_to(
     with FakeSkin("arm"):
         assert exit_status(replay, [str(file)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert f"arm run in namespace '{namespace.name}': give another one with --namespace" in line
+        assert f"arm runs in namespace '{namespace.name}': give another one with --namespace" in line
         assert exit_status(replay, [str(file), "--namespace", namespace.name, "--end", "0.1"]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"skin-replay: arm runs in namespace '{namespace.name}' too")
+
+
+def test_two_replays_at_once_have_a_namespace_each(file: Path, namespace: Namespace) -> None:
+    with running("skin-replay", str(file), "--loop") as first:
+        first.wait_for("ready")
+        second = refused("skin-replay", str(file))
+        assert second.returncode == 2
+        assert f"torso runs in namespace '{namespace.name}': give another one with --namespace" in second.stderr
+        other = Namespace(f"{namespace.name}-two")
+        with running("skin-replay", str(file), "--loop", "--namespace", other.name) as beside:
+            beside.wait_for("status", lambda status: status["frames"].get("torso", 0) > 0)
+            first.wait_for("status", lambda status: status["frames"].get("torso", 0) > 0)
+            assert beside.errors == ""
+            assert namespace.services() == other.services() == ["torso"]
+    shutil.rmtree(other.path)
 
 
 def test_it_waits_for_programs_and_stays_at_its_end(file: Path, namespace: Namespace) -> None:

@@ -52,7 +52,8 @@ def test_what_was_looked_at_and_what_could_not_be_is_told(skins: Skins) -> None:
     versions = next(one.seen for one in told.looked if one.what == "versions here")
     assert all(name in versions for name in ("skinware 0.1.0", "Python 3", "numpy ", "Linux "))
     not_looked = {one.what: one for one in told.not_looked}
-    assert "skin-calibrate check skin.toml" in not_looked["exchanged or mirrored modules of skin"].commands
+    by_strokes = not_looked["exchanged or mirrored modules of skin"].commands
+    assert "skin-calibrate check skin.toml --driver skin" in by_strokes
     assert "these were" in not_looked["stuck taxels of skin"].why
 
 
@@ -135,7 +136,7 @@ def test_a_board_that_moves_its_baseline_because_a_triangle_does_not_acknowledge
     skins("roboskin", boards=(7,), pattern="idle", no_ack=("7/2",), no_ack_after_cycles=1)
     finding = found_until(of("taxels", "doubtful"))
     assert finding.what.startswith("192 sensors")
-    assert finding.commands == ("skin-config skin rebaseline",)
+    assert finding.commands == ("skin-info skin",)  # of a driver whose type nobody knows
 
 
 @pytest.mark.parametrize("status", [Status.NO_ACK, Status.NOT_CONNECTED, Status.OUT_OF_RANGE, Status.SUSPECT])
@@ -185,7 +186,7 @@ def test_places_that_are_shared_or_missing() -> None:
     assert told["2 sensors are at places of others"].severity == Severity.WARNING
     assert told["1 sensor has no place"].severity == Severity.NOTE
     assert "triangle 0" in told["2 sensors are at places of others"].evidence
-    assert "skin-calibrate check skin.toml" in told["1 sensor has no place"].commands
+    assert "skin-calibrate check skin.toml --driver torso" in told["1 sensor has no place"].commands
 
 
 # -- buses ----------------------------------------------------------------------------------------------------------

@@ -177,7 +177,7 @@ def test_namespaces_that_are_forgotten_foreign_or_no_namespaces(alone: Path, mon
     young = dataclasses.replace(old, name="young", idle_s=10.0)
     seen = evidence(namespaces=(*told, old, foreign, young))
     (finding,) = findings(seen, "files")
-    assert (finding.severity, finding.commands) == (Severity.NOTE, ("rm -r /dev/shm/skinware.old",))
+    assert (finding.severity, finding.commands) == (Severity.NOTE, ("skin-info --namespace old",))
     assert "untouched for 120 min" in finding.where or "untouched for 2 h" in finding.where
     assert ("namespace lab", foreign.problem) in {(one.what, one.why) for one in examine(seen).not_looked}
 

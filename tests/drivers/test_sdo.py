@@ -106,7 +106,7 @@ def test_a_segmented_write() -> None:
 def test_a_refusal_says_what_was_refused_and_why() -> None:
     wire = scripted(["8000200100000206"])
     with pytest.raises(
-        SdoAborted, match=r"object 2000:1 of node 5: Object does not exist \(abort code 06020000\)"
+        SdoAborted, match=r"object 2000:1 of node 5: Object does not exist \(abort code 0x06020000\)"
     ) as e:
         transfer(wire, lambda client: client.read(0x2000, 1))
     assert e.value.code == 0x06020000

@@ -200,7 +200,7 @@ def test_identifiers_that_cannot_be_matched_are_refused() -> None:
     values = Values(0, "u1", 1)
     with pytest.raises(ConfigurationError, match="either 11 bits or 29"):
         Layout([Frame("f", (Identifier(1), Identifier(EXTENDED_FLAG | 2)), (8,), values)])
-    with pytest.raises(ConfigurationError, match="7FF has bits outside its mask F0: none matches"):
+    with pytest.raises(ConfigurationError, match="0x7FF has bits outside its mask 0xF0: none matches"):
         Layout([Frame("f", (Identifier(0x7FF, 0xF0),), (8,), values)])
     layouts = [
         Layout([Frame(f"f{i}", (Identifier(i),), (8,), values) for i in range(bus, MOST_FRAMES // 2 + 1)])

@@ -11,7 +11,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,6 +102,16 @@ class NameServer:
         if told is None:
             raise OSError(f"{self} did not take {name}")
         return told
+
+    def describe(self, name: str, carriers: Collection[str]) -> None:
+        """Have the server keep in which carriers a port can be called, as ports of YARP do when they register.
+
+        Args:
+            name: of the port, which is registered.
+            carriers: that it speaks as sender and as receiver.
+        """
+        for key in ("offers", "accepts"):
+            self._ask(name, f"set {name} {key} {' '.join(carriers)}")
 
     def unregister(self, name: str) -> None:
         """Tell that a port is no more."""

@@ -28,7 +28,7 @@ from skinware.structure import Structure
 from skinware.tactile.regions import Region
 from skinware.transfer.collecting import Collector
 from skinware.transfer.generation import Generation
-from skinware.yarp.carriers import Message
+from skinware.yarp.carriers import Carrier, Message
 from skinware.yarp.names import Contact, NameServer, is_port_name
 from skinware.yarp.port import OutputPort
 from skinware.yarp.vectors import Vector, vectors_of
@@ -130,7 +130,9 @@ class _Served:
             if self.registered is not None and known is not None:
                 self.trouble = "" if known == self.registered else "another program has this name now"
                 return
-            self.registered, self.trouble = self._names.register(self.port.name, host, number), ""
+            registered = self._names.register(self.port.name, host, number)
+            self._names.describe(self.port.name, [carrier.title for carrier in Carrier])
+            self.registered, self.trouble = registered, ""
         except OSError as error:
             self.trouble = str(error)
 

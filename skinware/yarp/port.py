@@ -1,8 +1,8 @@
 """An output port of YARP: whoever reads it gets the newest vector, as fast as each can; nobody is waited for.
 
-A reader calls us and asks to read (the command ``r``, in text or binary), or has us call it (``yarp connect OURS ITS``,
-which is the command ``[add]`` to a port). Commands are taken in text, as YARP's own tools send them; they are those of
-its manual that a port cannot do without. All of it runs in one event loop.
+A reader calls us and asks to read (the command ``r``), or has us call it (``yarp connect OURS ITS``, which is the
+command ``[add]`` to a port). Commands are taken in text, as ``yarp connect`` sends them, and in binary, as ``yarp admin
+rpc`` does; they are those of YARP's manual that a port cannot do without. All of it runs in one event loop.
 
 YARP 3 and YARP 4 mark a list of doubles differently, and a connection does not show which of them reads. Where the user
 has not named the version, binary readers are refused: none gets wrong numbers.
@@ -16,9 +16,11 @@ import logging
 import os
 import re
 import socket
+import struct
 from dataclasses import dataclass, field
 
-from skinware.yarp.carriers import READ, Carrier, Message, framed, unframed
+from skinware.yarp.bottles import Value, Word, in_text, of_text, packed, unpacked
+from skinware.yarp.carriers import Carrier, Message, framed, unframed
 from skinware.yarp.names import Contact, NameServer, is_port_name
 
 log: logging.Logger = logging.getLogger("skinware.yarp")
@@ -33,7 +35,11 @@ _LONGEST_WHO = 80
 _MOST_BEHIND = 1 << 16
 """Wanted of the kernel: bytes that may be on their way to a reader, so that what a slow one sees is not old."""
 _ADDRESS = re.compile(r"(?:(?P<carrier>[a-z_]+):/)?(?P<name>/.*)")
-_WORD = re.compile(r'"([^"]*)"|\(([^()]*)\)|(\S+)')
+_INDEX = struct.Struct("<8sBB8x")
+_COMMAND = struct.Struct("<icc2x")
+_INDEX_NUMBER = 10
+_MOST_BLOCKS = 16
+_SENDS_ONLY = "this port only sends: yarp read reads it, yarp admin rpc asks it"
 _WHICH_YARP = "YARP 3 and YARP 4 mark numbers differently: start skin-bridge yarp with --yarp 3 or --yarp 4"
 _HELP = (
     "*       Gives a description of this port",
@@ -44,6 +50,14 @@ _HELP = (
     "!/port  Requests to stop sending output to /port",
     "a       Signals the beginning of an administrative message",
     "?       Gives this help",
+)
+_ADMINISTRATION = (
+    "[add] PORT [CARRIER]: send to a port, by tcp, fast_tcp or text",
+    "[del] PORT: send to it no more",
+    "[list] [out] [PORT]: the ports that are sent to, or how one is",
+    "[list] [in]: nothing, since this port only sends",
+    "[ver]: version of these commands",
+    "[help]: these lines",
 )
 
 
@@ -139,12 +153,13 @@ class OutputPort:
             carrier = Carrier.of_greeting(begin)
             if carrier is None:
                 return
-            if not carrier.is_text:
-                who = await self._asked_to_send(reader, writer)
-                if who and not self._refusal(carrier, who):
-                    await self._serve(Receiver(who, carrier, writer), reader)
-                return
-            who = (await _line(reader))[:_LONGEST_WHO] or "?"
+            if carrier.is_text:
+                who = (await _line(reader))[:_LONGEST_WHO] or "?"
+            else:
+                who = await self._greeted_in_binary(reader, writer)
+        if not carrier.is_text:
+            await self._converse_in_binary(Receiver(who, carrier, writer), reader)
+            return
         writer.write(f"Welcome {who}\r\n".encode())
         while True:
             await writer.drain()
@@ -159,15 +174,39 @@ class OutputPort:
             if carrier.acknowledges:
                 writer.write(b"<ACK>\r\n")
 
-    async def _asked_to_send(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
-        """Greet a caller in binary; gives its name if it asks to read, else nothing."""
+    async def _greeted_in_binary(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> str:
+        """Greet a caller in binary; gives its name.
+
+        Raises:
+            ValueError: it has none.
+        """
         size = int.from_bytes(await reader.readexactly(4), "little")
         if not 1 <= size <= _LONGEST_LINE:
-            return ""
+            raise ValueError(f"a name of {size} bytes")
         who = (await reader.readexactly(size))[:-1].decode("utf-8", "replace")
         writer.write(framed(self._number))
         await writer.drain()
-        return who[:_LONGEST_WHO] or "?" if await reader.readexactly(len(READ)) == READ else ""
+        return who[:_LONGEST_WHO] or "?"
+
+    async def _converse_in_binary(self, caller: Receiver, reader: asyncio.StreamReader) -> None:
+        """Answer commands until the caller reads or goes; an answer is a list, without the head of a message."""
+        while True:
+            command, data = await _binary_message(reader)
+            if command == "r":
+                if not self._refusal(caller.carrier, caller.name):
+                    await self._serve(caller, reader)
+                return
+            answer = b""
+            if command == "a":
+                answer = packed(await self._administer([str(value) for value in unpacked(data)]))
+            elif command[:1] == "d":  # of D no answer is expected
+                answer = packed([Word("fail"), _SENDS_ONLY])
+            elif command.startswith(("/", "!/")):
+                await self._obey(command, reader)
+            caller.writer.write(answer + (framed(0) if caller.carrier.acknowledges else b""))
+            await caller.writer.drain()
+            if command == "q":
+                return
 
     def _refusal(self, carrier: Carrier, who: str) -> str:
         """Why a reader cannot be served in a carrier; empty if it can."""
@@ -184,7 +223,7 @@ class OutputPort:
             await _line(reader)  # data, of which we take none
             return []
         if command == "a":
-            return [await self._administer(_words(await _line(reader)))]
+            return [in_text(await self._administer(of_text(await _line(reader))))]
         if command == "*":
             lines = [
                 f"There is an output connection from {self.name} to {r.name} using {r.carrier.title}"
@@ -199,17 +238,19 @@ class OutputPort:
             return [self._remove(command[1:])]
         return ["Port command not understood.", "Type ? for help."]
 
-    async def _administer(self, words: list[str]) -> str:
-        """What an administrative message is answered with, as a list in text."""
+    async def _administer(self, words: list[str]) -> list[Value]:
+        """What an administrative message is answered with."""
         match words:
             case ["ver", *_]:
-                return "ver 1 2 3"
+                return [Word("ver"), 1, 2, 3]
+            case ["help", *_]:
+                return [Word("many"), *_ADMINISTRATION]
             case ["list", "in", *_]:
-                return ""
+                return []
             case ["list", "out"]:
-                return " ".join(receiver.name for receiver in self.receivers)
+                return [receiver.name for receiver in self.receivers]
             case ["list", "out", name, *_]:
-                return next((self._described(each) for each in self.receivers if each.name == name), "")
+                return next((self._described(each) for each in self.receivers if each.name == name), [])
             case ["add", name]:
                 said = await self._add(name)
             case ["add", name, carrier, *_]:
@@ -217,11 +258,18 @@ class OutputPort:
             case ["del", name, *_]:
                 said = self._remove(name)
             case _:
-                return '[fail] "send [help] for list of valid commands"'
-        return f'{0 if said.startswith(("Added", "Removed")) else -1} "{said}"'
+                return [Word("fail"), "send [help] for list of valid commands"]
+        return [0 if said.startswith(("Added", "Removed")) else -1, said]
 
-    def _described(self, receiver: Receiver) -> str:
-        return f"(from {self.name}) (to {receiver.name}) (carrier {receiver.carrier.title}) (connectionless 0) (push 1)"
+    def _described(self, receiver: Receiver) -> list[Value]:
+        carrier = receiver.carrier.title
+        return [
+            ["from", self.name],
+            ["to", receiver.name],
+            ["carrier", carrier],
+            ["connectionless", 0],
+            ["push", 1],
+        ]
 
     # -- whom we call ----------------------------------------------------------------------------------------------
 
@@ -318,10 +366,25 @@ async def _line(reader: asyncio.StreamReader) -> str:
     return line.decode("utf-8", "replace").strip()
 
 
-def _words(text: str) -> list[str]:
-    """A flat list in text, whose words may stand in quotes or, as commands do, in square brackets."""
-    words = ["".join(found) for found in _WORD.findall(text)]
-    return [word[1:-1] if word.startswith("[") and word.endswith("]") else word for word in words]
+async def _binary_message(reader: asyncio.StreamReader) -> tuple[str, bytes]:
+    """The next message in binary: its command, and what follows that.
+
+    Raises:
+        EOFError: there is none any more.
+        ValueError: it is none, or too long.
+    """
+    begin, n_blocks, n_answers = _INDEX.unpack(await reader.readexactly(_INDEX.size))
+    if unframed(begin) != _INDEX_NUMBER or n_blocks + n_answers > _MOST_BLOCKS:
+        raise ValueError("no message of YARP")
+    sizes = struct.unpack(f"<{n_blocks + n_answers}i", await reader.readexactly(4 * (n_blocks + n_answers)))
+    if min(sizes, default=0) < 0 or not _COMMAND.size <= sum(sizes) <= _LONGEST_LINE:
+        raise ValueError(f"a message of YARP of {sum(sizes)} bytes")
+    data = await reader.readexactly(sum(sizes))
+    size, mark, letter = _COMMAND.unpack_from(data)
+    text, rest = data[_COMMAND.size : _COMMAND.size + size], data[_COMMAND.size + size :]
+    if mark != b"~" or not 0 <= size <= len(data) - _COMMAND.size:
+        raise ValueError("no command of YARP")
+    return (text.rstrip(b"\0") if size else letter).decode("utf-8", "replace"), rest
 
 
 __all__ = ["OutputPort", "Receiver"]

@@ -122,7 +122,10 @@ class Robot:
                     self.ports.pop(name, None)
                 known = self.ports.get(name)
                 told = b""
-                if known is not None:
+                if what == "set":
+                    key, *values = more
+                    told = f"port {name} property {key} = {' '.join(sorted(values))}\r\n".encode()
+                elif known is not None:
                     told = "registration name {} ip {} port {} type {}\r\n".format(name, *known).encode()
                 caller.sendall(told + END)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 import socket
 import threading
 from collections.abc import Callable
@@ -116,3 +118,64 @@ def test_where_programs_of_yarp_look(tmp_path: Path) -> None:
     for text in ("", "10.0.0.1", "host port", "host 99999999"):
         file.write_text(text)
         assert configured_server(environment) == ("127.0.0.1", 10000)
+
+
+TRANSCRIPTS = Path(__file__).parents[3] / "shared/data/yarp_transcripts"
+
+
+def recorded(name: str) -> list[tuple[bytes, bytes]]:
+    """What was asked of a real yarpserver in each connection, and what it answered."""
+    path = TRANSCRIPTS / f"{name}.txt"
+    if not path.exists():
+        pytest.skip(f"there are no exchanges with a real YARP: {path} is missing")
+    exchanges = []
+    for connection in path.read_text().split("\nconnection ")[1:]:
+        lines = {way: re.findall(rf"^{way} ([0-9a-f]{{8,}})$", connection, re.MULTILINE) for way in "<>"}
+        exchanges.append((bytes.fromhex("".join(lines[">"])), bytes.fromhex("".join(lines["<"]))))
+    return exchanges
+
+
+def test_a_real_name_server_is_asked_and_understood_byte_by_byte() -> None:
+    exchanges = recorded("name_server_text")
+    asked: list[bytes] = []
+
+    def replay(caller: socket.socket) -> None:
+        question, answer = exchanges[len(asked)]
+        with caller.makefile("rb") as lines:
+            asked.append(b"".join(next(lines) for _ in range(question.count(b"\n"))))
+        caller.sendall(answer)
+        until_gone(caller)
+
+    with contextlib.closing(Answering(replay)) as there:
+        server = NameServer(LOCAL, there.port)
+        assert server.register("/sk/in", LOCAL, 12346) == Contact("/sk/in", LOCAL, 12346, "tcp")
+        assert server.register("/sk/in2", "...", 12347) == Contact("/sk/in2", LOCAL, 12347, "tcp")
+        assert server.query("/sk/in") == Contact("/sk/in", LOCAL, 12346, "tcp")
+        assert server.query("/not/there") is None
+        assert asked == [question for question, _ in exchanges[:4]]
+        exchanges[4:5] = []  # the list of all ports, which is never asked for
+        server.unregister("/sk/in")
+        server.unregister("/sk/in2")
+        assert asked == [question for question, _ in exchanges[:6]]
+
+
+def test_carriers_are_registered_as_real_ports_register_theirs() -> None:
+    """The transcript has them in the form NAME_SERVER; behind its first word the question is the same."""
+    real = {
+        key: (question.removeprefix(b"NAME_SERVER ").strip(), answer)
+        for question, answer in recorded("name_server_cli")
+        for key in ("offers", "accepts")
+        if f" {key} ".encode() in question
+    }
+    carriers = real["offers"][0].split(b" offers ")[1].decode().split()
+    asked: list[bytes] = []
+
+    def replay(caller: socket.socket) -> None:
+        with caller.makefile("rb") as lines:
+            asked.append([next(lines) for _ in range(3)][2].strip())
+        caller.sendall(b"Welcome skinware\r\n" + real["offers" if b" offers " in asked[-1] else "accepts"][1])
+        until_gone(caller)
+
+    with contextlib.closing(Answering(replay)) as there:
+        NameServer(LOCAL, there.port).describe("/foo/bar", carriers)
+    assert asked == [question for question, _ in real.values()]

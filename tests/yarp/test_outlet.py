@@ -78,6 +78,8 @@ def test_what_is_served_is_read_as_it_was(namespace: object, yarp: Robot, versio
     with contextlib.closing(Skin("hand")) as skin, outlet(yarp, yarp=version) as (there, told):
         wait_until(lambda: "/skinware/hand" in yarp.ports)
         assert told == [{"event": "port", "port": "/skinware/hand", "driver": "hand"}]
+        carriers = [f"set /skinware/hand {key} text text_ack tcp fast_tcp".encode() for key in ("offers", "accepts")]
+        wait_until(lambda: set(carriers) <= set(yarp.asked))
         with emulated_skin("yarp", name="again", bus=f"yarp://{LOCAL}:{yarp.server.port}/skinware/hand") as driver:
             frame = read_until(driver.reader, lambda f: not f.status.any())
             assert frame.values.tolist() == skin.values.tolist()

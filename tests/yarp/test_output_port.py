@@ -15,9 +15,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skinware.yarp.carriers import Carrier, Message
+from skinware.yarp.bottles import Word, packed, unpacked
+from skinware.yarp.carriers import Carrier, Message, framed
 from skinware.yarp.names import NameServer
-from skinware.yarp.port import _WHICH_YARP, OutputPort
+from skinware.yarp.port import _ADMINISTRATION, _WHICH_YARP, OutputPort
 from skinware_drivers.testing.waiting import wait_until
 from tests.yarp.peers import GREETING, LOCAL, PATIENCE_S, READING, Answering, Robot, robot, until_gone
 
@@ -194,7 +195,7 @@ def test_other_things_that_are_asked_for(there: There) -> None:
     asked = b"a\r\n[ver]\r\na\r\n[list] [in]\r\na\r\n[prop] get x\r\n!/gui\r\n/nobody\r\n"
     with called(there, b"CONNECT admin\r\n" + asked + b"q\r\n") as connection:
         said = hear(connection, b"know it\r\n").splitlines()
-        assert said[1:4] == [b"ver 1 2 3", b"", b'[fail] "send [help] for list of valid commands"']
+        assert said[1:4] == [b"[ver] 1 2 3", b"", b'[fail] "send [help] for list of valid commands"']
 
 
 def test_a_reader_that_does_not_read_misses_vectors_and_holds_nobody_up(yarp: Robot, there: There) -> None:
@@ -224,6 +225,93 @@ def test_a_reader_in_binary(there: There) -> None:
         wait_until(lambda: [(r.name, r.carrier) for r in there.port.receivers] == [("skinware", Carrier.FAST_TCP)])
         there.send(4.0)
         assert hear(connection, struct.pack("<iid", 266, 1, 4.0))
+
+
+INDEX = "59410a0000005250 0201 ffffffffffffffff 08000000 {:02x}000000 00000000 00000000 7e{:02x}0001"
+
+
+def question(letter: str, data: str) -> bytes:
+    """As ``yarp rpc`` 3.8.1 asks: a command of one letter, and a list."""
+    return bytes.fromhex(INDEX.format(len(bytes.fromhex(data)), ord(letter)) + data)
+
+
+NO_MORE = bytes.fromhex("59410a0000005250 0101 ffffffffffffffff 0a000000 00000000 02000000 7e000001") + b"q\0"
+LIST_OUT = "09010000 02000000 6c697374 6f757400"
+VER = "09010000 01000000 76657200"
+ADD = "00010000 02000000 09000000 61646400 04000000 07000000" + b"/nobody".hex()
+FOO = "00010000 03000000 04000000 03000000 666f6f 01000000 05000000 01010000 02000000 01000000 02000000"
+
+
+def test_questions_in_binary_are_answered_as_a_real_port_answers_them(yarp: Robot, there: There) -> None:
+    """The questions, the answer to ``[ver]`` and those to lists of nothing are those of a port of YARP 3.8.1."""
+    with called(there, Carrier.TCP.greeting("anon_rpc")) as connection:
+        assert hear(connection, b"RP")
+        connection.sendall(question("a", VER))
+        ver = bytes.fromhex("00010000 04000000 09000000 76657200 01000000 01000000 01000000 02000000 01000000 03000000")
+        assert hear(connection, framed(0)) == ver + framed(0)
+        connection.sendall(question("a", LIST_OUT))
+        assert hear(connection, framed(0)) == bytes.fromhex("00010000 00000000") + framed(0)
+        connection.sendall(question("a", ADD))
+        assert unpacked(hear(connection, framed(0))[:-8]) == [
+            -1,
+            "Cannot connect to /nobody: the name server does not know it",
+        ]
+        connection.sendall(question("a", FOO))
+        assert unpacked(hear(connection, framed(0))[:-8])[0] == "fail"
+        connection.sendall(question("a", "09010000 01000000 68656c70"))
+        many = unpacked(hear(connection, framed(0))[:-8])
+        assert (many[0], len(many)) == ("many", 1 + len(_ADMINISTRATION))
+        connection.sendall(question("d", "04010000 01000000 05000000" + b"hello".hex()))
+        assert "only sends" in str(unpacked(hear(connection, framed(0))[:-8])[1])
+        connection.sendall(question("D", "04010000 01000000 05000000" + b"hello".hex()))
+        assert hear(connection, framed(0)) == framed(0)
+        connection.sendall(NO_MORE)
+        assert hear(connection, framed(0)) == framed(0)
+        assert connection.recv(10) == b""
+
+
+def test_one_who_asks_in_binary_can_have_us_call(yarp: Robot, there: There) -> None:
+    with contextlib.closing(Input(Carrier.FAST_TCP)) as gui:
+        yarp.ports["/gui:i"] = (LOCAL, gui.port, "tcp")
+        with called(there, Carrier.FAST_TCP.greeting("anon_rpc")) as connection:
+            assert hear(connection, b"RP")
+            add = ["add", "fast_tcp://gui:i"]
+            connection.sendall(question("a", packed([Word(add[0]), add[1]]).hex()))
+            told = packed([0, "Added connection from /skinware/hand to /gui:i"])
+            assert hear(connection, told[-8:]) == told
+            wait_until(lambda: len(there.port.receivers) == 1)
+            connection.sendall(question("a", packed([Word("list"), Word("out"), "/gui:i"]).hex()))
+            listed = packed(["push", 1])
+            assert unpacked(hear(connection, listed)) == [
+                ["from", OURS],
+                ["to", "/gui:i"],
+                ["carrier", "fast_tcp"],
+                ["connectionless", 0],
+                ["push", 1],
+            ]
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"YA\x0b\0\0\0RP" + bytes(20),
+        b"YA\x0a\0\0\0RP\xff\xff" + bytes(8),
+        bytes.fromhex("59410a0000005250 0101 ffffffffffffffff ffffff7f 00000000"),
+        bytes.fromhex("59410a0000005250 0101 ffffffffffffffff ffffffff 00000000"),
+        bytes.fromhex("59410a0000005250 0101 ffffffffffffffff 08000000 00000000 00000000 21610001"),
+        bytes.fromhex("59410a0000005250 0101 ffffffffffffffff 08000000 00000000 ffffff7f 7e610001"),
+        question("a", ""),
+        question("a", "00010000 ffffff7f"),
+        question("a", "00010000 01000000 04000000 ffffffff"),
+        question("a", "00010000 01000000 0a000000 00000000"),
+        question("a", "00010000 01000000" * 8),
+        question("a", VER + "00"),
+    ],
+)
+def test_what_is_no_question_in_binary_is_hung_up_on(there: There, said: bytes) -> None:
+    with called(there, Carrier.TCP.greeting("anon_rpc") + said) as connection, contextlib.suppress(ConnectionError):
+        assert hear(connection, b"RP")
+        assert connection.recv(100) == b""
 
 
 def test_no_reader_in_binary_is_served_where_its_version_is_not_known(

@@ -84,14 +84,7 @@ def outcome(name: str, command: Sequence[str], program: str, **environment: str)
     return made
 
 
-def compared(name: str, peers: str, yarp: str | None) -> Outcome:
-    if name == "yarp":
-        script = HERE / "yarp.py"
-        return (
-            outcome(name, (sys.executable, str(script), str(yarp)), "YARP")
-            if script.exists()
-            else missing(name, script)
-        )
+def compared(name: str, peers: str) -> Outcome:
     if name in TOOLS:
         return outcome(name, TOOLS[name], {"fastdds": "Fast DDS 2.9.1"}.get(name, name))
     if name in TESTS:
@@ -121,14 +114,23 @@ def main() -> int:
     parser.add_argument("peers", help=argparse.SUPPRESS)
     every = [*SCRIPTS, *TESTS, *TOOLS]
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(every)}; default: all")
-    parser.add_argument("--yarp", metavar="DIR", help="also compare with YARP, built from source in DIR")
+    parser.add_argument(
+        "--yarp",
+        metavar="DIR",
+        action="append",
+        default=[],
+        help="also compare with YARP, whose sources are in DIR; repeat it",
+    )
+    parser.add_argument("--hours", default="0.02", metavar="H", help="how long programs of YARP run  [default: 0.02]")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--markdown", action="store_true", help="rows for pages")
     options = parser.parse_args()
     names = options.names or ([] if options.yarp else every)
     if unknown := [each for each in names if each not in every]:
         parser.error(f"{', '.join(unknown)}: give names of {', '.join(every)}")
-    outcomes = [compared(each, options.peers, options.yarp) for each in [*names, *(["yarp"] if options.yarp else [])]]
+    outcomes = [compared(each, options.peers) for each in names]
+    yarp = (sys.executable, str(HERE / "yarp.py"), "--hours", options.hours)
+    outcomes += [outcome("yarp", (*yarp, folder), "YARP") for folder in options.yarp]
     today = datetime.now(UTC).date().isoformat()
     for each in outcomes:
         if options.json:

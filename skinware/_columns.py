@@ -43,10 +43,9 @@ def column(name: str, data: npt.ArrayLike, code: str) -> npt.NDArray[Any]:
         raise StructureError(f"{name} must be one-dimensional, not of shape {given.shape}")
     if wanted.kind == "S":
         if given.dtype.kind == "U":
-            given = np.char.encode(given, "utf-8")
-        too_long = np.char.str_len(given.astype(bytes)) > wanted.itemsize if given.size else np.zeros(0, bool)
-        if too_long.any():
-            row = int(np.argmax(too_long))
+            given = np.array([text.encode() for text in given.tolist()], bytes)
+        too_long = (row for row, text in enumerate(given.astype(bytes).tolist()) if len(text) > wanted.itemsize)
+        if (row := next(too_long, None)) is not None:
             raise StructureError(f"{name} {row} is longer than {wanted.itemsize} bytes: {given[row]!r}")
         return frozen(given.astype(wanted))
     if given.size and given.dtype.kind not in "ui":

@@ -122,7 +122,8 @@ def test_either_end_goes_and_comes_back(namespace: Namespace, here: Namespace, e
                     again = serving(port) if end == "serve" else joining(port, here)
                     commands[end] = stack.enter_context(again)
                 wait_until(lambda: bool(reader.read().fresh("pressure").all()))
-            assert (reader.read().values == reader.read().values[0]).all()
+            values = reader.read().values
+            assert (values == values[0]).all()
             sweep(namespace)
 
 

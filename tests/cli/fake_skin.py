@@ -76,7 +76,7 @@ class FakeSkin:
         self.is_hung = False
         self.values: npt.NDArray[Any] | None = None
         self.status = np.zeros(self.structure.n_sensors, np.uint8)
-        self.untouched = np.zeros(self.structure.n_modules, np.uint8)
+        self.untouched: npt.NDArray[np.uint8] | None = None
         self.patch_state = np.full(self.structure.n_patches, int(PatchState.LIVE), np.uint8)
         self.bus_state = np.full(len(self.structure.buses), int(BusState.LIVE), np.uint8)
         self.bus_reason = np.zeros(len(self.structure.buses), np.uint8)
@@ -105,7 +105,7 @@ class FakeSkin:
             columns["values"][:] = self._touched() if self.values is None else self.values
             columns["status"][:] = self.status
             columns["module_time_ns"][:] = time.monotonic_ns()
-            columns["module_untouched"][:] = self.untouched
+            columns["module_untouched"][:] = 0 if self.untouched is None else self.untouched
             columns["patch_state"][:] = self.patch_state
             columns["bus_state"][:] = self.bus_state
             columns["bus_reason"][:] = self.bus_reason

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import click
+import numpy as np
 import pytest
 
 from skinware import DriverReader, Namespace, PatchState, Status
@@ -70,7 +71,7 @@ def test_modules_that_have_sent_nothing_but_0_are_fresh_and_said(capsys: pytest.
     with FakeSkin("a", fake_structure(2, 1)) as skin:
         skin.publish()
         assert "untouched" not in shown(capsys)
-        skin.untouched[1] = 1
+        skin.untouched = np.array([0, 1], np.uint8)
         skin.publish()
         lines = shown(capsys)
     assert re.search(r"sensors: .*; 12 untouched so far \(only 0\)\n", lines)

@@ -39,7 +39,7 @@ class TestCells(DriverConformance):
         ),
         (
             ElevenBits,
-            r"\nHeard 18D0.... \(29 bits\) where the layout has only identifiers of 11 bits: write EXTENDED_FLAG \|",
+            r"\nHeard 0x18D0.... \(29 bits\) where the layout has only identifiers of 11 bits: write EXTENDED_FLAG \|",
         ),
     ],
 )

@@ -94,7 +94,7 @@ def test_what_is_saved_is_read_again(tmp_path: Path) -> None:
             load(file)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")  # a process imports a module name from one file only
 def mistaken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The file of a driver with a mistake."""
     file = tmp_path_factory.mktemp("driver") / "mistaken.py"
